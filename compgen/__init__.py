@@ -1,0 +1,1 @@
+"""compgen: from a machine-tool measurement to checked compensation tables."""

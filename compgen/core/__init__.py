@@ -1,0 +1,1 @@
+"""Names, units, tables and files: what every stage shares."""

@@ -1,0 +1,229 @@
+"""The CSV dialect of the contract: comma, header, ``#`` comments with ``key = value`` metadata, strict numbers."""
+
+from __future__ import annotations
+
+import csv
+import math
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.core.files import read_text
+from compgen.core.text import nearest, one_line
+from compgen.errors import CompgenWarning, InputError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """The rows of one CSV file as columns of text; numbers are converted, and checked, on request.
+
+    ``lines`` holds the line number of each row, ``metadata`` the ``# key = value`` comments.
+    """
+
+    path: Path
+    columns: Mapping[str, Sequence[str]]
+    lines: Sequence[int]
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.lines)
+
+    def fail(self, row: int, column: str, message: str) -> InputError:
+        """Return the error that points at one cell."""
+        return InputError(message, file=self.path, line=self.lines[row], field=f"column {column}")
+
+    def text(self, column: str) -> list[str]:
+        """Return a column of labels; an empty cell is an error."""
+        cells = self.columns[column]
+        for row, cell in enumerate(cells):
+            if not cell:
+                raise self.fail(row, column, "is empty; every row needs a label here")
+        return list(cells)
+
+    def numbers(self, column: str, *, empty: float | None = None) -> FloatArray:
+        """Return a column as finite numbers, shape (rows,); empty cells become ``empty`` if that is given."""
+        cells = self.columns[column]
+        if empty is not None and any(not cell for cell in cells):
+            filled = [cell or repr(empty) for cell in cells]
+        else:
+            filled = list(cells)
+        try:
+            values = np.array(filled, dtype=np.float64)
+        except ValueError:
+            raise self._bad_number(column, filled) from None
+        if not np.isfinite(values).all():
+            row = next((k for k in range(len(cells)) if cells[k] and not math.isfinite(values[k])), None)
+            if row is not None:
+                raise self.fail(row, column, f"{cells[row]!r} is not a finite number")
+        return values
+
+    def _bad_number(self, column: str, cells: Sequence[str]) -> InputError:
+        for row, cell in enumerate(cells):
+            try:
+                float(cell)
+            except ValueError:
+                what = "is empty" if not cell else f"{one_line(cell)[:40]!r} is not a number"
+                return self.fail(row, column, f"{what}; a number with '.' as decimal point is due")
+        return InputError("holds text where numbers are due", file=self.path, field=f"column {column}")
+
+    def labels(self, column: str) -> NDArray[np.int64]:
+        """Return a column of whole-number labels, shape (rows,)."""
+        values = self.numbers(column)
+        whole = values.astype(np.int64)
+        wrong = np.flatnonzero(whole != values)
+        if wrong.size:
+            row = int(wrong[0])
+            raise self.fail(row, column, f"{self.columns[column][row]!r} is not a whole number")
+        return whole
+
+
+def read_csv(
+    path: str | Path, required: Iterable[str], optional: Iterable[str] = (), prefixes: Iterable[str] = ()
+) -> CsvTable:
+    """Read a CSV file strictly.
+
+    Parameters
+    ----------
+    path : the file.
+    required, optional : column names; others are left out with a warning.
+    prefixes : further allowed columns begin with one of these (e.g. ``temp_``).
+
+    Raises
+    ------
+    InputError
+        for an empty file, a missing or doubled column, a row with too few or too many fields, a truncated last line.
+    """
+    source = Path(path)
+    content = read_text(source)
+    required, prefixes = list(required), tuple(prefixes)
+    known = {*required, *optional}
+    header_line, header, rows, lines, metadata = _split(source, content)
+    if not header:
+        raise InputError(f"is empty; expected a header line with {', '.join(required)}", file=source)
+    _check_header(source, header_line, header, required, known, prefixes)
+    if not rows:
+        raise InputError("has a header but no rows", file=source, line=header_line)
+    for row, line in zip(rows, lines, strict=True):
+        if len(row) != len(header):
+            last = " (the last line: is the file truncated?)" if line == lines[-1] else ""
+            message = f"has {len(row)} fields, the header has {len(header)}{last}"
+            raise InputError(message, file=source, line=line)
+    _check_complete(source, content, rows, lines, metadata)
+    columns = {
+        name: [cell.strip() for cell in cells]
+        for name, cells in zip(header, zip(*rows, strict=True), strict=True)
+        if name in known or name.startswith(prefixes or ("\0",))
+    }
+    return CsvTable(source, columns, lines, metadata)
+
+
+def _split(source: Path, content: str) -> tuple[int, list[str], list[list[str]], list[int], dict[str, str]]:
+    metadata: dict[str, str] = {}
+    numbers: list[int] = []
+    data: list[str] = []
+    for number, line in enumerate(content.splitlines(), start=1):
+        stripped = line.strip()
+        if stripped.startswith("#"):
+            key, equals, value = stripped.lstrip("#").partition("=")
+            if equals:
+                metadata[key.strip()] = value.strip()
+        elif stripped:
+            numbers.append(number)
+            data.append(line)
+    if not data:
+        return 0, [], [], [], metadata
+    if "\0" in content:
+        raise InputError("holds NUL bytes; it is not a text file", file=source)
+    try:
+        parsed = list(csv.reader(data, strict=True))
+    except csv.Error as error:
+        raise InputError(f"is not readable as CSV: {error}", file=source) from error
+    if len(parsed) != len(data):
+        raise InputError("a quoted field runs over a line end; write each row on one line", file=source)
+    header = [name.strip() for name in parsed[0]]
+    return numbers[0], header, parsed[1:], numbers[1:], metadata
+
+
+def _check_header(
+    source: Path, line: int, header: list[str], required: list[str], known: set[str], prefixes: tuple[str, ...]
+) -> None:
+    doubled = sorted({name for name in header if header.count(name) > 1})
+    if doubled:
+        raise InputError(f"the header names {doubled[0]!r} twice", file=source, line=line)
+    missing = [name for name in required if name not in header]
+    if missing:
+        raise InputError(
+            f"column {missing[0]!r} is missing; needed are {', '.join(required)}; the header has {one_line(', '.join(header))}",
+            file=source,
+            line=line,
+        )
+    for name in header:
+        if name not in known and not name.startswith(prefixes or ("\0",)):
+            hint = nearest(name, known)
+            warnings.warn(
+                f"{source}:{line}: column {one_line(name)!r} is not known and left out; {hint}", CompgenWarning, 4
+            )
+
+
+def _check_complete(
+    source: Path, content: str, rows: list[list[str]], lines: list[int], metadata: dict[str, str]
+) -> None:
+    """A file that was cut is refused: by its declared number of rows, or by a shorter last number without line end."""
+    declared = metadata.get("rows")
+    if declared is not None and declared != str(len(rows)):
+        raise InputError(f"declares {one_line(declared)} rows but holds {len(rows)}: is it truncated?", file=source)
+    if content.endswith(("\n", "\r")) or len(rows) < 3:
+        return
+    decimals = {len(row[-1].strip().partition(".")[2]) for row in rows[:-1]}
+    if len(decimals) == 1 and len(rows[-1][-1].strip().partition(".")[2]) < decimals.pop():
+        message = "the last line has no line end and fewer decimals than the others: the file is truncated"
+        raise InputError(message, file=source, line=lines[-1])
+
+
+def format_csv(
+    columns: Mapping[str, Sequence[str] | FloatArray],
+    metadata: Mapping[str, object] | None = None,
+    decimals: Mapping[str, int] | None = None,
+) -> str:
+    """Return CSV text with ``# key = value`` comments, the number of rows among them, and a final line end.
+
+    Numbers are written with ``decimals`` digits after the point (6 if not given), text as it is.
+    """
+    digits = decimals or {}
+    cells = [_cells(values, digits.get(name, 6)) for name, values in columns.items()]
+    rows = list(zip(*cells, strict=True))
+    comments = [
+        f"# {one_line(key)} = {one_line(value)}" for key, value in {**(metadata or {}), "rows": len(rows)}.items()
+    ]
+    body = [",".join(columns), *(",".join(row) for row in rows)]
+    return "\n".join([*comments, *body]) + "\n"
+
+
+def _cells(values: Sequence[str] | FloatArray, digits: int) -> list[str]:
+    if isinstance(values, np.ndarray):
+        return [fixed(value, digits) for value in values.tolist()]
+    return [_quoted(str(value)) for value in values]
+
+
+def _quoted(cell: str) -> str:
+    flat = " ".join(cell.split())
+    return '"' + flat.replace('"', '""') + '"' if any(char in flat for char in ',"#') else flat
+
+
+def fixed(value: float, digits: int) -> str:
+    """Return ``value`` in fixed-point notation without exponent and without a negative zero.
+
+    >>> fixed(-0.0000001, 3), fixed(12.5, 2), fixed(float("nan"), 2)
+    ('0.000', '12.50', '')
+    """
+    if math.isnan(value):
+        return ""
+    text = f"{value:.{digits}f}"
+    return text[1:] if text.startswith("-") and not text.strip("-0.") else text

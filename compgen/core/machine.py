@@ -1,0 +1,224 @@
+"""A machine as its TOML file describes it: chain, axes, what the error model contains, settings per control."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import permutations
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from compgen.core import tomlio
+from compgen.core.csvio import FloatArray
+from compgen.core.names import AXES, ERROR_NAMES
+from compgen.core.text import nearest
+from compgen.errors import InputError
+from compgen.resources import data_folder
+
+Vector3 = tuple[float, float, float]
+Reference = Literal["X", "Y"]
+CurveBasis = Literal["linear", "cubic"]
+
+#: The 24 valid chains: W, every order of X, Y, Z and F, then T.
+CHAINS: tuple[str, ...] = tuple(f"W{''.join(order)}T" for order in permutations("FXYZ"))
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Kinematic chain from workpiece to tool, e.g. ``WFYXZT``; axes count 0, 1, 2 for X, Y, Z.
+
+    ``workpiece_side`` lists the axes left of F in order from the foundation outwards (the first is next to F),
+    ``tool_side`` those right of F, also from the foundation outwards (the last carries the tool).
+    """
+
+    name: str
+    workpiece_side: tuple[int, ...] = field(init=False)
+    tool_side: tuple[int, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.name not in CHAINS:
+            raise ValueError(
+                f"chain {self.name!r} is not valid: W first, T last, and X, Y, Z, F once each in between, e.g. 'WFYXZT'"
+            )
+        left, _, right = self.name[1:-1].partition("F")
+        object.__setattr__(self, "workpiece_side", tuple(AXES.index(axis) for axis in reversed(left)))
+        object.__setattr__(self, "tool_side", tuple(AXES.index(axis) for axis in right))
+
+    def lever_axes(self, axis: int) -> tuple[int, ...]:
+        """Axes whose travel is part of the lever arm of an angular error of ``axis`` (``docs/conventions.md``)."""
+        if axis in self.tool_side:
+            return self.tool_side[self.tool_side.index(axis) + 1 :]
+        return self.tool_side + self.workpiece_side[: self.workpiece_side.index(axis) + 1]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One linear axis: travel range and curve nodes in mm; ``nodes_mm`` has shape (n,) and spans the range."""
+
+    range_mm: tuple[float, float]
+    nodes_mm: FloatArray
+    expansion_um_per_m_k: float | None = None
+    screw_pitch_mm: float | None = None
+
+    @property
+    def length_mm(self) -> float:
+        """Travel in mm."""
+        return self.range_mm[1] - self.range_mm[0]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A three-axis machine; ``axes`` holds X, Y, Z in that order, ``errors`` what its model contains.
+
+    ``errors`` is ``"observable"``, 17, 21 or a tuple of names (resolved by :func:`compgen.model.modelled_errors`).
+    ``controllers`` keeps the raw settings of each control; the control itself checks them.
+    """
+
+    name: str
+    chain: Chain
+    axes: tuple[Axis, Axis, Axis]
+    squareness_reference: Reference = "X"
+    tool_offset_mm: Vector3 = (0.0, 0.0, 0.0)
+    reference_point_mm: Vector3 = (0.0, 0.0, 0.0)
+    errors: Literal["observable", 17, 21] | tuple[str, ...] = "observable"
+    curves: CurveBasis = "linear"
+    controllers: Mapping[str, tomlio.Section] = field(default_factory=dict)
+    source: Path | None = None
+
+    @property
+    def lower_mm(self) -> FloatArray:
+        """Lower travel ends, shape (3,)."""
+        return np.array([axis.range_mm[0] for axis in self.axes])
+
+    @property
+    def upper_mm(self) -> FloatArray:
+        """Upper travel ends, shape (3,)."""
+        return np.array([axis.range_mm[1] for axis in self.axes])
+
+    def controller_settings(self, name: str) -> tomlio.Section:
+        """Return a fresh section with the settings of one control (empty if the file has none)."""
+        section = self.controllers.get(name)
+        if section is None:
+            return tomlio.Section({}, path=self.source, name=f"controllers.{name}")
+        return tomlio.Section(section.data, path=section.path, text=section.text, name=section.name)
+
+
+def read_machine(path: str | Path) -> Machine:
+    """Read a machine TOML strictly: an unknown key, a wrong unit, a reversed range are errors that say what to do."""
+    root = tomlio.read_toml(path)
+    name = root.take("name", tomlio.text)
+    chain = root.take("chain", Chain)
+    reference = root.take("squareness_reference", tomlio.choice("X", "Y"), "X")
+    tool_offset_mm = root.take("tool_offset_mm", tomlio.vector3, (0.0, 0.0, 0.0))
+    reference_point_mm = root.take("reference_point_mm", tomlio.vector3, (0.0, 0.0, 0.0))
+    errors = root.take("errors", _error_selection, "observable")
+    curves = root.take("curves", tomlio.choice("linear", "cubic"), "linear")
+    axes_section = root.section("axes")
+    axes = [_read_axis(axes_section.section(axis), curves) for axis in AXES]
+    axes_section.finish()
+    controllers_section = root.section("controllers", required=False)
+    controllers = {key: controllers_section.section(key) for key in controllers_section.data}
+    for axis_name, axis, reference_mm in zip(AXES, axes, reference_point_mm, strict=True):
+        low, high = axis.range_mm
+        if not low <= reference_mm <= high:
+            raise root.fail(
+                "reference_point_mm",
+                f"{axis_name} = {reference_mm:g} mm lies outside the travel {low:g} ... {high:g} mm; the "
+                f"position-dependent errors are zero there, so it must lie within the travel",
+            )
+    root.finish()
+    return Machine(
+        name=name,
+        chain=chain,
+        axes=(axes[0], axes[1], axes[2]),
+        squareness_reference=cast(Reference, reference),
+        tool_offset_mm=tool_offset_mm,
+        reference_point_mm=reference_point_mm,
+        errors=errors,
+        curves=cast(CurveBasis, curves),
+        controllers=controllers,
+        source=Path(path),
+    )
+
+
+def _read_axis(section: tomlio.Section, curves: str) -> Axis:
+    range_mm = section.take("range_mm", tomlio.interval)
+    if "nodes_mm" in section or isinstance(section.data.get("nodes"), list):
+        key = "nodes_mm" if "nodes_mm" in section else "nodes"
+        nodes_mm = np.array(section.take(key, tomlio.ascending))
+        if key == "nodes_mm" and "nodes" in section:
+            raise section.fail("nodes", "stands beside nodes_mm; give one of the two")
+        if abs(nodes_mm[0] - range_mm[0]) > 1e-9 or abs(nodes_mm[-1] - range_mm[1]) > 1e-9:
+            message = f"goes from {nodes_mm[0]:g} to {nodes_mm[-1]:g} mm; first and last node are the ends of range_mm"
+            raise section.fail(key, message)
+    else:
+        nodes_mm = np.linspace(*range_mm, section.take("nodes", tomlio.whole(2, 10001)))
+    if curves == "cubic" and len(nodes_mm) < 4:
+        raise section.fail("nodes", f"{len(nodes_mm)} is too few for curves = 'cubic'; at least 4 are needed")
+    axis = Axis(
+        range_mm=range_mm,
+        nodes_mm=nodes_mm,
+        expansion_um_per_m_k=section.take("expansion_um_per_m_k", tomlio.number, None),
+        screw_pitch_mm=section.take("screw_pitch_mm", tomlio.positive, None),
+    )
+    section.finish()
+    return axis
+
+
+def _error_selection(value: Any) -> Literal["observable", 17, 21] | tuple[str, ...]:
+    if value == "observable" or (value in (17, 21) and not isinstance(value, bool)):
+        return cast(Literal["observable", 17, 21], value)
+    if not isinstance(value, list) or not value:
+        raise ValueError("'observable', 17, 21 or a list of error names is expected")
+    for name in value:
+        if name not in ERROR_NAMES:
+            raise ValueError(f"{name!r} is not one of the 21 errors; {nearest(str(name), ERROR_NAMES)}")
+    if len(set(value)) != len(value):
+        raise ValueError("each error may be named once")
+    return tuple(name for name in ERROR_NAMES if name in value)
+
+
+def machine_files(folders: tuple[Path, ...] = ()) -> dict[str, Path]:
+    """Return the machine files by the name they declare: the shipped ones, and those in ``folders``.
+
+    Looked for are ``*.toml`` and ``*/machine.toml``. Two files with one name are an error, unless a file outside
+    the shipped folder is a byte-for-byte copy.
+    """
+    found: dict[str, Path] = {}
+    for folder in dict.fromkeys(path.resolve() for path in (data_folder("machines"), *folders)):
+        for path in sorted([*folder.glob("*.toml"), *folder.glob("*/machine.toml")]):
+            name = tomlio.read_toml(path).take("name", tomlio.text)
+            first = found.setdefault(name, path)
+            if first != path and (folder in first.parents or first.read_bytes() != path.read_bytes()):
+                raise InputError(
+                    f"two machines are named {name!r}: this file and {first}; rename one", file=path, field="name"
+                )
+    return found
+
+
+def load_machine(machine: str | Path, folders: tuple[Path, ...] = ()) -> Machine:
+    """Load a machine by the path of its TOML file, or by its name.
+
+    Parameters
+    ----------
+    machine : a path (ends in ``.toml`` or has a folder in it), or a name in the shipped ``machines/``, in a folder
+        ``machines/`` below the working directory, or in ``folders``.
+    folders : further folders to look in.
+
+    Raises
+    ------
+    InputError
+        with file, line and key for anything that is missing, unknown or impossible.
+    """
+    path = Path(machine)
+    if path.suffix == ".toml" or len(path.parts) > 1:
+        return read_machine(path)
+    local = Path("machines")
+    known = machine_files((*((local,) if local.is_dir() else ()), *folders))
+    if str(machine) not in known:
+        raise InputError(
+            f"no machine is named {str(machine)!r}; {nearest(str(machine), known)}, or give the path of a TOML file"
+        )
+    return read_machine(known[str(machine)])

@@ -1,0 +1,209 @@
+"""Strict reading of TOML: every key is taken by somebody, the rest is an error that names the nearest known key."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, overload
+
+from compgen.core.files import read_text
+from compgen.core.text import nearest, one_line
+from compgen.errors import InputError
+
+T = TypeVar("T")
+D = TypeVar("D")
+_REQUIRED = object()
+
+
+class Section:
+    """One table of a TOML file whose keys are taken one by one.
+
+    ``take`` checks and returns a value, ``section`` descends, ``finish`` raises for a key that nobody took.
+    """
+
+    def __init__(self, data: Mapping[str, Any], *, path: Path | None, text: str = "", name: str = "") -> None:
+        self.data, self.path, self.text, self.name = dict(data), path, text, name
+        self._known: set[str] = set()
+
+    def fail(self, key: str, message: str) -> InputError:
+        """Return the error that points at ``key`` of this section."""
+        field = f"[{self.name}] {key}" if self.name else key
+        return InputError(message, file=self.path, line=self._line_of(key), field=one_line(field))
+
+    def __contains__(self, key: str) -> bool:
+        """Whether the file holds ``key``; asking makes the key a known one."""
+        self._known.add(key)
+        return key in self.data
+
+    @overload
+    def take(self, key: str, check: Callable[[Any], T]) -> T: ...
+    @overload
+    def take(self, key: str, check: Callable[[Any], T], default: D) -> T | D: ...
+    def take(self, key: str, check: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
+        """Return the checked value of ``key``; ``check`` raises ValueError with what is expected."""
+        if key not in self:
+            if default is _REQUIRED:
+                present = [name for name in self.data if name not in self._known]
+                raise self.fail(key, f"is missing{'; ' + nearest(key, present) if present else ''}")
+            return default
+        try:
+            return check(self.data[key])
+        except ValueError as error:
+            raise self.fail(key, f"{error}; got {one_line(repr(self.data[key]))[:80]}") from None
+
+    def section(self, key: str, *, required: bool = True) -> Section:
+        """Return the sub-section ``key`` (an empty one if it is absent and not required)."""
+        full = f"{self.name}.{key}" if self.name else key
+        value = self.take(key, _table) if required else self.take(key, _table, {})
+        return Section(value, path=self.path, text=self.text, name=full)
+
+    def sections(self, key: str) -> list[Section]:
+        """Return the sub-sections of an array of tables (``[[key]]``), empty if absent."""
+        full = f"{self.name}.{key}" if self.name else key
+        tables = self.take(key, _tables, [])
+        return [Section(table, path=self.path, text=self.text, name=full) for table in tables]
+
+    def finish(self) -> None:
+        """Raise InputError for the first key that was never asked for."""
+        for key in self.data:
+            if key not in self._known:
+                raise self.fail(key, f"is not a known key; {nearest(key, self._known)}")
+
+    def _line_of(self, key: str) -> int | None:
+        current = ""
+        for number, line in enumerate(self.text.splitlines(), start=1):
+            header = re.match(r"\s*\[\[?\s*([^\]]+?)\s*\]\]?\s*(#.*)?$", line)
+            if header:
+                current = header.group(1).replace('"', "").replace(" ", "")
+                if current == (f"{self.name}.{key}" if self.name else key):
+                    return number
+            elif current == self.name and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line):
+                return number
+        return None
+
+
+def read_toml(path: str | Path) -> Section:
+    """Read a TOML file as the root :class:`Section`; a syntax error, also a doubled key or table, is an InputError."""
+    source = Path(path)
+    text = read_text(source)
+    if not text.strip():
+        raise InputError("is empty", file=source)
+    try:
+        return Section(tomllib.loads(text), path=source, text=text)
+    except tomllib.TOMLDecodeError as error:
+        line = re.search(r"line (\d+)", str(error))
+        raise InputError(
+            f"is not valid TOML: {error}", file=source, line=int(line.group(1)) if line else None
+        ) from error
+
+
+# --- checks: each returns the clean value or raises ValueError with what is expected -----------------------------
+
+
+def number(value: Any) -> float:
+    """A finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError("a finite number is expected")
+    return float(value)
+
+
+def positive(value: Any) -> float:
+    """A finite number above zero."""
+    result = number(value)
+    if result <= 0:
+        raise ValueError("a number above zero is expected")
+    return result
+
+
+def not_negative(value: Any) -> float:
+    """A finite number, zero or more."""
+    result = number(value)
+    if result < 0:
+        raise ValueError("a number that is not negative is expected")
+    return result
+
+
+def whole(minimum: int, maximum: int | None = None) -> Callable[[Any], int]:
+    """A whole number within limits."""
+
+    def check(value: Any) -> int:
+        upper = math.inf if maximum is None else maximum
+        if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= upper:
+            limits = f"from {minimum} to {maximum}" if maximum is not None else f"of at least {minimum}"
+            raise ValueError(f"a whole number {limits} is expected")
+        return value
+
+    return check
+
+
+def flag(value: Any) -> bool:
+    """``true`` or ``false``."""
+    if not isinstance(value, bool):
+        raise ValueError("true or false is expected")
+    return value
+
+
+def text(value: Any) -> str:
+    """One line of text, at most 200 characters."""
+    if not isinstance(value, str) or not value.strip() or len(value) > 200 or any(ord(char) < 32 for char in value):
+        raise ValueError("one line of text is expected")
+    return value
+
+
+def choice(*allowed: str) -> Callable[[Any], str]:
+    """One of the given words."""
+
+    def check(value: Any) -> str:
+        if value not in allowed:
+            raise ValueError(f"one of {', '.join(map(repr, allowed))} is expected")
+        return str(value)
+
+    return check
+
+
+def numbers(value: Any) -> tuple[float, ...]:
+    """A list of finite numbers."""
+    if not isinstance(value, list):
+        raise ValueError("a list of numbers is expected")
+    return tuple(number(item) for item in value)
+
+
+def vector3(value: Any) -> tuple[float, float, float]:
+    """Three finite numbers, for X, Y and Z."""
+    if not isinstance(value, list) or len(value) != 3:
+        raise ValueError("three numbers, for X, Y and Z, are expected")
+    x, y, z = (number(item) for item in value)
+    return x, y, z
+
+
+def interval(value: Any) -> tuple[float, float]:
+    """Two finite numbers, the lower one first."""
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError("two numbers [lower, upper] are expected")
+    lower, upper = number(value[0]), number(value[1])
+    if lower >= upper:
+        raise ValueError("a range [lower, upper] with the lower number first is expected")
+    return lower, upper
+
+
+def ascending(value: Any) -> tuple[float, ...]:
+    """At least two numbers in ascending order."""
+    items = numbers(value)
+    if len(items) < 2 or any(b <= a for a, b in zip(items, items[1:], strict=False)):
+        raise ValueError("at least two numbers in ascending order are expected")
+    return items
+
+
+def _table(value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError("a table ([section]) is expected")
+    return value
+
+
+def _tables(value: Any) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise ValueError("an array of tables ([[section]]) is expected")
+    return value

@@ -1,0 +1,15 @@
+"""The machine model: E = C P to first order, and the exact product of finite rotations."""
+
+from compgen.model.exact import exact_columns, exact_error
+from compgen.model.observability import modelled_errors, observable_errors
+from compgen.model.volumetric import c_matrix, coefficients, volumetric_error
+
+__all__ = [
+    "c_matrix",
+    "coefficients",
+    "exact_columns",
+    "exact_error",
+    "modelled_errors",
+    "observable_errors",
+    "volumetric_error",
+]
