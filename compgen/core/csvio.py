@@ -159,11 +159,9 @@ def _check_header(
         raise InputError(f"the header names {doubled[0]!r} twice", file=source, line=line)
     missing = [name for name in required if name not in header]
     if missing:
-        raise InputError(
-            f"column {missing[0]!r} is missing; needed are {', '.join(required)}; the header has {one_line(', '.join(header))}",
-            file=source,
-            line=line,
-        )
+        needed, present = ", ".join(required), one_line(", ".join(header))
+        message = f"column {missing[0]!r} is missing; needed are {needed}; the header has {present}"
+        raise InputError(message, file=source, line=line)
     for name in header:
         if name not in known and not name.startswith(prefixes or ("\0",)):
             hint = nearest(name, known)

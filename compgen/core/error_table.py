@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -159,7 +159,7 @@ def format_errors(errors: ErrorTable, metadata: Mapping[str, object] | None = No
             positions.append(position)
             values.append(value / unit)
             u_values.append(u_value / unit)
-    columns = {
+    columns: dict[str, Sequence[str] | FloatArray] = {
         "error": names,
         "position_mm": np.array(positions),
         "value": np.array(values),

@@ -101,7 +101,10 @@ def _read_table(path: str | Path) -> CsvTable:
     for row, key in enumerate(zip(*(table.columns[name] for name in key_columns), strict=True)):
         first = seen.setdefault(key, row)
         if first != row:
-            message = f"station {key[0]!r} and point {key[1]!r} stand already in line {table.lines[first]}; give repeats a run or repeat column"
+            message = (
+                f"station {key[0]!r} and point {key[1]!r} stand already in line {table.lines[first]}; "
+                f"give repeats a run or repeat column"
+            )
             raise table.fail(row, "point", message)
     lengths = table.numbers("length_mm")
     for row in np.flatnonzero(np.abs(lengths) > 1e6)[:1]:
@@ -166,8 +169,8 @@ def format_lengths(lengths: Lengths) -> str:
     digits = {"length_mm": 7}
     _add_vectors(columns, digits, POSITION_COLUMNS, lengths.position_mm, 4)
     columns["length_mm"] = lengths.length_mm
-    for name, values in lengths.labels.items():
-        columns[name] = values.astype(np.float64)
+    for name, labels in lengths.labels.items():
+        columns[name] = labels.astype(np.float64)
         digits[name] = 0
     if lengths.approach is not None:
         _add_vectors(columns, digits, APPROACH_COLUMNS, lengths.approach, 0)

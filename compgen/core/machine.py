@@ -20,6 +20,7 @@ from compgen.resources import data_folder
 Vector3 = tuple[float, float, float]
 Reference = Literal["X", "Y"]
 CurveBasis = Literal["linear", "cubic"]
+ErrorSelection = Literal["observable", 17, 21] | tuple[str, ...]
 
 #: The 24 valid chains: W, every order of X, Y, Z and F, then T.
 CHAINS: tuple[str, ...] = tuple(f"W{''.join(order)}T" for order in permutations("FXYZ"))
@@ -82,7 +83,7 @@ class Machine:
     squareness_reference: Reference = "X"
     tool_offset_mm: Vector3 = (0.0, 0.0, 0.0)
     reference_point_mm: Vector3 = (0.0, 0.0, 0.0)
-    errors: Literal["observable", 17, 21] | tuple[str, ...] = "observable"
+    errors: ErrorSelection = "observable"
     curves: CurveBasis = "linear"
     controllers: Mapping[str, tomlio.Section] = field(default_factory=dict)
     source: Path | None = None
@@ -113,7 +114,7 @@ def read_machine(path: str | Path) -> Machine:
     reference = root.take("squareness_reference", tomlio.choice("X", "Y"), "X")
     tool_offset_mm = root.take("tool_offset_mm", tomlio.vector3, (0.0, 0.0, 0.0))
     reference_point_mm = root.take("reference_point_mm", tomlio.vector3, (0.0, 0.0, 0.0))
-    errors = root.take("errors", _error_selection, "observable")
+    errors: ErrorSelection = root.take("errors", _error_selection, "observable")
     curves = root.take("curves", tomlio.choice("linear", "cubic"), "linear")
     axes_section = root.section("axes")
     axes = [_read_axis(axes_section.section(axis), curves) for axis in AXES]
@@ -167,7 +168,7 @@ def _read_axis(section: tomlio.Section, curves: str) -> Axis:
     return axis
 
 
-def _error_selection(value: Any) -> Literal["observable", 17, 21] | tuple[str, ...]:
+def _error_selection(value: Any) -> ErrorSelection:
     if value == "observable" or (value in (17, 21) and not isinstance(value, bool)):
         return cast(Literal["observable", 17, 21], value)
     if not isinstance(value, list) or not value:

@@ -41,10 +41,11 @@ class ErrorName:
 
 
 def _all_errors() -> tuple[ErrorName, ...]:
+    kinds: tuple[tuple[Kind, str], ...] = (("linear", "XYZ"), ("angular", "ABC"))
     curves = [
         ErrorName(f"E{letter}{AXES[axis]}", kind, direction, axis)
         for axis in range(3)
-        for kind, letters in (("linear", "XYZ"), ("angular", "ABC"))
+        for kind, letters in kinds
         for direction, letter in enumerate(letters)
     ]
     squareness = [
@@ -52,7 +53,7 @@ def _all_errors() -> tuple[ErrorName, ...]:
         ErrorName("EB0Z", "squareness", 1, 2),
         ErrorName("EA0Z", "squareness", 0, 2),
     ]
-    return (*curves, *squareness)  # type: ignore[arg-type]
+    return (*curves, *squareness)
 
 
 #: All 21, in the order of the columns of C: six of X, six of Y, six of Z, then EC0Y, EB0Z, EA0Z.

@@ -96,7 +96,7 @@ def tip_position(
 def exact_error(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> FloatArray:
-    """Exact error of the tool tip at commanded positions (n, 3), tip minus (position + tool offset): shape (n, 3), mm."""
+    """Exact error of the tool tip at commanded positions (n, 3): tip minus (position + tool offset), (n, 3), mm."""
     position_mm = np.asarray(position_mm, dtype=np.float64)
     nominal = position_mm + tool_of(machine, tool_mm)
     return tip_position(machine, errors.at(position_mm), position_mm, tool_mm) - nominal
