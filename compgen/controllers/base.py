@@ -1,0 +1,146 @@
+"""What every control has in common: a basis of tables, and text that is built, parsed and emulated.
+
+A control is described by its **basis**: a list of :class:`Term`, each one table (a curve over one axis, or a
+constant) times a carrier field. The stage ``export`` finds the table values whose correction field comes closest to
+the wanted one; the control turns them into its own numbers, parses them back from text, and emulates what it does.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.points import Points
+from compgen.errors import InputError
+from compgen.model.basis import hat_matrix
+from compgen.model.volumetric import factor
+
+Settings = TypeVar("Settings")
+Tables = TypeVar("Tables")
+
+
+@dataclass(frozen=True)
+class Monomial:
+    """A carrier: ``sign`` times (factor minus ``origin_mm``) on axis ``output``.
+
+    ``lever`` as in :class:`compgen.model.volumetric.Coefficient`: None for the factor 1, 0..2 an axis coordinate,
+    3..5 the tool offset.
+    """
+
+    output: int
+    sign: int = 1
+    lever: int | None = None
+    origin_mm: float = 0.0
+
+
+@dataclass(frozen=True)
+class Term:
+    """One table of a control: values at ``nodes_mm`` over ``axis`` (None: one constant), times its carrier.
+
+    Parameters
+    ----------
+    name : unique within the basis, e.g. ``"X(y)"``, ``"X(y)*z"``, ``"EXX"``.
+    axis : 0..2, or None for a constant.
+    nodes_mm : positions of the values, shape (n,); a constant has one (any) position.
+    carrier : the correction in mm is the value times the sum of these monomials.
+    start : natural values, shape (n,); kept in directions that the wanted correction does not determine.
+    zero_at_mm : position where the interpolated value must be zero, or None.
+    """
+
+    name: str
+    axis: int | None
+    nodes_mm: FloatArray
+    carrier: tuple[Monomial, ...]
+    start: FloatArray
+    zero_at_mm: float | None = None
+
+    def curve_matrix(self, position_mm: FloatArray) -> FloatArray:
+        """Interpolation matrix (m, n) at commanded positions (m, 3)."""
+        if self.axis is None:
+            return np.ones((len(position_mm), 1))
+        return hat_matrix(self.nodes_mm, position_mm[:, self.axis])
+
+    def carrier_field(self, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
+        """Carrier at commanded positions (m, 3) with tool offset (3,) or (m, 3): shape (m, 3)."""
+        field = np.zeros((len(position_mm), 3))
+        for part in self.carrier:
+            field[:, part.output] += part.sign * (factor(part.lever, position_mm, tool_mm) - part.origin_mm)
+        return field
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """One file that is to be parsed as controller data: its path and its text."""
+
+    path: Path
+    text: str
+
+    def fail(self, message: str, line: int | None = None) -> InputError:
+        """Return the error that points at a line of this file (counting from 1)."""
+        return InputError(message, file=self.path, line=line)
+
+
+class Controller(ABC, Generic[Settings, Tables]):
+    """One control: everything that is particular to its files and to what it does with them.
+
+    Corrections are in mm, what the control ADDS to the commanded position, shape (n, 3); the sign convention of the
+    stored numbers is the control's own affair and lives in its ``tables``, ``parse`` and ``emulate``.
+    """
+
+    #: Name on the command line, and of its folder below ``templates/``.
+    name: str
+    #: True if a table is zero at the reference point by nature, so that a constant offset cannot be corrected.
+    anchored: bool = False
+
+    @abstractmethod
+    def read_settings(self, machine: Machine) -> Settings:
+        """Check ``[controllers.<name>]`` of the machine file; InputError for what is missing, unknown or wrong."""
+
+    @abstractmethod
+    def basis(self, machine: Machine, settings: Settings, errors: ErrorTable) -> list[Term]:
+        """Return the tables that the control would get for these errors, in correction space (mm added per unit)."""
+
+    @abstractmethod
+    def build(
+        self, machine: Machine, settings: Settings, basis: Sequence[Term], values: Mapping[str, FloatArray]
+    ) -> Tables:
+        """Turn term values (by name, shape of the term's nodes) into the control's own numbers, rounded as written."""
+
+    @abstractmethod
+    def context(self, machine: Machine, settings: Settings, tables: Tables) -> dict[str, Any]:
+        """Return what the Jinja2 templates of the control need beyond the common context."""
+
+    @abstractmethod
+    def parse(self, machine: Machine, settings: Settings, files: Sequence[SourceFile]) -> Tables:
+        """Read the control's numbers back from text; InputError with file and line for anything malformed."""
+
+    @abstractmethod
+    def emulate(self, machine: Machine, settings: Settings, tables: Tables, points: Points) -> FloatArray:
+        """Return what the control adds to the command at each point, shape (n, 3), mm."""
+
+    @abstractmethod
+    def violations(self, machine: Machine, settings: Settings, tables: Tables) -> list[str]:
+        """Return every limit of the control that the tables break, and travel that they do not cover, in words."""
+
+    @abstractmethod
+    def resolution_mm(self, settings: Settings) -> float:
+        """Return the largest correction error that rounding to the format's quantum may cause on one axis, mm."""
+
+
+AnyController = Controller[Any, Any]
+
+
+def coverage_violations(machine: Machine, axis: int, first_mm: float, last_mm: float, what: str) -> list[str]:
+    """Return a message if a table from ``first_mm`` to ``last_mm`` leaves a part of the axis' travel uncovered."""
+    low, high = machine.axes[axis].range_mm
+    if first_mm <= low + 1e-6 and last_mm >= high - 1e-6:
+        return []
+    return [f"{what} covers {first_mm:g} ... {last_mm:g} mm of {'XYZ'[axis]}, the travel is {low:g} ... {high:g} mm"]

@@ -1,0 +1,105 @@
+"""Node positions for tables: where the error curves have theirs, or equidistant where a control demands it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from decimal import ROUND_CEILING, Decimal
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.names import MM_PER_UM, error_named
+from compgen.model.basis import hat_matrix
+
+#: Loss by interpolation between table nodes that is not worth another node, as a displacement of the tool.
+NEGLIGIBLE_LOSS_MM = 0.02 * MM_PER_UM
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Equidistant nodes ``start + k step``, k = 0 ... count - 1, in exact decimal numbers (mm)."""
+
+    start: Decimal
+    step: Decimal
+    count: int
+
+    @property
+    def last(self) -> Decimal:
+        """Position of the last node, exact."""
+        return self.start + (self.count - 1) * self.step
+
+    @property
+    def nodes_mm(self) -> FloatArray:
+        """Node positions, shape (count,)."""
+        return np.array([float(self.start + k * self.step) for k in range(self.count)])
+
+
+def curve_nodes_mm(machine: Machine, errors: ErrorTable, axis: int, most: int = 1000) -> FloatArray:
+    """Return the union of the positions of all curves of an axis within its travel, the travel ends included."""
+    low, high = machine.axes[axis].range_mm
+    curves = [curve for name, curve in errors.curves.items() if error_named(name).axis == axis]
+    positions = np.concatenate([[low, high], *(curve.position_mm for curve in curves)])
+    inside = np.unique(np.round(positions[(positions >= low) & (positions <= high)], 6))
+    return inside if len(inside) <= most else np.linspace(low, high, most)
+
+
+def equidistant_grid(
+    machine: Machine, errors: ErrorTable, axis: int, *, most: int, step_mm: float | None = None, anchor: bool = False
+) -> Grid:
+    """Return an equidistant grid that covers the travel.
+
+    Parameters
+    ----------
+    machine, errors, axis : whose travel and curves are to be held.
+    most : largest number of nodes that the control takes.
+    step_mm : a step that the user asks for; otherwise the widest one that loses nothing that matters.
+    anchor : True if the reference point must be a node.
+    """
+    low, high = machine.axes[axis].range_mm
+    if step_mm is not None:
+        return _grid(machine, axis, Decimal(repr(step_mm)), anchor)
+    nodes = curve_nodes_mm(machine, errors, axis)
+    least = len(nodes) - 1
+    best: Grid | None = None
+    for intervals in range(max(1, min(least, most - 2)), most - 1):
+        step = _round_up(Decimal(repr(high - low)) / intervals)
+        grid = _grid(machine, axis, step, anchor)
+        if grid.count > most:
+            break
+        best = grid
+        if _loss_mm(machine, errors, axis, grid) <= NEGLIGIBLE_LOSS_MM:
+            break
+    return best if best is not None else _grid(machine, axis, _round_up(Decimal(repr(high - low))), anchor)
+
+
+def _round_up(step: Decimal) -> Decimal:
+    rounded = step.quantize(Decimal("0.0001"), rounding=ROUND_CEILING)
+    return max(rounded, Decimal("0.0001"))
+
+
+def _grid(machine: Machine, axis: int, step: Decimal, anchor: bool) -> Grid:
+    low, high = (Decimal(repr(end)) for end in machine.axes[axis].range_mm)
+    origin = Decimal(repr(machine.reference_point_mm[axis])) if anchor else low
+    below = math.ceil((origin - low) / step)
+    above = math.ceil((high - origin) / step)
+    return Grid(origin - below * step, step, below + above + 1)
+
+
+def _loss_mm(machine: Machine, errors: ErrorTable, axis: int, grid: Grid) -> float:
+    """Largest displacement that interpolation on ``grid`` loses of any curve of the axis (angles at their lever)."""
+    reach_mm = max(
+        1.0,
+        float(np.max(np.abs(np.concatenate([machine.lower_mm, machine.upper_mm, machine.tool_offset_mm])))),
+    )
+    loss = 0.0
+    for name, curve in errors.curves.items():
+        if error_named(name).axis == axis:
+            nodes = grid.nodes_mm
+            inside = curve.position_mm
+            difference = hat_matrix(nodes, inside) @ curve.at(nodes) - curve.value
+            lever = 1.0 if error_named(name).kind == "linear" else reach_mm
+            loss = max(loss, lever * float(np.max(np.abs(difference))))
+    return loss

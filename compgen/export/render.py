@@ -1,0 +1,150 @@
+"""Controller files through Jinja2: strict about missing values, sandboxed, nothing of a user's text is executed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+from jinja2 import ChoiceLoader, FileSystemLoader, StrictUndefined, TemplateError
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from compgen.core import tomlio
+from compgen.core.csvio import fixed
+from compgen.core.text import one_line
+from compgen.errors import InputError
+from compgen.resources import data_folder
+
+
+@dataclass(frozen=True)
+class FileSpec:
+    """One file of a format: its template, its name, and its line end."""
+
+    template: str
+    name: str
+    line_end: str
+
+
+@dataclass(frozen=True)
+class Format:
+    """The card of a control's format as ``templates/<name>/format.toml`` has it.
+
+    ``evidence`` is ``"documented"`` or ``"unverified"``; ``unverified`` lists what no public document settles.
+    """
+
+    name: str
+    title: str
+    summary: str
+    expresses: str
+    evidence: str
+    files: tuple[FileSpec, ...]
+    limits: tuple[str, ...]
+    unverified: tuple[str, ...]
+    sources: tuple[str, ...]
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise ValueError("a list of texts is expected")
+    return tuple(" ".join(item.split()) for item in value)
+
+
+def _prose(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError("a text is expected")
+    return " ".join(value.split())
+
+
+def load_format(name: str, folder: Path | None = None) -> Format:
+    """Load the card of format ``name`` from ``folder`` (the user's templates), else from the shipped ones."""
+    for base in (*((folder,) if folder else ()), data_folder("templates")):
+        path = base / name / "format.toml"
+        if path.is_file():
+            return _read_format(path)
+    raise InputError(f"no format.toml for {name!r} in {folder or data_folder('templates')}")
+
+
+def _read_format(path: Path) -> Format:
+    root = tomlio.read_toml(path)
+    files = []
+    for section in root.sections("files"):
+        spec = FileSpec(
+            template=section.take("template", tomlio.text),
+            name=section.take("name", tomlio.text),
+            line_end={"lf": "\n", "crlf": "\r\n"}[section.take("line_end", tomlio.choice("lf", "crlf"), "lf")],
+        )
+        section.finish()
+        files.append(spec)
+    card = Format(
+        name=root.take("name", tomlio.text),
+        title=root.take("title", tomlio.text),
+        summary=root.take("summary", _prose),
+        expresses=root.take("expresses", _prose),
+        evidence=root.take("evidence", tomlio.choice("documented", "unverified")),
+        files=tuple(files),
+        limits=root.take("limits", _texts),
+        unverified=root.take("unverified", _texts, ()),
+        sources=root.take("sources", _texts),
+    )
+    root.finish()
+    return card
+
+
+def _environment(folders: Sequence[Path]) -> ImmutableSandboxedEnvironment:
+    environment = ImmutableSandboxedEnvironment(
+        loader=ChoiceLoader([FileSystemLoader(folder) for folder in folders]),
+        undefined=StrictUndefined,
+        autoescape=False,
+        keep_trailing_newline=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["fixed"] = _fixed_filter
+    environment.filters["plain"] = lambda value: one_line(value)
+    return environment
+
+
+def _fixed_filter(value: float | Decimal, digits: int) -> str:
+    return fixed(float(value), digits)
+
+
+def _inert(value: Any) -> Any:
+    """Text of a user becomes one line of printable ASCII; containers are passed through item by item."""
+    if isinstance(value, str):
+        return one_line(value)
+    if isinstance(value, Mapping):
+        return {key: _inert(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_inert(item) for item in value]
+    return value
+
+
+def render(card: Format, template: str, context: Mapping[str, Any], folder: Path | None = None) -> str:
+    """Render one template of a format.
+
+    Parameters
+    ----------
+    card : the format.
+    template : file name below the format's folder.
+    context : values; texts are flattened to one line of printable ASCII before they reach the template.
+    folder : a user's templates folder, searched before the shipped one.
+    """
+    folders = [*((folder,) if folder else ()), data_folder("templates")]
+    try:
+        page = _environment(folders).get_template(f"{card.name}/{template}")
+        return page.render({**{key: _inert(value) for key, value in context.items()}, "format": card})
+    except TemplateError as error:
+        raise InputError(
+            f"the template cannot be rendered: {error}", file=f"templates/{card.name}/{template}"
+        ) from error
+
+
+def render_files(card: Format, context: Mapping[str, Any], folder: Path | None = None) -> dict[str, str]:
+    """Render every file of a format and return the texts by file name, with the format's line ends."""
+    texts = {}
+    for spec in card.files:
+        text = render(card, spec.template, context, folder)
+        texts[spec.name] = text.replace("\n", spec.line_end) if spec.line_end != "\n" else text
+    return texts

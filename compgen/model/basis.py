@@ -1,0 +1,58 @@
+"""Bases of curves over one axis: hat functions between nodes, and null spaces of a few linear constraints."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import null_space
+
+from compgen.core.csvio import FloatArray
+
+
+def hat_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
+    """Matrix (m, n) that interpolates values at ``nodes_mm`` (n,) linearly at ``position_mm`` (m,), constant outside.
+
+    >>> hat_matrix(np.array([0.0, 10.0, 30.0]), np.array([5.0, 30.0, 99.0]))
+    array([[0.5, 0.5, 0. ],
+           [0. , 0. , 1. ],
+           [0. , 0. , 1. ]])
+    """
+    nodes, position = np.asarray(nodes_mm), np.asarray(position_mm)
+    matrix = np.zeros((len(position), len(nodes)))
+    rows = np.arange(len(position))
+    if len(nodes) == 1:
+        matrix[:, 0] = 1.0
+        return matrix
+    left = np.clip(np.searchsorted(nodes, position, side="right") - 1, 0, len(nodes) - 2)
+    share = np.clip((position - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
+    matrix[rows, left] = 1.0 - share
+    matrix[rows, left + 1] += share
+    return matrix
+
+
+def spline_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
+    """Matrix (m, n) of the clamped cubic B-splines with n coefficients over the range of ``nodes_mm`` (n,).
+
+    The knots are spread like the nodes (averages of three neighbouring nodes), first and last fourfold, so that the
+    first and the last coefficient are the end values. Positions (m,) outside the range get the end value.
+    """
+    nodes = np.asarray(nodes_mm, dtype=np.float64)
+    inner = (nodes[1:-3] + nodes[2:-2] + nodes[3:-1]) / 3.0
+    knots = np.concatenate([np.repeat(nodes[0], 4), inner, np.repeat(nodes[-1], 4)])
+    inside = np.clip(position_mm, nodes[0], nodes[-1])
+    return np.asarray(BSpline.design_matrix(inside, knots, 3).toarray(), dtype=np.float64)
+
+
+def free_basis(constraints: FloatArray, size: int) -> FloatArray:
+    """Orthonormal-or-unit basis (size, free) of all x with ``constraints`` (k, size) x = 0.
+
+    Rows with a single entry just drop that unknown, so that the rest keep their meaning (and exact zeros).
+    """
+    rows = np.atleast_2d(constraints) if np.size(constraints) else np.zeros((0, size))
+    single = np.count_nonzero(rows, axis=1) == 1
+    dropped = {int(np.flatnonzero(row)[0]) for row in rows[single]}
+    kept = [k for k in range(size) if k not in dropped]
+    basis = np.eye(size)[:, kept]
+    rest = rows[~single] @ basis
+    rest = rest[np.any(rest != 0.0, axis=1)]
+    return basis @ np.asarray(null_space(rest), dtype=np.float64) if len(rest) else basis
