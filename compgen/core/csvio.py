@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from compgen.core.text import nearest, one_line
 from compgen.errors import CompgenWarning, InputError
 
 FloatArray = NDArray[np.float64]
+_LARGEST_LABEL = 2.0**53
 
 
 @dataclass(frozen=True)
@@ -50,14 +53,14 @@ class CsvTable:
     def numbers(self, column: str, *, empty: float | None = None) -> FloatArray:
         """Return a column as finite numbers, shape (rows,); empty cells become ``empty`` if that is given."""
         cells = self.columns[column]
-        if empty is not None and any(not cell for cell in cells):
-            filled = [cell or repr(empty) for cell in cells]
-        else:
-            filled = list(cells)
+        filled = list(cells) if empty is None else [cell or repr(empty) for cell in cells]
         try:
             values = np.array(filled, dtype=np.float64)
         except ValueError:
             raise self._bad_number(column, filled) from None
+        together = "".join(filled)
+        if "_" in together or not together.isascii():  # Python reads 1_000 and digits of other scripts; a file may not
+            raise self._bad_number(column, filled)
         if not np.isfinite(values).all():
             row = next((k for k in range(len(cells)) if cells[k] and not math.isfinite(values[k])), None)
             if row is not None:
@@ -66,9 +69,7 @@ class CsvTable:
 
     def _bad_number(self, column: str, cells: Sequence[str]) -> InputError:
         for row, cell in enumerate(cells):
-            try:
-                float(cell)
-            except ValueError:
+            if not _is_number(cell):
                 what = "is empty" if not cell else f"{one_line(cell)[:40]!r} is not a number"
                 return self.fail(row, column, f"{what}; a number with '.' as decimal point is due")
         return InputError("holds text where numbers are due", file=self.path, field=f"column {column}")
@@ -76,12 +77,28 @@ class CsvTable:
     def labels(self, column: str) -> NDArray[np.int64]:
         """Return a column of whole-number labels, shape (rows,)."""
         values = self.numbers(column)
-        whole = values.astype(np.int64)
-        wrong = np.flatnonzero(whole != values)
+        wrong = np.flatnonzero((values != np.round(values)) | (np.abs(values) > _LARGEST_LABEL))
         if wrong.size:
             row = int(wrong[0])
-            raise self.fail(row, column, f"{self.columns[column][row]!r} is not a whole number")
-        return whole
+            raise self.fail(row, column, f"{self.columns[column][row]!r} is not a whole number below 2^53")
+        return values.astype(np.int64)
+
+    def signs(self, column: str) -> FloatArray:
+        """Return a column of directions of travel, +1, -1 or 0 (unknown), shape (rows,)."""
+        values = self.numbers(column)
+        wrong = np.flatnonzero(~np.isin(values, (-1.0, 0.0, 1.0)))
+        if wrong.size:
+            row = int(wrong[0])
+            raise self.fail(row, column, f"{self.columns[column][row]!r} is not a direction; 1, -1 or 0 is due")
+        return values
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return cell.isascii() and "_" not in cell
 
 
 def read_csv(
@@ -93,7 +110,7 @@ def read_csv(
     ----------
     path : the file.
     required, optional : column names; others are left out with a warning.
-    prefixes : further allowed columns begin with one of these (e.g. ``temp_``).
+    prefixes : further allowed columns begin with one of these (e.g. ``temp_``), or match one that holds a ``*``.
 
     Raises
     ------
@@ -119,16 +136,20 @@ def read_csv(
     columns = {
         name: [cell.strip() for cell in cells]
         for name, cells in zip(header, zip(*rows, strict=True), strict=True)
-        if name in known or name.startswith(prefixes or ("\0",))
+        if _is_allowed(name, known, prefixes)
     }
     return CsvTable(source, columns, lines, metadata)
+
+
+def _is_allowed(name: str, known: set[str], patterns: tuple[str, ...]) -> bool:
+    return name in known or any(fnmatchcase(name, p if "*" in p else f"{p}*") for p in patterns)
 
 
 def _split(source: Path, content: str) -> tuple[int, list[str], list[list[str]], list[int], dict[str, str]]:
     metadata: dict[str, str] = {}
     numbers: list[int] = []
     data: list[str] = []
-    for number, line in enumerate(content.splitlines(), start=1):
+    for number, line in enumerate(re.split(r"\r\n|\r|\n", content), start=1):
         stripped = line.strip()
         if stripped.startswith("#"):
             key, equals, value = stripped.lstrip("#").partition("=")
@@ -141,10 +162,12 @@ def _split(source: Path, content: str) -> tuple[int, list[str], list[list[str]],
         return 0, [], [], [], metadata
     if "\0" in content:
         raise InputError("holds NUL bytes; it is not a text file", file=source)
+    reader = csv.reader(data, strict=True, skipinitialspace=True)
     try:
-        parsed = list(csv.reader(data, strict=True))
+        parsed = list(reader)
     except csv.Error as error:
-        raise InputError(f"is not readable as CSV: {error}", file=source) from error
+        line = numbers[max(reader.line_num, 1) - 1]
+        raise InputError(f"is not readable as CSV: {error}", file=source, line=line) from error
     if len(parsed) != len(data):
         raise InputError("a quoted field runs over a line end; write each row on one line", file=source)
     header = [name.strip() for name in parsed[0]]
@@ -160,10 +183,11 @@ def _check_header(
     missing = [name for name in required if name not in header]
     if missing:
         needed, present = ", ".join(required), one_line(", ".join(header))
-        message = f"column {missing[0]!r} is missing; needed are {needed}; the header has {present}"
+        hint = "; separate columns by commas" if len(header) == 1 and re.search(r"[;\t]", header[0]) else ""
+        message = f"column {missing[0]!r} is missing; needed are {needed}; the header has {present}{hint}"
         raise InputError(message, file=source, line=line)
     for name in header:
-        if name not in known and not name.startswith(prefixes or ("\0",)):
+        if not _is_allowed(name, known, prefixes):
             hint = nearest(name, known)
             warnings.warn(
                 f"{source}:{line}: column {one_line(name)!r} is not known and left out; {hint}", CompgenWarning, 4
@@ -173,14 +197,20 @@ def _check_header(
 def _check_complete(
     source: Path, content: str, rows: list[list[str]], lines: list[int], metadata: dict[str, str]
 ) -> None:
-    """A file that was cut is refused: by its declared number of rows, or by a shorter last number without line end."""
+    """A file that was cut is refused: by what it declares, or by a shorter last number without line end.
+
+    A file that declares its rows was written by a program and ends with a line end; one that does not may lack it.
+    """
     declared = metadata.get("rows")
     if declared is not None and declared != str(len(rows)):
         raise InputError(f"declares {one_line(declared)} rows but holds {len(rows)}: is it truncated?", file=source)
-    if content.endswith(("\n", "\r")) or len(rows) < 3:
+    if content.endswith(("\n", "\r")):
         return
-    decimals = {len(row[-1].strip().partition(".")[2]) for row in rows[:-1]}
-    if len(decimals) == 1 and len(rows[-1][-1].strip().partition(".")[2]) < decimals.pop():
+    if declared is not None:
+        message = "the last line has no line end: the file is truncated; if it is complete, end the line"
+        raise InputError(message, file=source, line=lines[-1])
+    *before, last = [len(row[-1].strip().partition(".")[2]) for row in rows]
+    if len(before) > 1 and last < min(before):
         message = "the last line has no line end and fewer decimals than the others: the file is truncated"
         raise InputError(message, file=source, line=lines[-1])
 
@@ -223,5 +253,7 @@ def fixed(value: float, digits: int) -> str:
     """
     if math.isnan(value):
         return ""
+    if math.isinf(value):
+        raise ValueError("an infinite number cannot be written to a table")
     text = f"{value:.{digits}f}"
     return text[1:] if text.startswith("-") and not text.strip("-0.") else text

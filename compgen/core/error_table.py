@@ -29,8 +29,8 @@ class Curve:
     def __post_init__(self) -> None:
         if not len(self.position_mm) == len(self.value) == len(self.u) > 0:
             raise ValueError(f"lengths differ: {len(self.position_mm)}, {len(self.value)}, {len(self.u)}")
-        if np.any(np.diff(self.position_mm) <= 0):
-            raise ValueError("positions of a curve must ascend")
+        if not np.all(np.isfinite(self.position_mm)) or np.any(np.diff(self.position_mm) <= 0):
+            raise ValueError("positions of a curve must be finite and ascend")
 
     def at(self, position_mm: FloatArray) -> FloatArray:
         """Value at the given positions, same shape."""
@@ -49,9 +49,13 @@ class ErrorTable:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in (*self.curves, *self.squareness):
-            if name not in ERROR_INDEX:
-                raise ValueError(f"{name!r} is not one of the 21 errors")
+        for names, allowed, what in (
+            (self.curves, CURVE_NAMES, "18 errors that are functions"),
+            (self.squareness, SQUARENESS_NAMES, "3 squareness errors"),
+        ):
+            for name in names:
+                if name not in allowed:
+                    raise ValueError(f"{name!r} is not one of the {what}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -93,7 +97,8 @@ def read_errors(path: str | Path) -> ErrorTable:
     table = read_csv(path, required=("error", "position_mm", "value"), optional=("u_value",))
     names = table.text("error")
     values = table.numbers("value")
-    u_values = table.numbers("u_value", empty=np.nan) if "u_value" in table.columns else np.full(len(values), np.nan)
+    u_values = _uncertainties(table)
+    positions_mm = table.numbers("position_mm", empty=np.nan)
     curves: dict[str, Curve] = {}
     squareness: dict[str, tuple[float, float]] = {}
     rows_of: dict[str, list[int]] = {}
@@ -107,7 +112,8 @@ def read_errors(path: str | Path) -> ErrorTable:
             _check_constant(table, name, rows)
             squareness[name] = (float(values[rows[0]]) * unit, float(u_values[rows[0]]) * unit)
         else:
-            position_mm = _positions(table, rows)
+            _check_positions(table, name, rows, positions_mm)
+            position_mm = positions_mm[rows]
             order = np.argsort(position_mm)
             picked = np.array(rows)[order]
             curves[name] = Curve(position_mm[order], values[picked] * unit, u_values[picked] * unit)
@@ -121,24 +127,25 @@ def _check_constant(table: CsvTable, name: str, rows: list[int]) -> None:
         raise table.fail(rows[0], "position_mm", f"{name} is a constant; leave its position empty")
 
 
-def _positions(table: CsvTable, rows: list[int]) -> FloatArray:
+def _check_positions(table: CsvTable, name: str, rows: list[int], positions_mm: FloatArray) -> None:
     seen: dict[float, int] = {}
-    positions = []
     for row in rows:
-        cell = table.columns["position_mm"][row]
-        try:
-            position = float(cell)
-        except ValueError:
-            raise table.fail(row, "position_mm", f"{cell!r} is not a number; a position in mm is due") from None
-        if not np.isfinite(position):
-            raise table.fail(row, "position_mm", f"{cell!r} is not a finite number")
-        if position in seen:
-            raise table.fail(
-                row, "position_mm", f"this error has {position:g} mm already in line {table.lines[seen[position]]}"
-            )
-        seen[position] = row
-        positions.append(position)
-    return np.array(positions)
+        position = float(positions_mm[row])
+        if np.isnan(position):
+            raise table.fail(row, "position_mm", f"is empty; {name} is a function and needs a position in mm")
+        first = seen.setdefault(position, row)
+        if first != row:
+            message = f"{name} has a value at {position:g} mm already in line {table.lines[first]}"
+            raise table.fail(row, "position_mm", message)
+
+
+def _uncertainties(table: CsvTable) -> FloatArray:
+    if "u_value" not in table.columns:
+        return np.full(len(table), np.nan)
+    u_values = table.numbers("u_value", empty=np.nan)
+    for row in np.flatnonzero(u_values < 0)[:1]:
+        raise table.fail(int(row), "u_value", f"{u_values[row]:g} is negative; a standard uncertainty is not")
+    return u_values
 
 
 def format_errors(errors: ErrorTable, metadata: Mapping[str, object] | None = None) -> str:

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import os
 import tempfile
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from compgen.errors import InputError
@@ -33,10 +34,13 @@ class OutputFolder:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self._contents: dict[str, bytes] = {}
-        existing = self.folder
-        while not existing.exists() and existing != existing.parent:
-            existing = existing.parent
-        _check_folder(existing)
+        try:
+            existing = self.folder
+            while not existing.exists() and existing != existing.parent:
+                existing = existing.parent
+            _check_folder(existing)
+        except OSError as error:
+            raise InputError(f"cannot be used: {error.strerror or error}", file=self.folder) from error
 
     def add(self, name: str, content: str | bytes) -> None:
         """Remember ``content`` (text is encoded as UTF-8, line ends kept) for the file ``name``."""
@@ -44,27 +48,64 @@ class OutputFolder:
 
     def commit(self) -> dict[str, Path]:
         """Write everything and return the path of each file by name."""
+        paths = {name: self.folder / name for name in self._contents}
         temporary: dict[str, Path] = {}
+        made = _missing_folders(paths.values())
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            for path in paths.values():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if path.is_dir():
+                    raise IsADirectoryError(21, f"{path.name} is a folder")
             for name, content in self._contents.items():
-                temporary[name] = _write_temporary(self.folder / name, content)
-            paths = {name: self.folder / name for name in self._contents}
-            for name, path in temporary.items():
-                os.replace(path, paths[name])
+                temporary[name] = _write_temporary(paths[name], content)
+            _replace_all([(temporary[name], paths[name]) for name in paths])
         except OSError as error:
+            _remove([*temporary.values()], made)
             raise InputError(
                 f"cannot write: {error.strerror or error}; nothing was written", file=self.folder
             ) from error
-        finally:
-            for path in temporary.values():
-                with contextlib.suppress(OSError):
-                    path.unlink(missing_ok=True)
+        except BaseException:
+            _remove([*temporary.values()], made)
+            raise
         return paths
 
 
+def _missing_folders(targets: Iterable[Path]) -> list[Path]:
+    """Folders that have to be made for the targets, the innermost first."""
+    missing = {folder for target in targets for folder in target.parents if not folder.exists()}
+    return sorted(missing, key=lambda folder: len(folder.parts), reverse=True)
+
+
+def _remove(files: Iterable[Path], folders: Iterable[Path]) -> None:
+    """Remove temporary files, then the folders made for them as far as they are empty."""
+    for path in files:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def _replace_all(moves: Sequence[tuple[Path, Path]]) -> None:
+    """Rename each first path to the second; if one fails, put back what stood there before."""
+    before = {target: target.read_bytes() if target.exists() else None for _, target in moves}
+    done: list[Path] = []
+    try:
+        for source, target in moves:
+            os.replace(source, target)
+            done.append(target)
+    except BaseException:
+        for target in done:
+            content = before[target]
+            with contextlib.suppress(OSError):
+                if content is None:
+                    target.unlink()
+                else:
+                    os.replace(_write_temporary(target, content), target)
+        raise
+
+
 def _write_temporary(target: Path, content: bytes) -> Path:
-    target.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
     path = Path(name)
     try:
@@ -96,9 +137,9 @@ def write_file(path: str | Path, content: str | bytes) -> Path:
 def read_bytes(path: str | Path) -> bytes:
     """Return the contents of ``path`` or raise an InputError that says why not."""
     source = Path(path)
-    if source.is_dir():
-        raise InputError("is a folder; a file is needed", file=source)
     try:
+        if source.is_dir():
+            raise InputError("is a folder; a file is needed", file=source)
         return source.read_bytes()
     except FileNotFoundError as error:
         raise InputError("no such file", file=source) from error

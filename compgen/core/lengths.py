@@ -64,6 +64,7 @@ def read_lengths(paths: str | Path | Sequence[str | Path]) -> Lengths:
     if not files:
         raise InputError("no measurement file was given")
     tables = [_read_table(path) for path in files]
+    _check_distinct(tables)
     names = tuple(dict.fromkeys(name for table in tables for name in table.text("station")))
     index = {name: k for k, name in enumerate(names)}
     return Lengths(
@@ -90,7 +91,7 @@ def _read_table(path: str | Path) -> CsvTable:
         path,
         required=("station", "point", *POSITION_COLUMNS, "length_mm"),
         optional=("approach", *TOOL_COLUMNS, *APPROACH_COLUMNS, *LABEL_COLUMNS, *COVARIATE_COLUMNS),
-        prefixes=("temp_",),
+        prefixes=("temp_*_c",),
     )
     key_columns = [
         name
@@ -110,6 +111,14 @@ def _read_table(path: str | Path) -> CsvTable:
     for row in np.flatnonzero(np.abs(lengths) > 1e6)[:1]:
         raise table.fail(int(row), "length_mm", f"{lengths[row]:g} mm is more than a kilometre; is the unit mm?")
     return table
+
+
+def _check_distinct(tables: list[CsvTable]) -> None:
+    """The same readings may not come in twice, as one file given twice or as a copy of it."""
+    for k, table in enumerate(tables):
+        for earlier in tables[:k]:
+            if table.columns == earlier.columns:
+                raise InputError(f"holds the same rows as {earlier.path}; give each measurement once", file=table.path)
 
 
 def _vectors(table: CsvTable, names: Sequence[str]) -> FloatArray:
@@ -141,7 +150,7 @@ def _common_approach(tables: list[CsvTable]) -> FloatArray | None:
         return None
     blocks = []
     for table in tables:
-        block = [table.numbers(n) if n in table.columns else np.zeros(len(table)) for n in APPROACH_COLUMNS]
+        block = [table.signs(n) if n in table.columns else np.zeros(len(table)) for n in APPROACH_COLUMNS]
         blocks.append(np.column_stack(block))
     return np.concatenate(blocks)
 
@@ -152,6 +161,9 @@ def _common_covariates(tables: list[CsvTable]) -> dict[str, FloatArray]:
         for name in dict.fromkeys(name for table in tables for name in table.columns)
         if name in (*COVARIATE_COLUMNS, "approach") or name.startswith("temp_")
     ]
+    for table in tables:
+        if "approach" in table.columns:
+            table.signs("approach")
     return {
         name: np.concatenate(
             [table.numbers(name) if name in table.columns else np.full(len(table), np.nan) for table in tables]
@@ -161,13 +173,13 @@ def _common_covariates(tables: list[CsvTable]) -> dict[str, FloatArray]:
 
 
 def format_lengths(lengths: Lengths) -> str:
-    """Return the text of a ``*.lengths.csv`` file: positions with 4 decimals, lengths with 7 (0.1 nm)."""
+    """Return the text of a ``*.lengths.csv`` file: positions with 6 decimals (1 nm), lengths with 7."""
     columns: dict[str, Sequence[str] | FloatArray] = {
         "station": [lengths.stations[k] for k in lengths.station],
         "point": list(lengths.point),
     }
     digits = {"length_mm": 7}
-    _add_vectors(columns, digits, POSITION_COLUMNS, lengths.position_mm, 4)
+    _add_vectors(columns, digits, POSITION_COLUMNS, lengths.position_mm, 6)
     columns["length_mm"] = lengths.length_mm
     for name, labels in lengths.labels.items():
         columns[name] = labels.astype(np.float64)
@@ -175,7 +187,7 @@ def format_lengths(lengths: Lengths) -> str:
     if lengths.approach is not None:
         _add_vectors(columns, digits, APPROACH_COLUMNS, lengths.approach, 0)
     if lengths.tool_mm is not None:
-        _add_vectors(columns, digits, TOOL_COLUMNS, lengths.tool_mm, 4)
+        _add_vectors(columns, digits, TOOL_COLUMNS, lengths.tool_mm, 6)
     for name, values in lengths.covariates.items():
         columns[name] = values
         digits[name] = 3

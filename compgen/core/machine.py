@@ -127,7 +127,7 @@ def read_machine(path: str | Path) -> Machine:
             raise root.fail(
                 "reference_point_mm",
                 f"{axis_name} = {reference_mm:g} mm lies outside the travel {low:g} ... {high:g} mm; the "
-                f"position-dependent errors are zero there, so it must lie within the travel",
+                f"position-dependent errors are zero there, so it must lie within the travel; set reference_point_mm",
             )
     root.finish()
     return Machine(

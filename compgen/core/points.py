@@ -41,7 +41,8 @@ def read_points(path: str | Path) -> Points:
         present = [name for name in names if name in table.columns]
         if present and len(present) < 3:
             raise InputError(f"has {present[0]} but not all of {', '.join(names)}", file=table.path)
-        groups.append(np.column_stack([table.numbers(name) for name in names]) if present else None)
+        read = table.signs if names is APPROACH_COLUMNS else table.numbers
+        groups.append(np.column_stack([read(name) for name in names]) if present else None)
     position_mm = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
     return Points(position_mm, tool_mm=groups[0], approach=groups[1])
 

@@ -26,6 +26,7 @@ class Section:
 
     def __init__(self, data: Mapping[str, Any], *, path: Path | None, text: str = "", name: str = "") -> None:
         self.data, self.path, self.text, self.name = dict(data), path, text, name
+        self._nth = 0  # which of the tables of that name, for an array of tables
         self._known: set[str] = set()
 
     def fail(self, key: str, message: str) -> InputError:
@@ -64,7 +65,10 @@ class Section:
         """Return the sub-sections of an array of tables (``[[key]]``), empty if absent."""
         full = f"{self.name}.{key}" if self.name else key
         tables = self.take(key, _tables, [])
-        return [Section(table, path=self.path, text=self.text, name=full) for table in tables]
+        found = [Section(table, path=self.path, text=self.text, name=full) for table in tables]
+        for nth, section in enumerate(found):
+            section._nth = nth
+        return found
 
     def finish(self) -> None:
         """Raise InputError for the first key that was never asked for."""
@@ -73,16 +77,21 @@ class Section:
                 raise self.fail(key, f"is not a known key; {nearest(key, self._known)}")
 
     def _line_of(self, key: str) -> int | None:
-        current = ""
-        for number, line in enumerate(self.text.splitlines(), start=1):
-            header = re.match(r"\s*\[\[?\s*([^\]]+?)\s*\]\]?\s*(#.*)?$", line)
+        """Line of ``key``, or of its table's header if the key itself stands nowhere."""
+        full = f"{self.name}.{key}" if self.name else key
+        inside, count, own = not self.name, -1, None
+        for number, line in enumerate(self.text.split("\n"), start=1):
+            header = re.match(r"\s*\[\[?\s*([^\[\],]+?)\s*\]\]?\s*(#.*)?$", line)
             if header:
-                current = header.group(1).replace('"', "").replace(" ", "")
-                if current == (f"{self.name}.{key}" if self.name else key):
+                table = re.sub(r"[\"' ]", "", header.group(1))
+                count += table == self.name
+                inside = table == self.name and count == self._nth
+                own = number if inside else own
+                if table == full and max(count, 0) == self._nth:
                     return number
-            elif current == self.name and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line):
+            elif inside and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line):
                 return number
-        return None
+        return own
 
 
 def read_toml(path: str | Path) -> Section:
@@ -93,11 +102,10 @@ def read_toml(path: str | Path) -> Section:
         raise InputError("is empty", file=source)
     try:
         return Section(tomllib.loads(text), path=source, text=text)
-    except tomllib.TOMLDecodeError as error:
-        line = re.search(r"line (\d+)", str(error))
-        raise InputError(
-            f"is not valid TOML: {error}", file=source, line=int(line.group(1)) if line else None
-        ) from error
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
+        found = re.search(r"line (\d+)", str(error))
+        line = int(found.group(1)) if found else len(text.splitlines())
+        raise InputError(f"is not valid TOML: {error}", file=source, line=line) from error
 
 
 # --- checks: each returns the clean value or raises ValueError with what is expected -----------------------------
@@ -105,7 +113,7 @@ def read_toml(path: str | Path) -> Section:
 
 def number(value: Any) -> float:
     """A finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
         raise ValueError("a finite number is expected")
     return float(value)
 

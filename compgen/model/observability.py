@@ -8,6 +8,9 @@ from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import ERROR_NAMES, ERRORS
 
+_SAME_TOOL_MM = 1e-9
+_PARALLEL = 1e-6  # sine of the angle below which two lever arms count as parallel
+
 
 def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> tuple[str, ...]:
     """Return the names of the errors that can be told from every other one.
@@ -15,6 +18,8 @@ def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> t
     A linear error and a squareness error always can. An angular error can if the travel of ANOTHER axis is a lever
     arm of it, or if tools of different offset were used: with its own travel or one tool alone it acts as a function
     of its own axis only, which is that axis' straightness or positioning. For one tool this leaves 17 on every chain.
+    If all lever arms of an axis are parallel, the rotation about them moves nothing; one error is left out for it
+    and the others, taken together, do what it would do for those tools.
 
     Parameters
     ----------
@@ -22,14 +27,23 @@ def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> t
     tools_mm : the tool offsets that were used, shape (n, 3); default: one tool.
     """
     tools = np.zeros((1, 3)) if tools_mm is None else np.atleast_2d(tools_mm)
-    spread = np.ptp(tools, axis=0) > 1e-9
-    names = []
-    for error in ERRORS:
-        levers = [axis for axis in machine.chain.lever_axes(error.axis) if axis != error.axis]
-        across = [axis for axis in range(3) if axis != error.direction]
-        if error.kind != "angular" or any(axis in levers or spread[axis] for axis in across):
-            names.append(error.name)
-    return tuple(names)
+    idle = [_idle_rotations(machine, axis, tools) for axis in range(3)]
+    return tuple(error.name for error in ERRORS if error.kind != "angular" or error.direction not in idle[error.axis])
+
+
+def _idle_rotations(machine: Machine, axis: int, tools_mm: FloatArray) -> set[int]:
+    """Directions (0, 1, 2) of the angular errors of ``axis`` that its lever arms do not show."""
+    travel = np.eye(3)[[other for other in machine.chain.lever_axes(axis) if other != axis]]
+    spread = tools_mm - tools_mm.mean(axis=0)
+    longest = np.linalg.norm(spread, axis=1).max()
+    levers = np.vstack([travel, spread / longest]) if longest > _SAME_TOOL_MM else travel
+    if not len(levers):
+        return {0, 1, 2}
+    _, lengths, directions = np.linalg.svd(levers)
+    if len(lengths) > 1 and lengths[1] > _PARALLEL:
+        return set()
+    components = np.abs(directions[0])
+    return {int(np.flatnonzero(components > _PARALLEL)[-1])}
 
 
 def modelled_errors(machine: Machine, tools_mm: FloatArray | None = None) -> tuple[str, ...]:
