@@ -1,1 +1,26 @@
-"""simulate."""
+"""A virtual machine and virtual instruments: measurement files whose truth is known."""
+
+from compgen.simulate.laser_tracer import LaserTracer, Station
+from compgen.simulate.run import Simulation, actual_tips, simulate, write_simulation
+from compgen.simulate.scenario import Scenario, read_scenario
+from compgen.simulate.trajectory import Line, Stops, Trajectory, plan_stops, trajectory_points
+from compgen.simulate.truth import RandomErrors, TruthPlan, draw_truth
+
+__all__ = [
+    "LaserTracer",
+    "Line",
+    "RandomErrors",
+    "Scenario",
+    "Simulation",
+    "Station",
+    "Stops",
+    "Trajectory",
+    "TruthPlan",
+    "actual_tips",
+    "draw_truth",
+    "plan_stops",
+    "read_scenario",
+    "simulate",
+    "trajectory_points",
+    "write_simulation",
+]

@@ -1,0 +1,100 @@
+"""Run a scenario on a virtual machine: true errors -> tips -> readings -> files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable, format_errors
+from compgen.core.files import OutputFolder
+from compgen.core.lengths import Lengths, format_lengths
+from compgen.core.machine import Machine
+from compgen.errors import InputError
+from compgen.model.exact import tip_position
+from compgen.simulate.laser_tracer import Station
+from compgen.simulate.scenario import Scenario
+from compgen.simulate.trajectory import Stops, plan_stops
+from compgen.simulate.truth import child_seeds, draw_truth, random_stream
+
+#: Children of the seed: one for the errors, one for the noise.
+ERROR_STREAM, NOISE_STREAM = 0, 1
+
+#: A further effect: displacement of the tip in the workpiece frame at the stops, shape (n, 3), mm.
+Effect = Callable[[Machine, Stops], FloatArray]
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """The measurement of a virtual machine, and what is really true of it.
+
+    Parameters
+    ----------
+    name : beginning of the file names.
+    lengths : the readings, as a measurement file holds them.
+    truth : the true errors in mm and rad; its metadata name machine and seed.
+    stations : the true stations.
+    """
+
+    name: str
+    lengths: Lengths
+    truth: ErrorTable
+    stations: tuple[Station, ...]
+
+
+def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequence[Effect] = ()) -> FloatArray:
+    """Where the tool tip really is in the workpiece frame: exact chain plus ``effects``, shape (n, 3), mm."""
+    tip_mm = tip_position(machine, truth.at(stops.position_mm), stops.position_mm, stops.tool_mm)
+    for effect in effects:
+        tip_mm = tip_mm + effect(machine, stops)
+    return tip_mm
+
+
+def simulate(
+    machine: Machine, scenario: Scenario, seed: int | None = None, effects: Sequence[Effect] = ()
+) -> Simulation:
+    """Measure a virtual machine.
+
+    Parameters
+    ----------
+    machine : chain, travel, nodes and modelled errors count.
+    scenario : true errors, instrument and trajectory.
+    seed : takes the place of the scenario's. Errors and noise have random streams of their own, so that changing
+        the one leaves the other.
+    effects : what acts besides the geometric errors.
+
+    Raises
+    ------
+    InputError
+        if the trajectory leaves the machine's travel.
+    """
+    used_seed = scenario.seed if seed is None else seed
+    seeds = np.random.SeedSequence(used_seed)
+    try:
+        stops = plan_stops(scenario.trajectory, machine, scenario.instrument.passes)
+    except InputError as error:
+        raise InputError(error.message, file=scenario.source, field=error.field) from None
+    tools_mm = np.array(scenario.trajectory.tools_mm) if scenario.trajectory.tools_mm else None
+    truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), tools_mm)
+    truth.warn_outside(stops.position_mm)
+    tip_mm = actual_tips(machine, truth, stops, effects)
+    lengths = scenario.instrument.observe(stops, tip_mm, random_stream(seeds, NOISE_STREAM))
+    common = {"machine": machine.name, "seed": str(used_seed)}
+    reference = " ".join(f"{value:g}" for value in machine.reference_point_mm)
+    return Simulation(
+        name=scenario.name,
+        lengths=replace(lengths, metadata={**common, **lengths.metadata}),
+        truth=truth.replace(metadata={**common, "source": "simulated truth", "reference_point_mm": reference}),
+        stations=scenario.instrument.stations,
+    )
+
+
+def write_simulation(simulation: Simulation, folder: str | Path) -> dict[str, Path]:
+    """Write ``<name>.lengths.csv`` and ``truth.errors.csv`` into ``folder`` and return their paths by file name."""
+    output = OutputFolder(folder)
+    output.add(f"{simulation.name}.lengths.csv", format_lengths(simulation.lengths))
+    output.add("truth.errors.csv", format_errors(simulation.truth))
+    return output.commit()

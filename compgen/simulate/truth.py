@@ -1,0 +1,209 @@
+"""The truth of a simulation: error curves that are given, read from a file, or drawn at random and smooth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compgen.core import tomlio
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import Curve, ErrorTable, read_errors
+from compgen.core.machine import Machine
+from compgen.core.names import (
+    CURVE_NAMES,
+    ERROR_INDEX,
+    MM_PER_UM,
+    RAD_PER_URAD,
+    SQUARENESS_NAMES,
+    ErrorName,
+    error_named,
+)
+from compgen.core.text import nearest
+from compgen.model import modelled_errors
+
+#: Number of harmonics in a drawn curve; harmonic k bends k half-waves into the travel.
+HARMONICS = 3
+
+PeakRange = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class RandomErrors:
+    """How errors are drawn: the peak of each one is uniform within its range, in mm or rad.
+
+    ``nodes`` gives the number of nodes of the curves on X, Y, Z; None takes the machine's nodes.
+    """
+
+    linear_peak_mm: PeakRange = (10 * MM_PER_UM, 30 * MM_PER_UM)
+    angular_peak_rad: PeakRange = (10 * RAD_PER_URAD, 30 * RAD_PER_URAD)
+    squareness_peak_rad: PeakRange = (10 * RAD_PER_URAD, 30 * RAD_PER_URAD)
+    nodes: tuple[int, int, int] | None = None
+
+
+@dataclass(frozen=True)
+class TruthPlan:
+    """Where the true errors come from; what is ``given`` wins over what is drawn or stands in the file.
+
+    Parameters
+    ----------
+    given : curves and squareness errors of the scenario, or of the file it names.
+    random : how the errors of the machine's model that are not given are drawn; None leaves them zero.
+    """
+
+    given: ErrorTable = field(default_factory=ErrorTable)
+    random: RandomErrors | None = None
+
+
+def read_truth_plan(section: tomlio.Section, folder: Path) -> TruthPlan:
+    """Read the ``[errors]`` section of a scenario; a relative ``file`` counts from ``folder``.
+
+    Raises
+    ------
+    InputError
+        for unknown keys or errors, a unit that does not fit the error, a file beside random errors.
+    """
+    file = section.take("file", tomlio.text, None)
+    drawn = section.take("random", tomlio.flag, file is None)
+    if file is not None and drawn:
+        raise section.fail("random", "errors come from a file already; give either file or random = true")
+    table = read_errors(folder / file) if file is not None else ErrorTable()
+    random = _read_random(section) if drawn else None
+    given = ErrorTable(
+        {**table.curves, **_read_curves(section)},
+        {**table.squareness, **_read_squareness(section.section("squareness_urad", required=False))},
+    )
+    section.finish()
+    return TruthPlan(given, random)
+
+
+def _read_random(section: tomlio.Section) -> RandomErrors:
+    default = RandomErrors()
+    linear_um = section.take("linear_peak_um", _peak_range, None)
+    angular_urad = section.take("angular_peak_urad", _peak_range, None)
+    squareness_urad = section.take("squareness_peak_urad", _peak_range, None)
+    return RandomErrors(
+        linear_peak_mm=_scaled(linear_um, MM_PER_UM) or default.linear_peak_mm,
+        angular_peak_rad=_scaled(angular_urad, RAD_PER_URAD) or default.angular_peak_rad,
+        squareness_peak_rad=_scaled(squareness_urad, RAD_PER_URAD) or default.squareness_peak_rad,
+        nodes=section.take("nodes", counts, None),
+    )
+
+
+def _scaled(limits: PeakRange | None, unit: float) -> PeakRange | None:
+    return None if limits is None else (limits[0] * unit, limits[1] * unit)
+
+
+def _peak_range(value: Any) -> PeakRange:
+    items = tomlio.numbers(value)
+    if len(items) != 2 or not 0 <= items[0] <= items[1]:
+        raise ValueError("two numbers [smallest, largest], not negative and in this order, are expected")
+    return items[0], items[1]
+
+
+def counts(value: Any) -> tuple[int, int, int]:
+    """One whole number for all three axes, or three for X, Y and Z, each at least 2 (a check for TOML values)."""
+    items = value if isinstance(value, list) else [value] * 3
+    if len(items) != 3:
+        raise ValueError("a whole number, or three for X, Y and Z, is expected")
+    x, y, z = (tomlio.whole(2, 10001)(item) for item in items)
+    return x, y, z
+
+
+def _read_curves(section: tomlio.Section) -> dict[str, Curve]:
+    curves: dict[str, Curve] = {}
+    for entry in section.sections("curve"):
+        name = entry.take("name", _curve_name)
+        if name in curves:
+            raise entry.fail("name", f"the curve of {name} is given twice; give it once")
+        curves[name] = _read_curve(entry, error_named(name))
+        entry.finish()
+    return curves
+
+
+def _read_curve(entry: tomlio.Section, error: ErrorName) -> Curve:
+    position_mm = np.array(entry.take("position_mm", tomlio.ascending))
+    key, other = ("value_um", "value_urad") if error.unit == "um" else ("value_urad", "value_um")
+    if other in entry:
+        raise entry.fail(other, f"{error.name} is given in {error.unit}; write {key}")
+    value = np.array(entry.take(key, tomlio.numbers))
+    if len(value) != len(position_mm):
+        raise entry.fail(key, f"has {len(value)} values for {len(position_mm)} positions; give one for each")
+    return Curve(position_mm, value * error.si_per_unit, np.full(len(value), np.nan))
+
+
+def _curve_name(value: Any) -> str:
+    if value in SQUARENESS_NAMES:
+        raise ValueError("a squareness error is a constant; it belongs in [errors.squareness_urad]")
+    if value not in CURVE_NAMES:
+        raise ValueError(f"the name of one of the 18 error curves is expected; {nearest(str(value), CURVE_NAMES)}")
+    return str(value)
+
+
+def _read_squareness(section: tomlio.Section) -> dict[str, tuple[float, float]]:
+    given = {name: section.take(name, tomlio.number, None) for name in SQUARENESS_NAMES}
+    section.finish()
+    return {name: (value * RAD_PER_URAD, np.nan) for name, value in given.items() if value is not None}
+
+
+def child_seeds(seeds: np.random.SeedSequence, index: int) -> np.random.SeedSequence:
+    """Return child ``index`` of ``seeds``, always the same one (``spawn`` would go on counting)."""
+    return np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, index))
+
+
+def random_stream(seeds: np.random.SeedSequence, index: int) -> np.random.Generator:
+    """Return the generator of child ``index`` of ``seeds``."""
+    return np.random.Generator(np.random.PCG64(child_seeds(seeds, index)))
+
+
+def draw_truth(
+    plan: TruthPlan, machine: Machine, seeds: np.random.SeedSequence, tools_mm: FloatArray | None = None
+) -> ErrorTable:
+    """Return the true errors of ``machine`` in mm and rad.
+
+    Every error has a random stream of its own, so giving one of them leaves the others as they were.
+
+    Parameters
+    ----------
+    plan : what is given and how the rest is drawn.
+    machine : its nodes, reference point and modelled errors count.
+    seeds : parent of the 21 random streams, one for each error by its place among the 21.
+    tools_mm : the tool offsets that will be used, shape (k, 3); they decide which errors the model contains.
+    """
+    curves, squareness = dict(plan.given.curves), dict(plan.given.squareness)
+    if plan.random is None:
+        return ErrorTable(curves, squareness)
+    for name in modelled_errors(machine, tools_mm):
+        rng = random_stream(seeds, ERROR_INDEX[name])
+        if name in SQUARENESS_NAMES:
+            size = float(rng.uniform(*plan.random.squareness_peak_rad) * rng.choice([-1.0, 1.0]))
+            squareness.setdefault(name, (size, np.nan))
+        elif name not in curves:
+            curves[name] = draw_curve(error_named(name), machine, plan.random, rng)
+    return ErrorTable(curves, squareness)
+
+
+def draw_curve(error: ErrorName, machine: Machine, random: RandomErrors, rng: np.random.Generator) -> Curve:
+    """Draw one smooth curve whose largest absolute node value is uniform in the peak range of its kind.
+
+    It keeps the gauge of the model: a straightness is zero at both ends of its nodes (a sum of sines), positioning
+    and angles are zero at the machine's reference point (a slope and cosines, less their value there).
+    """
+    axis = machine.axes[error.axis]
+    nodes_mm = axis.nodes_mm if random.nodes is None else np.linspace(*axis.range_mm, random.nodes[error.axis])
+    peak = rng.uniform(*(random.linear_peak_mm if error.kind == "linear" else random.angular_peak_rad))
+    along = (nodes_mm - nodes_mm[0]) / (nodes_mm[-1] - nodes_mm[0])
+    order = np.arange(1, HARMONICS + 1)
+    phase = np.pi * np.outer(along, order)
+    weights = rng.standard_normal(HARMONICS) / order**2
+    if error.is_straightness:
+        shape = np.sin(phase) @ weights
+        shape[[0, -1]] = 0.0
+    else:
+        shape = rng.standard_normal() * along + np.cos(phase) @ weights
+        shape = shape - np.interp(machine.reference_point_mm[error.axis], nodes_mm, shape)
+    largest = np.abs(shape).max()
+    value = shape * (peak / largest) if largest > 0 else shape
+    return Curve(nodes_mm, value, np.full(len(nodes_mm), np.nan))
