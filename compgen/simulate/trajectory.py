@@ -16,7 +16,7 @@ from compgen.core.names import AXES
 from compgen.errors import InputError
 from compgen.simulate.truth import counts
 
-#: Decimals of commanded positions, in mm: those that a lengths file keeps, so that nothing is lost in writing.
+#: Decimals of commanded positions in mm: 0.1 um, no finer than a lengths file keeps, so that writing loses nothing.
 POSITION_DECIMALS = 4
 SECONDS_PER_MIN = 60.0
 
