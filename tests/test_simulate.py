@@ -288,6 +288,14 @@ def test_a_grid_is_run_in_serpentines_there_and_back(mill):
     assert stops.point[12:] == stops.point[:12][::-1]
 
 
+@pytest.mark.parametrize("counts", [(2, 3, 4), (3, 3, 3), (4, 2, 3), (3, 4, 2)])
+def test_a_serpentine_visits_every_point_once_and_moves_to_neighbours_only(mill, counts):
+    trajectory = Trajectory(levels_mm=tuple(np.arange(float(count)) for count in counts))
+    points = trajectory_points(trajectory, mill)
+    assert len({tuple(point) for point in points.tolist()}) == len(points) == np.prod(counts)
+    assert (np.abs(np.diff(points, axis=0)).sum(axis=1) == 1).all()
+
+
 def test_approach_is_the_last_direction_of_travel_kept_while_the_axis_rests(mill):
     levels = (np.array([0.0, 10.0]), np.array([0.0, 5.0]), np.array([1.0, 2.0]))
     stops = plan_stops(Trajectory(levels_mm=levels, start_mm=(0.0, 9.0, 0.0)), mill)
