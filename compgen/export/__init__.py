@@ -1,1 +1,19 @@
-"""export."""
+"""From errors to controller files."""
+
+from compgen.export.export import REJECTED_PREFIX, Export, Provenance, export, program_version
+from compgen.export.render import Format, load_format
+from compgen.export.synthesis import Projector, projector, synthesize, wanted_correction
+
+__all__ = [
+    "REJECTED_PREFIX",
+    "Export",
+    "Format",
+    "Projector",
+    "Provenance",
+    "export",
+    "load_format",
+    "program_version",
+    "projector",
+    "synthesize",
+    "wanted_correction",
+]

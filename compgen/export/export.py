@@ -1,0 +1,166 @@
+"""Errors to controller files: settings, basis, best table values, text, manifest and preflight list."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from compgen.controllers import controller_named
+from compgen.core.error_table import ErrorTable, format_errors
+from compgen.core.files import OutputFolder, sha256_of
+from compgen.core.machine import Machine
+from compgen.errors import InputError
+from compgen.export.render import Format, load_format, render, render_files
+from compgen.export.synthesis import synthesize
+
+#: Put in front of the name of a table that was not accepted.
+REJECTED_PREFIX = "NOT-ACCEPTED-"
+
+
+def program_version() -> str:
+    """Return the version of compgen that runs."""
+    try:
+        return version("compgen")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+@dataclass(frozen=True)
+class Export:
+    """What :func:`export` made, still in memory.
+
+    Parameters
+    ----------
+    controller : name of the control.
+    files : text of each controller file by name.
+    manifest : contents of ``manifest.json``: hashes, version, inputs, settings, sign statement.
+    preflight : text of ``preflight.md``.
+    violations : limits of the control that the tables break; not empty means not acceptable.
+    warnings : what the user should know.
+    """
+
+    controller: str
+    files: Mapping[str, str]
+    manifest: Mapping[str, Any]
+    preflight: str
+    violations: Sequence[str] = ()
+    warnings: Sequence[str] = ()
+
+    def write(self, folder: str | Path, *, accepted: bool | None = None) -> list[Path]:
+        """Write everything atomically and return the paths of the controller files.
+
+        Tables that are not accepted (by default: that break a limit) get ``NOT-ACCEPTED-`` before their name; a table
+        of that name from an earlier run is then moved aside to ``PREVIOUS-`` so that it cannot be taken for the new one.
+        """
+        good = not self.violations if accepted is None else accepted
+        prefix = "" if good else REJECTED_PREFIX
+        output = OutputFolder(folder)
+        for name, text in self.files.items():
+            output.add(prefix + name, text.encode("ascii", "replace"))
+        manifest = {**self.manifest, "accepted": good, "file_prefix": prefix}
+        output.add("manifest.json", json.dumps(manifest, indent=2) + "\n")
+        output.add("preflight.md", self.preflight)
+        paths = output.commit()
+        for name in self.files:
+            stale = output.folder / (name if prefix else REJECTED_PREFIX + name)
+            if stale.exists():
+                stale.replace(output.folder / f"PREVIOUS-{stale.name}")
+        return [paths[prefix + name] for name in self.files]
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the errors came from: (name, SHA-256) of every input file, for manifest and file headers."""
+
+    inputs: Sequence[tuple[str, str]] = field(default_factory=tuple)
+
+
+def export(
+    machine: Machine,
+    errors: ErrorTable,
+    controller: str,
+    *,
+    templates: Path | None = None,
+    allow_unverified: bool = False,
+    provenance: Provenance | None = None,
+) -> Export:
+    """Turn errors into the files of one control; nothing is written yet.
+
+    Parameters
+    ----------
+    machine : its section ``[controllers.<name>]`` holds what the export needs.
+    errors : usually the fitted errors, mm and rad.
+    controller : name of the control, e.g. ``"isg-csv"``.
+    templates : a folder of the user's own templates, searched before the shipped ones.
+    allow_unverified : export formats that no public document fully describes.
+    provenance : the input files, for the manifest and the headers.
+
+    Raises
+    ------
+    InputError
+        for settings that are missing or wrong, and for an unverified format that was not allowed.
+    """
+    control = controller_named(controller)
+    settings = control.read_settings(machine)
+    card = load_format(controller, templates)
+    if card.evidence == "unverified" and not allow_unverified:
+        raise InputError(
+            f"the format {controller!r} is unverified ({'; '.join(card.unverified)}); "
+            "add --allow-unverified if you accept that"
+        )
+    basis = control.basis(machine, settings, errors)
+    values = synthesize(machine, errors, basis, anchored=control.anchored)
+    tables = control.build(machine, settings, basis, values)
+    own = control.context(machine, settings, tables)
+    common = _common_context(machine, errors, controller, provenance or Provenance())
+    files = render_files(card, {**common, **own}, templates)
+    described = [{"name": name, "sha256": sha256_of(text.encode("ascii", "replace"))} for name, text in files.items()]
+    violations = control.violations(machine, settings, tables)
+    preflight = render(card, "preflight.md.j2", {**common, **own, "files": described}, templates)
+    manifest = _manifest(common, card, own, described, machine)
+    return Export(controller, files, {**manifest, "violations": violations}, preflight, violations, own["warnings"])
+
+
+def _common_context(machine: Machine, errors: ErrorTable, controller: str, provenance: Provenance) -> dict[str, Any]:
+    inputs = list(provenance.inputs) or [("errors", sha256_of(format_errors(errors).encode()))]
+    return {
+        "version": program_version(),
+        "controller": controller,
+        "machine_name": machine.name,
+        "chain": machine.chain.name,
+        "inputs": [name for name, _ in inputs],
+        "input_sha256": sha256_of(format_errors(errors).encode()),
+        "input_hashes": dict(inputs),
+    }
+
+
+def _manifest(
+    common: dict[str, Any], card: Format, own: dict[str, Any], files: list[dict[str, str]], machine: Machine
+) -> dict[str, Any]:
+    return {
+        "program": f"compgen {common['version']}",
+        "controller": common["controller"],
+        "format": card.title,
+        "evidence": card.evidence,
+        "unverified": list(card.unverified),
+        "machine": {
+            "name": machine.name,
+            "chain": machine.chain.name,
+            "squareness_reference": machine.squareness_reference,
+            "tool_offset_mm": list(machine.tool_offset_mm),
+            "reference_point_mm": list(machine.reference_point_mm),
+            "file": str(machine.source) if machine.source else None,
+            "sha256": sha256_of(machine.source.read_bytes()) if machine.source and machine.source.is_file() else None,
+        },
+        "inputs": [{"name": name, "sha256": digest} for name, digest in common["input_hashes"].items()],
+        "errors_sha256": common["input_sha256"],
+        "settings": dict(machine.controller_settings(common["controller"]).data),
+        "sign_statement": own["sign_statement"],
+        "parameters": own["parameters"],
+        "warnings": own["warnings"],
+        "files": files,
+    }

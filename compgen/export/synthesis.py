@@ -1,0 +1,167 @@
+"""The best tables that a control can hold: least squares of its basis against the wanted correction field.
+
+The wanted correction c*(p) makes the exact machine stand where it was told to: tip(p + c*(p)) = p + tool offset. It
+contains what a first-order model leaves out, e.g. the 4 um over a metre that come with a squareness of 2.9 mrad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from compgen.controllers.base import Term
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.errors import ConvergenceError
+from compgen.model.basis import free_basis
+from compgen.model.exact import exact_error
+from compgen.model.grid import volume_sample
+from compgen.model.volumetric import tool_of
+
+#: Directions of the basis that the volume does not determine keep their start values: a weight far below any data.
+RIDGE = 1e-9
+CHUNK_POINTS = 4096
+
+
+def wanted_correction(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
+) -> FloatArray:
+    """Return what must be added to commands (n, 3) so that the exact machine stands where it was told to, mm."""
+    correction = np.zeros_like(position_mm)
+    for _ in range(50):
+        previous = correction
+        moved = position_mm + previous
+        correction = -exact_error(machine, errors, moved, tool_mm)
+        if np.max(np.abs(correction - previous)) < 1e-10:
+            return correction
+    raise ConvergenceError("the errors are too large for a compensation: tip(p + c) = p has no solution by iteration")
+
+
+@dataclass(frozen=True)
+class Projector:
+    """Least squares of a basis over sample points, with the normal matrix factorised once.
+
+    ``transform`` (parameters, free) builds in the zeros at the reference point; ``offsets`` is 3 when a constant per
+    axis is fitted beside the tables because the control cannot express it.
+    """
+
+    basis: tuple[Term, ...]
+    position_mm: FloatArray
+    tool_mm: FloatArray
+    transform: FloatArray
+    offsets: int
+    factor: tuple[FloatArray, bool]
+    scale: FloatArray
+
+    def project(self, wanted_mm: FloatArray, start: FloatArray | None = None) -> FloatArray:
+        """Return all table values (parameters,) whose field is closest to ``wanted_mm`` (n, 3)."""
+        first = np.zeros(len(self.transform)) if start is None else start
+        rest = wanted_mm - self.field(first)
+        right = np.zeros(len(self.scale))
+        for chunk, matrix in self._chunks():
+            right += matrix.T @ rest[chunk].ravel()
+        solution = self.scale * np.asarray(cho_solve(self.factor, right * self.scale))
+        return first + self.transform @ solution[: self.transform.shape[1]]
+
+    def field(self, values: FloatArray, position_mm: FloatArray | None = None) -> FloatArray:
+        """Return the correction field of table values at the sample points or at others, shape (n, 3), mm."""
+        points = self.position_mm if position_mm is None else position_mm
+        return basis_field(self.basis, values, points, self.tool_mm)
+
+    def by_name(self, values: FloatArray) -> dict[str, FloatArray]:
+        """Split a vector of all table values by term."""
+        bounds = np.cumsum([0, *(len(term.nodes_mm) for term in self.basis)])
+        return {term.name: values[bounds[k] : bounds[k + 1]] for k, term in enumerate(self.basis)}
+
+    def _chunks(self) -> list[tuple[slice, FloatArray]]:
+        return [
+            (chunk, _design(self.basis, self.position_mm[chunk], self.tool_mm, self.transform, self.offsets))
+            for chunk in _slices(len(self.position_mm))
+        ]
+
+
+def _slices(count: int) -> list[slice]:
+    return [slice(k, min(k + CHUNK_POINTS, count)) for k in range(0, count, CHUNK_POINTS)]
+
+
+def basis_field(basis: Sequence[Term], values: FloatArray, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
+    """Return the correction field of a basis with the given values (all terms in a row) at points (n, 3)."""
+    field = np.zeros((len(position_mm), 3))
+    first = 0
+    for term in basis:
+        part = values[first : first + len(term.nodes_mm)]
+        field += term.carrier_field(position_mm, tool_mm) * (term.curve_matrix(position_mm) @ part)[:, None]
+        first += len(term.nodes_mm)
+    return field
+
+
+def _design(
+    basis: Sequence[Term], position_mm: FloatArray, tool_mm: FloatArray, transform: FloatArray, offsets: int
+) -> FloatArray:
+    """Design matrix (3 n, free + offsets) at points (n, 3)."""
+    blocks = [
+        term.carrier_field(position_mm, tool_mm)[:, :, None] * term.curve_matrix(position_mm)[:, None, :]
+        for term in basis
+    ]
+    full = np.concatenate(blocks, axis=2).reshape(3 * len(position_mm), -1) @ transform
+    if not offsets:
+        return full
+    return np.hstack([full, np.tile(np.eye(3), (len(position_mm), 1))])
+
+
+def projector(machine: Machine, basis: Sequence[Term], *, anchored: bool) -> Projector:
+    """Factorise the least-squares problem of a basis over the machine's volume.
+
+    Parameters
+    ----------
+    machine : its travel is sampled at the tables' nodes and between them, with its own tool offset.
+    basis : the control's terms.
+    anchored : True if a constant offset per axis is no part of what the control can do.
+    """
+    nodes = tuple(
+        np.unique(np.concatenate([[low, high], *(term.nodes_mm for term in basis if term.axis == axis)]))
+        for axis, (low, high) in enumerate(item.range_mm for item in machine.axes)
+    )
+    position_mm = volume_sample(machine, nodes)
+    tool_mm = tool_of(machine, None)
+    transform = _transform(basis)
+    offsets = 3 if anchored else 0
+    size = transform.shape[1] + offsets
+    normal = np.zeros((size, size))
+    for chunk in _slices(len(position_mm)):
+        matrix = _design(basis, position_mm[chunk], tool_mm, transform, offsets)
+        normal += matrix.T @ matrix
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
+    ridge = RIDGE * np.eye(size)
+    ridge[transform.shape[1] :] = 0.0
+    factor = cho_factor(normal * scale[:, None] * scale + ridge, lower=True)
+    return Projector(tuple(basis), position_mm, tool_mm, transform, offsets, factor, scale)
+
+
+def _transform(basis: Sequence[Term]) -> FloatArray:
+    blocks = []
+    for term in basis:
+        rows = np.zeros((0, len(term.nodes_mm)))
+        if term.zero_at_mm is not None and term.axis is not None:
+            point = np.zeros((1, 3))
+            point[0, term.axis] = term.zero_at_mm
+            rows = term.curve_matrix(point)
+        blocks.append(free_basis(np.where(np.abs(rows) < 1e-14, 0.0, rows), len(term.nodes_mm)))
+    total = np.zeros((sum(len(block) for block in blocks), sum(block.shape[1] for block in blocks)))
+    row = column = 0
+    for block in blocks:
+        total[row : row + block.shape[0], column : column + block.shape[1]] = block
+        row, column = row + block.shape[0], column + block.shape[1]
+    return total
+
+
+def synthesize(machine: Machine, errors: ErrorTable, basis: Sequence[Term], *, anchored: bool) -> dict[str, FloatArray]:
+    """Return the table values by term that come closest to the wanted correction over the volume."""
+    solver = projector(machine, basis, anchored=anchored)
+    wanted = wanted_correction(machine, errors, solver.position_mm)
+    start = np.concatenate([term.start for term in basis])
+    return solver.by_name(solver.project(wanted, start))

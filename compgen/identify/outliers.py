@@ -1,0 +1,85 @@
+"""Readings that do not belong: found by a robust limit, explained where the data allow it, never dropped silently."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.core.csvio import FloatArray
+from compgen.core.lengths import Lengths
+from compgen.identify.problem import LengthProblem, State
+from compgen.model.exact import tip_position
+
+#: A reading is rejected when its residual exceeds this many robust standard deviations (1.4826 MAD).
+LIMIT = 6.0
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """One rejected reading: where it stands, its residual in um, and the reason in words."""
+
+    row: int
+    station: str
+    point: str
+    residual_um: float
+    reason: str
+    file: str = ""
+    line: int = 0
+
+
+def accepted_readings(standardised: FloatArray, floor: float = 1.0) -> NDArray[np.bool_]:
+    """Mark the readings whose standardised residual (n,) lies within the robust limit.
+
+    ``floor`` keeps the scale from collapsing when more than half the residuals are exactly zero.
+    """
+    spread = 1.4826 * float(np.median(np.abs(standardised - np.median(standardised))))
+    return np.abs(standardised) <= LIMIT * max(spread, floor * 1e-3)
+
+
+def explain_rejected(
+    lengths: Lengths, problem: LengthProblem, state: State, rejected: NDArray[np.int64], sigma_mm: FloatArray
+) -> tuple[Rejected, ...]:
+    """Give every rejected reading a reason: another station's or another point's length, or just its size."""
+    values = problem.parameters.values(state.errors, problem.bases)
+    tip = tip_position(problem.parameters.machine, values, problem.position_mm, problem.tool_mm)
+    distance = np.linalg.norm(tip[:, None, :] - state.stations_mm[None], axis=2)
+    dead = np.array([state.dead_length_mm[problem.group[problem.station == k][0]] for k in range(problem.stations)])
+    predicted = distance - dead
+    residuals = problem.residuals(state)
+    found = []
+    for row in rejected.tolist():
+        file, line = lengths.origin[row] if lengths.origin else ("", 0)
+        found.append(
+            Rejected(
+                row=row,
+                station=lengths.stations[lengths.station[row]],
+                point=str(lengths.point[row]),
+                residual_um=float(-residuals[row] * 1000.0),
+                reason=_reason(lengths, problem, predicted, row, float(residuals[row]), float(sigma_mm[row])),
+                file=file,
+                line=line,
+            )
+        )
+    return tuple(found)
+
+
+def _reason(
+    lengths: Lengths, problem: LengthProblem, predicted: FloatArray, row: int, residual: float, sigma_mm: float
+) -> str:
+    size = f"differs from the model by {-residual * 1000.0:+.1f} um, {abs(residual) / sigma_mm:.0f} standard deviations"
+    pose, station, reading = problem.pose[row], problem.station[row], problem.length_mm[row]
+    close = 10.0 * sigma_mm
+    others = np.abs(predicted[pose] - reading)
+    others[station] = np.inf
+    if others.min() < close:
+        return (
+            f"{size}; it fits station {lengths.stations[int(np.argmin(others))]!r} at this point: wrong station label?"
+        )
+    points = np.abs(predicted[:, station] - reading)
+    points[pose] = np.inf
+    if abs(residual) > 0.05 and points.min() < min(close, 0.002):
+        where = ", ".join(f"{value:g}" for value in problem.position_mm[int(np.argmin(points))])
+        return f"{size}; it fits the position ({where}) mm: duplicated or swapped point?"
+    return f"{size}; beam break or disturbed reading?"

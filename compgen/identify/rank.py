@@ -1,0 +1,100 @@
+"""What the data do not determine: numerical rank, unobservable combinations in words, nodes without data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.core.csvio import FloatArray
+from compgen.identify.problem import LengthProblem
+
+#: Eigenvalues of the normal matrix with unit diagonal below this count as zero. A determined problem stays above
+#: about 1e-7, an undetermined direction falls to 1e-14: there is a wide gap.
+ZERO_EIGENVALUE = 1e-11
+
+
+@dataclass(frozen=True)
+class Rank:
+    """Numerical rank of a problem.
+
+    ``undetermined`` marks the unknowns (size,) that take part in a direction without data, ``combinations`` names
+    these directions, ``condition`` is the ratio of the kept eigenvalues of the scaled normal matrix.
+    """
+
+    rank: int
+    size: int
+    condition: float
+    undetermined: NDArray[np.bool_]
+    combinations: tuple[str, ...]
+
+
+def analyse_rank(problem: LengthProblem, matrix: FloatArray, stations: tuple[str, ...]) -> Rank:
+    """Analyse the normal matrix (size, size) of a problem; ``stations`` are the names for the messages."""
+    diagonal = np.diag(matrix)
+    empty = diagonal <= 1e-14 * np.median(diagonal[diagonal > 0])
+    scale = 1.0 / np.sqrt(np.where(empty, 1.0, diagonal))
+    scaled = np.where(np.outer(empty, empty), 0.0, matrix * np.outer(scale, scale))
+    eigenvalues, vectors = np.linalg.eigh(scaled)
+    null = eigenvalues < ZERO_EIGENVALUE
+    kept = eigenvalues[~null]
+    undetermined = np.sqrt(np.sum(vectors[:, null] ** 2, axis=1)) > 1e-4
+    return Rank(
+        rank=int(np.count_nonzero(~null)),
+        size=len(matrix),
+        condition=float(kept[-1] / kept[0]) if len(kept) else np.inf,
+        undetermined=undetermined,
+        combinations=_combinations(problem, vectors[:, null], empty, stations),
+    )
+
+
+def _combinations(
+    problem: LengthProblem, null_vectors: FloatArray, empty: NDArray[np.bool_], stations: tuple[str, ...]
+) -> tuple[str, ...]:
+    texts = []
+    names = unknown_names(problem, stations)
+    without = [names[k] for k in np.flatnonzero(empty)]
+    if without:
+        texts.append(f"no data at all for: {_shortened(without)}")
+    others = null_vectors[:, np.sum(null_vectors[empty] ** 2, axis=0) < 0.5]
+    for vector in _sparse_directions(others).T:
+        share: dict[str, float] = {}
+        for name, value in zip(names, vector, strict=True):
+            share[name.split(" ")[0]] = share.get(name.split(" ")[0], 0.0) + float(value**2)
+        leading = sorted((name for name in share if share[name] > 0.02), key=lambda name: -share[name])
+        texts.append("cannot be told apart: " + " and ".join(leading[:6]) + (" and others" if len(leading) > 6 else ""))
+    return tuple(dict.fromkeys(texts))
+
+
+def _sparse_directions(vectors: FloatArray) -> FloatArray:
+    """Rotate a null space (size, k) to vectors with few entries each (pivoted elimination), columns normalised."""
+    rest = vectors.copy()
+    found = []
+    while rest.shape[1]:
+        pivot = int(np.argmax(np.sum(rest**2, axis=1)))
+        direction = rest @ rest[pivot]
+        direction /= np.linalg.norm(direction)
+        found.append(direction)
+        rest = rest - np.outer(direction, direction @ rest)
+        left, singular, _ = np.linalg.svd(rest, full_matrices=False)
+        rest = left[:, singular > 1e-6]
+    return np.column_stack(found) if found else vectors
+
+
+def unknown_names(problem: LengthProblem, stations: tuple[str, ...]) -> list[str]:
+    """Names of all unknowns, e.g. ``EXX at -80 mm``, ``EC0Y``, ``LT1 x``, ``LT1 dead length``."""
+    names: list[str] = []
+    for curve in problem.parameters.curves:
+        for column in curve.free.T:
+            strongest = int(np.argmax(np.abs(column)))
+            names.append(f"{curve.error.name} at {curve.nodes_mm[strongest]:g} mm")
+    names += problem.parameters.squareness
+    names += [f"{station} {letter}" for station in stations for letter in "xyz"]
+    owner = {int(group): stations[int(station)] for group, station in zip(problem.group, problem.station, strict=True)}
+    names += [f"{owner[group]} dead length" for group in range(problem.groups)]
+    return names
+
+
+def _shortened(names: list[str], most: int = 12) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,65 @@
+"""Start values of the stations in closed form: from lengths to positions that may be metres away."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from compgen.core.csvio import FloatArray
+
+
+@dataclass(frozen=True)
+class StationStart:
+    """Start of one station: position (3,) and dead length of each of its set-ups (g,), mm."""
+
+    position_mm: FloatArray
+    dead_length_mm: FloatArray
+
+
+def station_start(points_mm: FloatArray, length_mm: FloatArray, group: NDArray[np.int64], groups: int) -> StationStart:
+    """Locate one station from nominal points (n, 3) and readings (n,).
+
+    |P - s|^2 = (L + l)^2 gives |P|^2 - L^2 = 2 P.s + 2 l L - (|s|^2 - l^2), linear in s, l and a constant for every
+    set-up ``group`` (n,) = 0 ... groups - 1. Where the points do not determine it (all in a plane or on a line) or
+    where the result does not explain the readings, a search from many directions takes its place.
+    """
+    centre, scale = points_mm.mean(axis=0), max(float(np.ptp(points_mm, axis=0).max()), 1.0)
+    p = (points_mm - centre) / scale
+    reading = length_mm / scale
+    member = group[:, None] == np.arange(groups)
+    columns = np.column_stack([2 * p, 2 * reading[:, None] * member, -1.0 * member])
+    target = np.einsum("ij,ij->i", p, p) - reading**2
+    solution, _, rank, _ = np.linalg.lstsq(columns, target, rcond=1e-9)
+    position, dead = solution[:3], solution[3 : 3 + groups]
+    if rank < columns.shape[1] or _misfit(p, reading, member, position, dead) > 1e-2:
+        position, dead = _search(p, reading, member)
+    return StationStart(position * scale + centre, dead * scale)
+
+
+def _residual(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_], x: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(p - x[:3], axis=1) - member @ x[3:] - reading)
+
+
+def _misfit(
+    p: FloatArray, reading: FloatArray, member: NDArray[np.bool_], position: FloatArray, dead: FloatArray
+) -> float:
+    return float(np.median(np.abs(_residual(p, reading, member, np.concatenate([position, dead])))))
+
+
+def _search(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    best: tuple[float, FloatArray] | None = None
+    for direction in np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3):
+        for distance in (1.0, 3.0):
+            start = direction * distance
+            dead = np.linalg.norm(p - start, axis=1) - reading
+            x0 = np.concatenate([start, member.T @ dead / member.sum(axis=0)])
+            found = least_squares(
+                lambda x: _residual(p, reading, member, x), x0, loss="soft_l1", f_scale=1e-3, max_nfev=60
+            )
+            if best is None or found.cost < best[0]:
+                best = (float(found.cost), found.x)
+    assert best is not None
+    return best[1][:3], best[1][3:]
