@@ -1,0 +1,182 @@
+"""Strict TOML: every refusal names the file, the line and the key, and says what is expected."""
+
+import pytest
+
+from compgen.core import tomlio
+from compgen.errors import InputError
+
+TEXT = """\
+name = "m"           # 1
+count = 3
+
+[axes.X]
+range_mm = [-1, 2]
+grid = [
+  [1, 2],
+  [3, 4]
+]
+late = "x"
+
+[ "axes"."Y" ]       # 12
+range_um = [0, 1]
+
+[[slide]]
+name = "first"
+
+[[slide]]
+name = "second"
+nmae = 1
+"""
+
+
+@pytest.fixture
+def saved(tmp_path):
+    def save(content):
+        path = tmp_path / "file.toml"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
+        return path
+
+    return save
+
+
+def message_of(action, *arguments):
+    with pytest.raises(InputError) as caught:
+        action(*arguments)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("", "is empty"),
+        ("  \n", "is empty"),
+        ("a = 1\nb = \n", ":2: is not valid TOML"),
+        ("a = 1\nb = 'x", ":2: is not valid TOML"),
+        ("a = 1\nb = 2\na = 3\n", ":3: is not valid TOML"),
+        ("[axes.X]\nn = 1\n[axes.X]\nn = 2\n", ":3: is not valid TOML"),
+        ("a = 01\n", ":1: is not valid TOML"),
+        ("a = " + "9" * 5000, "is not valid TOML"),
+        ("a = " + "[" * 5000, "is not valid TOML"),
+        (b"a = '\xff'\n", ":1: is not UTF-8"),
+        (b"a = 1\n\0", "is not valid TOML"),
+    ],
+)
+def test_what_is_not_toml_is_refused_with_file_and_line(saved, content, says):
+    path = saved(content)
+    message = message_of(tomlio.read_toml, path)
+    assert message.startswith(str(path)) and says in message
+
+
+def test_a_folder_is_refused(tmp_path):
+    assert "is a folder" in message_of(tomlio.read_toml, tmp_path)
+
+
+def test_a_byte_order_mark_and_windows_line_ends_are_understood(saved):
+    root = tomlio.read_toml(saved("\ufeffa = 1\r\nb = true\r\n"))
+    assert root.take("a", tomlio.number) == 1.0 and root.take("b", tomlio.flag) is True
+    root.finish()
+
+
+def test_a_wrong_value_is_shown_with_its_line_and_what_is_expected(saved):
+    path = saved(TEXT)
+    message = message_of(tomlio.read_toml(path).take, "count", tomlio.text)
+    assert message == f"{path}:2: count: one line of text is expected; got 3"
+
+
+def test_a_missing_key_names_the_nearest_one_that_is_there_and_the_line_of_its_table(saved):
+    path = saved(TEXT)
+    section = tomlio.read_toml(path).section("axes").section("Y")
+    message = message_of(section.take, "range_mm", tomlio.interval)
+    assert message.startswith(f"{path}:12: [axes.Y] range_mm: is missing; did you mean 'range_um'?")
+
+
+def test_an_unknown_key_names_the_nearest_known_one(saved):
+    path = saved(TEXT)
+    section = tomlio.read_toml(path).section("axes").section("Y")
+    section.take("range_mm", tomlio.interval, None)
+    section.take("nodes", tomlio.number, None)
+    message = message_of(section.finish)
+    assert message.startswith(f"{path}:13: [axes.Y] range_um: is not a known key; did you mean 'range_mm'?")
+
+
+def test_lists_over_several_lines_do_not_confuse_the_line_numbers(saved):
+    section = tomlio.read_toml(saved(TEXT)).section("axes").section("X")
+    assert ":10: [axes.X] late" in message_of(section.take, "late", tomlio.number)
+
+
+def test_a_wrong_key_in_the_second_table_of_an_array_points_there(saved):
+    first, second = tomlio.read_toml(saved(TEXT)).sections("slide")
+    assert [s.take("name", tomlio.text) for s in (first, second)] == ["first", "second"]
+    first.finish()
+    assert ":20: [slide] nmae: is not a known key; did you mean 'name'?" in message_of(second.finish)
+    assert ":18: [slide] size: is missing" in message_of(second.take, "size", tomlio.number)
+
+
+def test_a_section_that_is_a_value_and_a_value_that_is_a_section_are_refused(saved):
+    root = tomlio.read_toml(saved(TEXT))
+    assert ":2: count: a table ([section]) is expected; got 3" in message_of(root.section, "count")
+    assert ":2: count: an array of tables ([[section]]) is expected" in message_of(root.sections, "count")
+    assert "name: is missing" in message_of(tomlio.read_toml(saved("nmae = 1\n")).take, "name", tomlio.text)
+
+
+def test_what_is_optional_may_be_absent(saved):
+    root = tomlio.read_toml(saved("a = 1\n"))
+    assert root.take("b", tomlio.number, 7) == 7
+    assert root.section("c", required=False).data == {}
+    assert root.sections("d") == []
+    assert "a: is not a known key" in message_of(root.finish)
+
+
+def test_a_section_that_came_from_no_file_still_names_the_key():
+    section = tomlio.Section({"sing": "x"}, path=None, name="controllers.c")
+    assert message_of(section.take, "sign", tomlio.text).startswith("[controllers.c] sign: is missing; did you mean")
+
+
+HUGE = 10**400
+
+
+@pytest.mark.parametrize(
+    ("check", "value", "says"),
+    [
+        (tomlio.number, "1", "a finite number"),
+        (tomlio.number, True, "a finite number"),
+        (tomlio.number, float("nan"), "a finite number"),
+        (tomlio.number, float("-inf"), "a finite number"),
+        (tomlio.number, HUGE, "a finite number"),
+        (tomlio.positive, 0, "above zero"),
+        (tomlio.not_negative, -1e-9, "not negative"),
+        (tomlio.whole(2, 5), 6, "a whole number from 2 to 5"),
+        (tomlio.whole(2, 5), 1, "a whole number from 2 to 5"),
+        (tomlio.whole(2), 1, "a whole number of at least 2"),
+        (tomlio.whole(2), 3.0, "a whole number"),
+        (tomlio.whole(0), True, "a whole number"),
+        (tomlio.flag, 1, "true or false"),
+        (tomlio.text, " ", "one line of text"),
+        (tomlio.text, "a\nb", "one line of text"),
+        (tomlio.text, "a" * 201, "one line of text"),
+        (tomlio.choice("X", "Y"), "Z", "one of 'X', 'Y'"),
+        (tomlio.choice("X", "Y"), ["X"], "one of 'X', 'Y'"),
+        (tomlio.numbers, 1, "a list of numbers"),
+        (tomlio.numbers, [1, "2"], "a finite number"),
+        (tomlio.vector3, [1, 2], "three numbers"),
+        (tomlio.vector3, {"x": 1}, "three numbers"),
+        (tomlio.interval, [1], "two numbers"),
+        (tomlio.interval, [2, 1], "lower number first"),
+        (tomlio.interval, [1, 1], "lower number first"),
+        (tomlio.interval, [0, float("inf")], "a finite number"),
+        (tomlio.ascending, [1], "ascending"),
+        (tomlio.ascending, [1, 1], "ascending"),
+    ],
+)
+def test_each_check_refuses_what_it_does_not_mean(check, value, says):
+    with pytest.raises(ValueError, match=says):
+        check(value)
+
+
+def test_each_check_returns_the_clean_value():
+    assert tomlio.number(3) == 3.0 and isinstance(tomlio.number(3), float)
+    assert tomlio.positive(0.5) == 0.5 and tomlio.not_negative(0) == 0.0
+    assert tomlio.whole(2, 5)(5) == 5 and tomlio.flag(False) is False
+    assert tomlio.text("a b") == "a b" and tomlio.choice("X", "Y")("Y") == "Y"
+    assert tomlio.numbers([]) == () and tomlio.vector3([1, 2, 3]) == (1.0, 2.0, 3.0)
+    assert tomlio.interval([-1, 0]) == (-1.0, 0.0) and tomlio.ascending([0, 1, 4]) == (0.0, 1.0, 4.0)
