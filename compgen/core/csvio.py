@@ -124,7 +124,7 @@ def read_csv(
     header_line, header, rows, lines, metadata = _split(source, content)
     if not header:
         raise InputError(f"is empty; expected a header line with {', '.join(required)}", file=source)
-    _check_header(source, header_line, header, required, known, prefixes)
+    _check_header(source, header_line, header, required)
     if not rows:
         raise InputError("has a header but no rows", file=source, line=header_line)
     for row, line in zip(rows, lines, strict=True):
@@ -133,6 +133,10 @@ def read_csv(
             message = f"has {len(row)} fields, the header has {len(header)}{last}"
             raise InputError(message, file=source, line=line)
     _check_complete(source, content, rows, lines, metadata)
+    for name in header:
+        if not _is_allowed(name, known, prefixes):
+            message = f"column {one_line(name)!r} is not known and left out; {nearest(name, known)}"
+            warnings.warn(f"{source}:{header_line}: {message}", CompgenWarning, stacklevel=3)
     columns = {
         name: [cell.strip() for cell in cells]
         for name, cells in zip(header, zip(*rows, strict=True), strict=True)
@@ -174,9 +178,7 @@ def _split(source: Path, content: str) -> tuple[int, list[str], list[list[str]],
     return numbers[0], header, parsed[1:], numbers[1:], metadata
 
 
-def _check_header(
-    source: Path, line: int, header: list[str], required: list[str], known: set[str], prefixes: tuple[str, ...]
-) -> None:
+def _check_header(source: Path, line: int, header: list[str], required: list[str]) -> None:
     doubled = sorted({name for name in header if header.count(name) > 1})
     if doubled:
         raise InputError(f"the header names {doubled[0]!r} twice", file=source, line=line)
@@ -186,12 +188,6 @@ def _check_header(
         hint = "; separate columns by commas" if len(header) == 1 and re.search(r"[;\t]", header[0]) else ""
         message = f"column {missing[0]!r} is missing; needed are {needed}; the header has {present}{hint}"
         raise InputError(message, file=source, line=line)
-    for name in header:
-        if not _is_allowed(name, known, prefixes):
-            hint = nearest(name, known)
-            warnings.warn(
-                f"{source}:{line}: column {one_line(name)!r} is not known and left out; {hint}", CompgenWarning, 4
-            )
 
 
 def _check_complete(
