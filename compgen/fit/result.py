@@ -1,0 +1,80 @@
+"""What the fit returns: the fitted table, a report per curve, and what was moved out of the curves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.fit.frame import FrameChange
+from compgen.fit.weight import Method
+
+
+@dataclass(frozen=True)
+class ActiveBound:
+    """A bound that the fitted curve touches: ``max_abs`` at one node, ``max_slope`` between two; positions in mm."""
+
+    bound: str
+    from_mm: float
+    to_mm: float
+
+
+@dataclass(frozen=True)
+class CurveReport:
+    """How one curve was fitted; amounts are in ``unit`` (um or urad).
+
+    Parameters
+    ----------
+    smoothness : the dimensionless weight that was used (:class:`compgen.fit.FitOptions` says what it means).
+    method : how the weight was found: ``REML`` (uncertainties known), ``GCV`` (unknown) or ``given``.
+    half_gain_mm : wave length that the smoothing halves, on even nodes; 0 if none is.
+    degrees_of_freedom : effective ones, trace of the smoother without bounds; ``free_nodes`` is their largest number.
+    rms_residual : root mean square of data minus fit, over all nodes, after the data were brought to zero ends.
+    reduced_chi_square : weighted square sum of the residuals over the degrees of freedom left; nan where the
+        uncertainties are unknown or nothing is left.
+    noise : standard deviation of the data's noise as the residuals show it (at unit weight); nan if nothing is left.
+    smoothing_bias_max, smoothing_bias_rms : how much the smoothing flattens a curve like the fitted one, S c - c.
+    smoothing_bias : the same per position, shape (n,).
+    active_bounds : where the curve touches a bound.
+    solver : ``direct``, or ``cvxpy+OSQP`` (``cvxpy+CLARABEL`` where that fails) when a bound is active.
+    """
+
+    error: str
+    unit: str
+    smoothness: float
+    method: Method
+    half_gain_mm: float
+    degrees_of_freedom: float
+    free_nodes: int
+    rms_residual: float
+    reduced_chi_square: float
+    noise: float
+    smoothing_bias_max: float
+    smoothing_bias_rms: float
+    smoothing_bias: FloatArray = field(repr=False, compare=False)
+    active_bounds: tuple[ActiveBound, ...] = ()
+    solver: str = "direct"
+
+    def to_dict(self) -> dict[str, object]:
+        """Return plain values for JSON; unknown numbers are None."""
+        plain = {**asdict(self), "smoothing_bias": self.smoothing_bias.tolist()}
+        return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in plain.items()}
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Fitted ``errors`` with their uncertainty, the ``report`` by error name, and the ``change`` of the frame.
+
+    E of the input and E of the zeroed input differ by ``change``; the fit itself then only smooths.
+    """
+
+    errors: ErrorTable
+    report: Mapping[str, CurveReport]
+    change: FrameChange
+
+    def to_dict(self) -> dict[str, object]:
+        """Return reports and frame change as plain values for JSON."""
+        reports = {name: report.to_dict() for name, report in self.report.items()}
+        return {"curves": reports, "frame_change": self.change.to_dict()}
