@@ -1,1 +1,71 @@
-"""compgen: from a machine-tool measurement to checked compensation tables."""
+"""compgen: from a machine-tool measurement to checked compensation tables.
+
+Each stage is a function on plain data, without side effects: :func:`load_machine`, :func:`read_lengths`,
+:func:`identify`, :func:`fit`, :func:`export`, :func:`read_tables`, :func:`verify`, :func:`predict`.
+"""
+
+from compgen.controllers import CONTROLLERS
+from compgen.core.error_table import Curve, ErrorTable, format_errors, read_errors
+from compgen.core.lengths import Lengths, format_lengths, read_lengths
+from compgen.core.machine import Axis, Chain, Machine, load_machine
+from compgen.core.points import Points, format_points, read_points
+from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.export import Export, export, wanted_correction
+from compgen.fit import FitOptions, FitResult, fit
+from compgen.identify import Identification, IdentifyOptions, identify
+from compgen.model import c_matrix, exact_error, modelled_errors, observable_errors, predict, volumetric_error
+from compgen.pipeline import RunResult, run
+from compgen.simulate import Scenario, Simulation, read_scenario, simulate, write_simulation
+from compgen.verify import ReadTables, Residuals, Verification, read_tables, residuals, verify, without_rigid_motion
+
+__all__ = [
+    "CONTROLLERS",
+    "Axis",
+    "Chain",
+    "CompgenError",
+    "CompgenWarning",
+    "ConvergenceError",
+    "Curve",
+    "ErrorTable",
+    "Export",
+    "FitOptions",
+    "FitResult",
+    "Identification",
+    "IdentifyOptions",
+    "InputError",
+    "Lengths",
+    "Machine",
+    "Points",
+    "ReadTables",
+    "Residuals",
+    "RunResult",
+    "Scenario",
+    "Simulation",
+    "UndeterminedError",
+    "Verification",
+    "c_matrix",
+    "exact_error",
+    "export",
+    "fit",
+    "format_errors",
+    "format_lengths",
+    "format_points",
+    "identify",
+    "load_machine",
+    "modelled_errors",
+    "observable_errors",
+    "predict",
+    "read_errors",
+    "read_lengths",
+    "read_points",
+    "read_scenario",
+    "read_tables",
+    "residuals",
+    "run",
+    "simulate",
+    "verify",
+    "volumetric_error",
+    "without_rigid_motion",
+    "wanted_correction",
+    "write_simulation",
+]

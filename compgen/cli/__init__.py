@@ -1,1 +1,35 @@
-"""cli."""
+"""The command line: ``compgen --help``."""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from compgen.cli import export_commands, identify_commands, listing_commands, run_commands, simulate_commands
+from compgen.cli.common import run_command
+from compgen.export import program_version
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(program_version(), prog_name="compgen")
+def cli() -> None:
+    """From a machine-tool measurement to checked compensation tables.
+
+    Lengths are in mm, errors in files in um and urad. Exit codes: 0 done and accepted, 1 done but not acceptable,
+    2 wrong usage or bad input, 3 internal error.
+
+    \b
+    Example:
+      compgen run zha-gantry lengths.csv --controller isg-csv --out tables/
+    """
+
+
+for module in (run_commands, simulate_commands, identify_commands, export_commands, listing_commands):
+    for command in module.COMMANDS:
+        cli.add_command(command)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    sys.exit(run_command(cli))

@@ -2,6 +2,7 @@
 
 from compgen.model.exact import exact_columns, exact_error
 from compgen.model.observability import modelled_errors, observable_errors
+from compgen.model.predict import predict
 from compgen.model.volumetric import c_matrix, coefficients, volumetric_error
 
 __all__ = [
@@ -11,5 +12,6 @@ __all__ = [
     "exact_error",
     "modelled_errors",
     "observable_errors",
+    "predict",
     "volumetric_error",
 ]

@@ -1,1 +1,1 @@
-"""report."""
+"""Results as text for the terminal and as data for scripts."""

@@ -1,0 +1,151 @@
+"""What all commands share: options, messages, exit codes."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from rich.console import Console
+
+from compgen.controllers import CONTROLLERS
+from compgen.core.machine import Machine, load_machine
+from compgen.core.text import nearest
+from compgen.errors import CompgenError, CompgenWarning, InputError
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+#: Names of the contract; a machine file may hold settings for any of them.
+CONTRACT_CONTROLLERS = (
+    "isg-csv",
+    "etalon-exchange",
+    "siemens-eec",
+    "siemens-cec",
+    "siemens-cec-eec",
+    "fanuc-pitch",
+    "fanuc-straightness",
+    "fanuc-3d",
+    "heidenhain-com",
+    "heidenhain-kinematics",
+    "twincat-lists",
+    "pmac",
+    "mitsubishi",
+    "linuxcnc-comp",
+    "linuxcnc-volumetric",
+    "neutral",
+)
+stdout = Console(highlight=False)
+stderr = Console(stderr=True, highlight=False)
+
+
+def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:
+    """Load a machine and check the settings of every control that its file names."""
+    machine = load_machine(name, tuple(machines))
+    for controller in machine.controllers:
+        if controller in CONTROLLERS:
+            CONTROLLERS[controller].read_settings(machine)
+        elif controller not in CONTRACT_CONTROLLERS:
+            message = f"is not a controller; {nearest(controller, {*CONTROLLERS, *CONTRACT_CONTROLLERS})}"
+            raise InputError(message, file=machine.source, field=f"[controllers.{controller}]")
+    return machine
+
+
+def machine_argument(command: Command) -> Command:
+    """Add MACHINE and --machines; the command receives ``machine`` as a loaded machine."""
+
+    @functools.wraps(command)
+    def wrapper(*args: Any, machine: str, machines: tuple[Path, ...], **options: Any) -> Any:
+        return command(*args, machine=open_machine(machine, machines), **options)
+
+    help_text = "Further folder with machine files (may be given several times)."
+    option = click.option("--machines", multiple=True, type=click.Path(path_type=Path), help=help_text)
+    return click.argument("machine", metavar="MACHINE")(option(wrapper))  # type: ignore[return-value]
+
+
+def json_option(command: Command) -> Command:
+    """Add --json: one JSON object on stdout and nothing else there."""
+    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout, nothing else.")(
+        command
+    )
+
+
+def out_option(command: Command) -> Command:
+    """Add --out DIR."""
+    kind = click.Path(path_type=Path)
+    return click.option("--out", required=True, metavar="DIR", type=kind, help="Folder for the results.")(command)
+
+
+def controller_option(*, multiple: bool = False) -> Callable[[Command], Command]:
+    """Add --controller NAME."""
+    text = "Name of the control; `compgen controllers` lists them." + (
+        " May be given several times." if multiple else ""
+    )
+    return click.option("--controller", "controller", required=True, metavar="NAME", multiple=multiple, help=text)
+
+
+def print_json(data: Any) -> None:
+    """Print one JSON object to stdout."""
+    click.echo(json.dumps(data, indent=2, default=str))
+
+
+@contextmanager
+def progress(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
+    """Show the current stage on a terminal; say nothing into a pipe."""
+    if quiet or not stderr.is_terminal:
+        yield lambda _: None
+        return
+    with stderr.status("starting") as status:
+        yield lambda text: status.update(text)
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if issubclass(category, CompgenWarning):
+        stderr.print(f"warning: {message}", style="yellow", markup=False, soft_wrap=True)
+
+
+def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code of the contract; never show a traceback for bad input."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", CompgenWarning)
+        warnings.showwarning = _show_warning
+        try:
+            code = group.main(words, prog_name="compgen", standalone_mode=False)
+            return code if isinstance(code, int) else 0
+        except click.exceptions.Exit as error:
+            return error.exit_code
+        except click.ClickException as error:
+            error.show()
+            return 2
+        except (click.Abort, KeyboardInterrupt):
+            stderr.print("stopped", markup=False)
+            return 130
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        except CompgenError as error:
+            return _fail(str(error), error.exit_code, words)
+        except MemoryError:
+            return _fail("not enough memory for this input", 3, words)
+        except Exception as error:  # the last line of defence: exit code 3 of the contract
+            if os.environ.get("COMPGEN_TRACEBACK"):
+                traceback.print_exc()
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            text = f"internal error: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
+            return _fail(f"{text}; COMPGEN_TRACEBACK=1 shows more", 3, words)
+
+
+def _fail(message: str, code: int, words: Sequence[str]) -> int:
+    stderr.print(f"error: {message}", style="red", markup=False, soft_wrap=True)
+    if "--json" in words:
+        print_json({"error": message, "exit_code": code})
+    return code

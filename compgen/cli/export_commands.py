@@ -1,0 +1,146 @@
+"""``compgen export``, ``compgen read`` and ``compgen verify``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from compgen.cli.common import (
+    controller_option,
+    json_option,
+    machine_argument,
+    out_option,
+    print_json,
+    stderr,
+    stdout,
+)
+from compgen.core.error_table import read_errors
+from compgen.core.files import OutputFolder, write_file
+from compgen.core.machine import Machine
+from compgen.core.points import format_points, read_points
+from compgen.export import export
+from compgen.pipeline import provenance_of, write_all
+from compgen.report.text import verification_table
+from compgen.verify import read_tables, residuals, verify
+
+
+@click.command("export")
+@machine_argument
+@click.argument("errors", type=click.Path(path_type=Path))
+@controller_option()
+@out_option
+@click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
+@click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
+@json_option
+def export_command(
+    machine: Machine,
+    errors: Path,
+    controller: str,
+    out: Path,
+    templates: Path | None,
+    allow_unverified: bool,
+    as_json: bool,
+) -> int:
+    """Export errors to the files of a control, with manifest.json and preflight.md.
+
+    ERRORS is an *.errors.csv file (um, urad), usually the fitted one. Files that break a limit of the control are
+    written as NOT-ACCEPTED-... (exit code 1).
+
+    \b
+    Example:
+      compgen export zha-gantry fitted/fitted.errors.csv --controller siemens-cec --out tables/
+    """
+    OutputFolder(out)
+    exported = export(
+        machine,
+        read_errors(errors),
+        controller,
+        templates=templates,
+        allow_unverified=allow_unverified,
+        provenance=provenance_of(machine.source, errors),
+    )
+    paths = exported.write(out)
+    for text in exported.warnings:
+        stderr.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
+    for text in exported.violations:
+        stderr.print(f"not acceptable: {text}", style="red", markup=False, soft_wrap=True)
+    if as_json:
+        print_json({**exported.manifest, "accepted": not exported.violations, "paths": [str(path) for path in paths]})
+    else:
+        for path in paths:
+            stdout.print(f"  {path}", markup=False, soft_wrap=True)
+    return 1 if exported.violations else 0
+
+
+@click.command("read")
+@machine_argument
+@click.argument("tables", nargs=-1, required=True, type=click.Path(path_type=Path))
+@controller_option()
+@click.option("--points", required=True, type=click.Path(path_type=Path), help="*.points.csv (mm).")
+@click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="CSV file for the result.")
+@json_option
+def read_command(
+    machine: Machine, tables: tuple[Path, ...], controller: str, points: Path, out: Path, as_json: bool
+) -> int:
+    """Read controller files, emulate the control, and write the correction at each point.
+
+    FILE gets the points plus cx_um, cy_um, cz_um: what the control adds to the command.
+
+    \b
+    Example:
+      compgen read zha-gantry tables/volcomp0.csv --controller isg-csv --points p.points.csv --out correction.csv
+    """
+    where = read_points(points)
+    correction_mm = read_tables(machine, tables, controller).correction(machine, where)
+    columns = {f"c{axis}_um": correction_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
+    write_file(out, format_points(where, columns, {"machine": machine.name, "controller": controller}))
+    figures = residuals(correction_mm)
+    if as_json:
+        print_json({"points": len(where), "controller": controller, **figures.as_dict(), "file": str(out)})
+    else:
+        text = f"{len(where)} points: correction max {figures.max_um:.2f} um, rms {figures.rms_um:.2f} um -> {out}"
+        stdout.print(text, markup=False, soft_wrap=True)
+    return 0
+
+
+@click.command("verify")
+@machine_argument
+@click.argument("tables", nargs=-1, required=True, type=click.Path(path_type=Path))
+@controller_option()
+@click.option(
+    "--errors", required=True, type=click.Path(path_type=Path), help="*.errors.csv of the machine (um, urad)."
+)
+@click.option("--points", type=click.Path(path_type=Path), help="*.points.csv (mm); default: a grid over the volume.")
+@out_option
+@json_option
+def verify_command(
+    machine: Machine,
+    tables: tuple[Path, ...],
+    controller: str,
+    errors: Path,
+    points: Path | None,
+    out: Path,
+    as_json: bool,
+) -> int:
+    """Verify controller files against the errors of the machine: the exact model before, and after the tables act.
+
+    Writes result.json to DIR. Exit code 1 if the tables are not acceptable, with the reasons.
+
+    \b
+    Example:
+      compgen verify zha-gantry tables/volcomp0.csv --controller isg-csv --errors identified.errors.csv --out check/
+    """
+    OutputFolder(out)
+    where = read_points(points) if points else None
+    result = verify(machine, read_tables(machine, tables, controller), read_errors(errors), where)
+    write_all(out, {"result.json": json.dumps(result.summary(), indent=2) + "\n"})
+    if as_json:
+        print_json(result.summary())
+    else:
+        stdout.print(verification_table([result]))
+    return 0 if result.accepted else 1
+
+
+COMMANDS = (export_command, read_command, verify_command)

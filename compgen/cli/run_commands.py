@@ -1,0 +1,79 @@
+"""``compgen run``: the whole chain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from compgen.cli.common import (
+    controller_option,
+    json_option,
+    machine_argument,
+    out_option,
+    print_json,
+    progress,
+    stdout,
+)
+from compgen.cli.identify_commands import fit_options, identify_options, instrument_options, smoothness_option
+from compgen.core.machine import Machine
+from compgen.pipeline import run
+from compgen.report.text import identification_table, run_json, verification_table
+
+
+@click.command("run")
+@machine_argument
+@click.argument("measurements", nargs=-1, required=True, type=click.Path(path_type=Path))
+@controller_option(multiple=True)
+@out_option
+@instrument_options
+@smoothness_option
+@click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
+@click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
+@json_option
+def run_command(
+    machine: Machine,
+    measurements: tuple[Path, ...],
+    controller: tuple[str, ...],
+    out: Path,
+    u_length_um: float | None,
+    u_length_um_per_m: float | None,
+    keep_all: bool,
+    smoothness: float | None,
+    templates: Path | None,
+    allow_unverified: bool,
+    as_json: bool,
+) -> int:
+    """Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.
+
+    MACHINE is a name in machines/ or the path of a machine TOML; MEASUREMENTS are *.lengths.csv files (mm). With
+    several --controller each gets its own sub-folder of DIR.
+
+    \b
+    Example:
+      compgen run zha-gantry examples/zha-gantry.lengths.csv --controller isg-csv --out tables/
+    """
+    with progress(quiet=as_json) as show:
+        result = run(
+            machine,
+            measurements,
+            tuple(dict.fromkeys(controller)),
+            out,
+            identify_options=identify_options(u_length_um, u_length_um_per_m, keep_all),
+            fit_options=fit_options(smoothness),
+            templates=templates,
+            allow_unverified=allow_unverified,
+            progress=show,
+        )
+    if as_json:
+        print_json(run_json(result))
+    else:
+        stdout.print(identification_table(result.identification))
+        stdout.print(verification_table([item.verification for item in result.results]))
+        for item in result.results:
+            for path in item.paths:
+                stdout.print(f"  {path}", markup=False, soft_wrap=True)
+    return 0 if result.accepted else 1
+
+
+COMMANDS = (run_command,)

@@ -1,0 +1,75 @@
+"""``compgen simulate`` and ``compgen predict``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.core.error_table import read_errors
+from compgen.core.files import write_file
+from compgen.core.machine import Machine
+from compgen.core.points import format_points, read_points
+from compgen.model import predict
+from compgen.simulate import read_scenario, simulate, write_simulation
+from compgen.verify import residuals
+
+
+@click.command("simulate")
+@machine_argument
+@click.option("--scenario", required=True, type=click.Path(path_type=Path), help="Scenario TOML; see docs/simulate.md.")
+@out_option
+@click.option("--seed", type=click.IntRange(min=0), help="Seed in place of the scenario's own.")
+@json_option
+def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | None, as_json: bool) -> int:
+    """Simulate a machine and its measurement: writes *.lengths.csv (mm) and truth.errors.csv (um, urad) to DIR.
+
+    \b
+    Example:
+      compgen simulate zha-gantry --scenario examples/zha-gantry.scenario.toml --out simulated/
+    """
+    with progress(quiet=as_json) as show:
+        show("simulating")
+        simulation = simulate(machine, read_scenario(scenario), seed)
+    paths = write_simulation(simulation, out)
+    if as_json:
+        summary = {"readings": len(simulation.lengths), "stations": list(simulation.lengths.stations)}
+        print_json({**summary, "files": {name: str(path) for name, path in paths.items()}})
+    else:
+        for path in paths.values():
+            stdout.print(f"  {path}", markup=False, soft_wrap=True)
+    return 0
+
+
+@click.command("predict")
+@machine_argument
+@click.argument("errors", type=click.Path(path_type=Path))
+@click.option("--points", required=True, type=click.Path(path_type=Path), help="*.points.csv (mm).")
+@click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="CSV file for the result.")
+@click.option("--exact", is_flag=True, help="Finite rotations along the chain in place of E = C P.")
+@json_option
+def predict_command(machine: Machine, errors: Path, points: Path, out: Path, exact: bool, as_json: bool) -> int:
+    """Predict the error of the tool tip at given points: E = C P, or the exact model.
+
+    ERRORS is an *.errors.csv file (um, urad). FILE gets the points plus ex_um, ey_um, ez_um.
+
+    \b
+    Example:
+      compgen predict zha-gantry fitted/fitted.errors.csv --points p.points.csv --out predicted.csv
+    """
+    where = read_points(points)
+    error_mm = predict(machine, read_errors(errors), where, exact=exact)
+    columns = {f"e{axis}_um": error_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
+    model = "exact" if exact else "E = C P"
+    write_file(out, format_points(where, columns, {"machine": machine.name, "model": model}))
+    figures = residuals(error_mm)
+    if as_json:
+        print_json({"points": len(where), "model": model, **figures.as_dict(), "file": str(out)})
+    else:
+        text = f"{len(where)} points, {model}: max {figures.max_um:.2f} um, rms {figures.rms_um:.2f} um -> {out}"
+        stdout.print(text, markup=False, soft_wrap=True)
+    return 0
+
+
+COMMANDS = (simulate_command, predict_command)

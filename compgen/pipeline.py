@@ -1,0 +1,177 @@
+"""The whole chain: identify, fit, export, read back from disk, verify; for one or several controls."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compgen.controllers import controller_named
+from compgen.core.csvio import FloatArray, format_csv
+from compgen.core.error_table import ErrorTable, format_errors
+from compgen.core.files import OutputFolder, read_bytes, sha256_of
+from compgen.core.lengths import read_lengths
+from compgen.core.machine import Machine
+from compgen.export import Export, Provenance, export
+from compgen.fit import FitOptions, FitResult, fit
+from compgen.identify import Identification, IdentifyOptions, identify
+from compgen.verify import Verification, read_tables, verify
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ControllerResult:
+    """Outcome for one control: what was exported, what the round trip on the written files says, and where they are."""
+
+    export: Export
+    verification: Verification
+    paths: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Outcome of :func:`run`; ``accepted`` is True if every control's tables are."""
+
+    identification: Identification
+    fitted: FitResult
+    results: tuple[ControllerResult, ...]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether all tables may be loaded."""
+        return all(result.verification.accepted for result in self.results)
+
+
+def provenance_of(*paths: str | Path | None) -> Provenance:
+    """Return name and SHA-256 of the given files."""
+    files = [Path(path) for path in paths if path is not None]
+    return Provenance(tuple((path.name, sha256_of(read_bytes(path))) for path in files))
+
+
+def identification_files(result: Identification, provenance: Provenance) -> dict[str, str]:
+    """Return the texts of ``identified.errors.csv``, ``stations.csv`` and ``identify.json``."""
+    stations = result.stations
+    columns: dict[str, Sequence[str] | FloatArray] = {
+        "station": [item.station for item in stations],
+        "setup": [str(item.setup) for item in stations],
+        **{f"{axis}_mm": np.array([item.position_mm[k] for item in stations]) for k, axis in enumerate("xyz")},
+        **{
+            f"u_{axis}_um": 1e3 * np.array([item.u_position_mm[k] for item in stations]) for k, axis in enumerate("xyz")
+        },
+        "dead_length_mm": np.array([item.dead_length_mm for item in stations]),
+        "u_dead_length_um": 1e3 * np.array([item.u_dead_length_mm for item in stations]),
+        "readings": [str(item.readings) for item in stations],
+        "residual_rms_um": np.array([item.rms_um for item in stations]),
+    }
+    summary = {**result.summary(), "inputs": [{"name": name, "sha256": digest} for name, digest in provenance.inputs]}
+    return {
+        "identified.errors.csv": format_errors(result.errors),
+        "stations.csv": format_csv(columns, {"machine": result.errors.metadata.get("machine", "")}),
+        "identify.json": json.dumps(summary, indent=2) + "\n",
+    }
+
+
+def fit_files(result: FitResult) -> dict[str, str]:
+    """Return the texts of ``fitted.errors.csv`` and ``fit.json``."""
+    return {
+        "fitted.errors.csv": format_errors(result.errors),
+        "fit.json": json.dumps(result.to_dict(), indent=2) + "\n",
+    }
+
+
+def write_all(folder: str | Path, files: dict[str, str]) -> dict[str, Path]:
+    """Write a set of texts together, all or none."""
+    output = OutputFolder(folder)
+    for name, text in files.items():
+        output.add(name, text)
+    return output.commit()
+
+
+def export_and_verify(
+    machine: Machine,
+    fitted: ErrorTable,
+    identified: ErrorTable,
+    controller: str,
+    folder: str | Path,
+    **export_options: Any,
+) -> ControllerResult:
+    """Export, write to a hidden folder, read the bytes back from there, verify, and only then give the files a name.
+
+    The verification moves the exact model with the ``identified`` errors, not with the fitted ones that made the
+    tables. Files that are not accepted are written as ``NOT-ACCEPTED-...``.
+    """
+    exported = export(machine, fitted, controller, **export_options)
+    target = OutputFolder(folder).folder
+    target.mkdir(parents=True, exist_ok=True)
+    staging = Path(tempfile.mkdtemp(prefix=".verify-", dir=target))
+    try:
+        written = exported.write(staging, accepted=True)
+        verification = verify(machine, read_tables(machine, written, controller), identified)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+    paths = exported.write(target, accepted=verification.accepted)
+    named = tuple((path.name, digest) for path, (_, digest) in zip(paths, verification.files, strict=True))
+    verification = replace(verification, files=named)
+    write_all(target, {"result.json": json.dumps(verification.summary(), indent=2) + "\n"})
+    return ControllerResult(exported, verification, tuple(paths))
+
+
+def run(
+    machine: Machine,
+    measurements: Sequence[str | Path],
+    controllers: Sequence[str],
+    folder: str | Path,
+    *,
+    identify_options: IdentifyOptions | None = None,
+    fit_options: FitOptions | None = None,
+    templates: Path | None = None,
+    allow_unverified: bool = False,
+    progress: Progress = lambda _: None,
+) -> RunResult:
+    """Run the whole chain and write everything to ``folder``.
+
+    Parameters
+    ----------
+    machine : the machine.
+    measurements : ``*.lengths.csv`` files.
+    controllers : names of the controls; with one its files stand in ``folder``, with several each has its own
+        sub-folder.
+    folder : output folder.
+    identify_options, fit_options, templates, allow_unverified : handed to the stages.
+    progress : is told the name of each stage as it begins.
+    """
+    OutputFolder(folder)
+    for name in controllers:  # wrong settings are found before the work begins
+        controller_named(name).read_settings(machine)
+    progress("reading the measurement")
+    lengths = read_lengths(measurements)
+    provenance = provenance_of(machine.source, *measurements)
+    progress(f"identifying: {len(lengths)} lengths of {len(lengths.stations)} stations")
+    identification = identify(machine, lengths, identify_options)
+    progress("fitting smooth curves")
+    fitted = fit(machine, identification.errors, fit_options or FitOptions())
+    write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted)})
+    results = []
+    for name in controllers:
+        progress(f"exporting, reading back and verifying: {name}")
+        target = Path(folder) / name if len(controllers) > 1 else Path(folder)
+        results.append(
+            export_and_verify(
+                machine,
+                fitted.errors,
+                identification.errors,
+                name,
+                target,
+                templates=templates,
+                allow_unverified=allow_unverified,
+                provenance=provenance,
+            )
+        )
+    return RunResult(identification, fitted, tuple(results))
