@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from compgen.controllers.base import AnyController, Controller, Monomial, SourceFile, Term
+from compgen.controllers.siemens_cec import SiemensCec
+from compgen.controllers.siemens_eec import SiemensEec
+from compgen.controllers.fanuc_pitch import FanucPitch
 from compgen.core.text import nearest
 from compgen.errors import InputError
 
 #: Every control by its name on the command line.
-CONTROLLERS: dict[str, AnyController] = {}
+CONTROLLERS: dict[str, AnyController] = {
+    "fanuc-pitch": FanucPitch(),
+    "siemens-cec": SiemensCec(),
+    "siemens-eec": SiemensEec(),
+}
 
 
 def controller_named(name: str) -> AnyController:

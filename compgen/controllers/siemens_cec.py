@@ -1,0 +1,263 @@
+"""SINUMERIK cross-error compensation (CEC, sag): any axis corrected as a function of any axis, and products of tables.
+
+Source: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245-252, 264; 802D sl, p. 215-222.
+The sign of the sum is not settled by the readable documents and must be stated in the machine file.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from compgen.controllers.base import Controller, SourceFile, Term
+from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.siemens_limits import largest_sums, set_violations
+from compgen.controllers.siemens_preflight import cec_parameters, cec_sign_statement, cec_warnings
+from compgen.controllers.siemens_products import MM_DECIMALS, MULT_MODES, CecMap, CecTable, folded_tables, sum_into_axes
+from compgen.controllers.siemens_settings import take_axis_names, take_steps
+from compgen.controllers.siemens_syntax import (
+    Assignment,
+    TableParts,
+    axis_of,
+    read_assignments,
+)
+from compgen.controllers.terms import one_dimensional_terms, product_terms
+from compgen.core import tomlio
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.names import AXES
+from compgen.core.points import Points
+from compgen.errors import CompgenWarning
+
+#: Variables of the tables without ``$``, with the number of their indices (K3-2013, p. 248-249).
+VARIABLES = {
+    "AN_CEC": 2,
+    "AN_CEC_INPUT_AXIS": 1,
+    "AN_CEC_OUTPUT_AXIS": 1,
+    "AN_CEC_STEP": 1,
+    "AN_CEC_MIN": 1,
+    "AN_CEC_MAX": 1,
+    "AN_CEC_DIRECTION": 1,
+    "AN_CEC_MULT_BY_TABLE": 1,
+    "AN_CEC_IS_MODULO": 1,
+}
+_SIGN_MISSING = (
+    "is missing. Siemens' readable documents do not say whether the control adds or subtracts the sum of the tables: "
+    'test it at the machine (one table, both nodes 0.05: the axis moves by -0.05 for "error", by +0.05 for '
+    '"correction") and write sign = "error" or sign = "correction"'
+)
+_AXIS_VALUE = re.compile(r'\(\s*([A-Z0-9_]{1,32})\s*\)|"([A-Z0-9_]{1,32})"')
+#: Factors of a product have 9 decimals and stay below some mm: what their rounding may add up to on one axis.
+_PRODUCT_ROUNDING_MM = 1e-8
+
+
+@dataclass(frozen=True)
+class CecSettings:
+    """Settings ``[controllers.siemens-cec]``.
+
+    Parameters
+    ----------
+    sign : ``"error"`` (the control subtracts the sum) or ``"correction"`` (it adds it).
+    mult_mode : S1 to S4, see :mod:`compgen.controllers.siemens_products`.
+    products : whether angular errors are exported as products of tables.
+    axis_names : names of X, Y, Z on the control.
+    axis_style : ``"paren"`` writes (AX1), ``"quote"`` writes "AX1".
+    step_mm : node distances that the user asks for, or None.
+    max_points : nodes that the control can hold per table.
+    tables_available : tables that the control has, or None if that is not stated.
+    max_sum_mm : MD32720 of X, Y, Z in mm, or None if that is not stated.
+    """
+
+    sign: str
+    mult_mode: str
+    products: bool
+    axis_names: tuple[str, str, str]
+    axis_style: str
+    step_mm: tuple[float | None, ...]
+    max_points: int
+    tables_available: int | None
+    max_sum_mm: tuple[float, float, float] | None
+
+    @property
+    def subtracts(self) -> bool:
+        """Whether the control subtracts the sum of the tables from the command."""
+        return self.sign == "error"
+
+
+@dataclass(frozen=True)
+class CecTables:
+    """Tables by index, with the numbers as the file has them."""
+
+    tables: CecMap
+
+
+class SiemensCec(Controller[CecSettings, CecTables]):
+    """SINUMERIK CEC: straightness, squareness, positioning, and angular errors as products of tables."""
+
+    name = "siemens-cec"
+
+    def read_settings(self, machine: Machine) -> CecSettings:
+        """Check the settings; ``sign`` is mandatory."""
+        section = machine.controller_settings(self.name)
+        if "sign" not in section:
+            raise section.fail("sign", _SIGN_MISSING)
+        max_points = section.take("max_points", tomlio.whole(3, 100_000), 2000)
+        settings = CecSettings(
+            sign=section.take("sign", tomlio.choice("error", "correction")),
+            mult_mode=section.take("mult_mode", tomlio.choice(*MULT_MODES), "S1"),
+            products=section.take("products", tomlio.flag, True),
+            axis_names=take_axis_names(section),
+            axis_style=section.take("axis_style", tomlio.choice("paren", "quote"), "paren"),
+            step_mm=take_steps(section, machine, max_points),
+            max_points=max_points,
+            tables_available=section.take("tables_available", tomlio.whole(1, 1000), None),
+            max_sum_mm=section.take("max_sum_mm", _max_sum, None),
+        )
+        section.finish()
+        return settings
+
+    def basis(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> list[Term]:
+        """Return nine tables output over axis, and the products with levers that count from the reference point."""
+        nodes = [
+            equidistant_grid(machine, errors, axis, most=settings.max_points, step_mm=settings.step_mm[axis]).nodes_mm
+            for axis in range(3)
+        ]
+        pairs = [(output, axis) for output in range(3) for axis in range(3)]
+        if not settings.products:
+            return one_dimensional_terms(machine, errors, nodes, pairs)
+        origin = machine.reference_point_mm
+        ordinary = one_dimensional_terms(machine, errors, nodes, pairs, lever_origin_mm=origin)
+        return ordinary + product_terms(machine, errors, nodes, origin)
+
+    def build(
+        self, machine: Machine, settings: CecSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
+    ) -> CecTables:
+        """Return the tables with balanced folding, in whole units of the last decimal."""
+        return CecTables(folded_tables(basis, values, flip=settings.subtracts, mode=settings.mult_mode))
+
+    def context(self, machine: Machine, settings: CecSettings, tables: CecTables) -> dict[str, Any]:
+        """Return tables, machine data and the sign with a number from the file."""
+        sums = largest_sums(machine, tables.tables, settings.mult_mode)
+        names, subtracts = settings.axis_names, settings.subtracts
+        return {
+            "sign_statement": cec_sign_statement(names, subtracts, sums),
+            "parameters": cec_parameters(machine, names, tables.tables, settings.mult_mode, sums),
+            "warnings": cec_warnings(machine, names, tables.tables, settings, sums),
+            "sign": settings.sign,
+            "mult_mode": settings.mult_mode,
+            "has_products": any(entry.multiplier for entry in tables.tables.values()),
+            "tables": [self._table_context(settings, index, entry) for index, entry in sorted(tables.tables.items())],
+        }
+
+    def _table_context(self, settings: CecSettings, index: int, entry: CecTable) -> dict[str, Any]:
+        return {
+            "index": index,
+            "label": entry.label,
+            "input": _styled(settings, entry.input_axis),
+            "output": _styled(settings, entry.output_axis),
+            "step_mm": float(entry.table.step_mm),
+            "minimum_mm": float(entry.table.start_mm),
+            "maximum_mm": float(entry.table.last_mm),
+            "direction": entry.direction,
+            "multiplier": entry.multiplier,
+            "modulo": int(entry.table.modulo),
+            "decimals": entry.decimals,
+            "values_mm": [float(value) for value in entry.table.values],
+        }
+
+    def parse(self, machine: Machine, settings: CecSettings, files: Sequence[SourceFile]) -> CecTables:
+        """Read the tables; every variable of a table must be there, because the control keeps old values."""
+        parts: dict[int, TableParts] = {}
+        for item in read_assignments(files, VARIABLES):
+            index = item.index_number(0, 999)
+            part = parts.setdefault(index, TableParts(f"table {index}", item.source))
+            part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
+        return CecTables({index: _read_table(part, settings.axis_names) for index, part in sorted(parts.items())})
+
+    def emulate(self, machine: Machine, settings: CecSettings, tables: CecTables, points: Points) -> FloatArray:
+        """Return what the control adds: the clipped sum of the tables, subtracted or added as ``sign`` says.
+
+        A table with DIRECTION 1 or -1 acts where the last travel of its input axis (``points.approach``) has that
+        sign. Where that is unknown (0, or no approach at all) it does not act, and a CompgenWarning says so: what a
+        control does before the first motion is not documented.
+        """
+        outputs = {index: _output(entry, points) for index, entry in tables.tables.items()}
+        totals = sum_into_axes(tables.tables, settings.mult_mode, outputs)
+        total = np.column_stack([np.broadcast_to(part, (len(points),)) for part in totals])
+        if settings.max_sum_mm is not None:
+            total = np.clip(total, -np.array(settings.max_sum_mm), np.array(settings.max_sum_mm))
+        return -total if settings.subtracts else total
+
+    def violations(self, machine: Machine, settings: CecSettings, tables: CecTables) -> list[str]:
+        """Return broken rules of the set, and sums above MD32720 if the machine file states it."""
+        found = set_violations(machine, tables.tables, settings.max_points, settings.tables_available)
+        if settings.max_sum_mm is None:
+            return found
+        for axis, (value, place) in enumerate(largest_sums(machine, tables.tables, settings.mult_mode)):
+            if abs(value) > settings.max_sum_mm[axis]:
+                found.append(
+                    f"the sum into {settings.axis_names[axis]} reaches {value:+.6f} mm at X {place[0]:g} Y {place[1]:g} "
+                    f"Z {place[2]:g}; MD32720 clips it at {settings.max_sum_mm[axis]:g} mm"
+                )
+        return found
+
+    def resolution_mm(self, settings: CecSettings) -> float:
+        """Half of the last decimal of three tables per axis, and what the factors of products add."""
+        return 3 * 0.5 * 10.0**-MM_DECIMALS + (_PRODUCT_ROUNDING_MM if settings.products else 0.0)
+
+
+def _max_sum(value: Any) -> tuple[float, float, float]:
+    """MD32720 in mm: one number above zero for all axes, or a table with X, Y and Z."""
+    if isinstance(value, dict):
+        if set(value) != set(AXES):
+            raise ValueError("one number, or a table { X = ..., Y = ..., Z = ... }, is expected")
+        x, y, z = (tomlio.positive(value[axis]) for axis in AXES)
+        return x, y, z
+    number = tomlio.positive(value)
+    return number, number, number
+
+
+def _styled(settings: CecSettings, axis: int) -> str:
+    name = settings.axis_names[axis]
+    return f"({name})" if settings.axis_style == "paren" else f'"{name}"'
+
+
+def _read_table(part: TableParts, axis_names: Sequence[str]) -> CecTable:
+    input_item, output_item = part.scalar("$AN_CEC_INPUT_AXIS"), part.scalar("$AN_CEC_OUTPUT_AXIS")
+    direction = part.scalar("$AN_CEC_DIRECTION").whole(-1_000_000, 1_000_000)
+    multiplier = part.scalar("$AN_CEC_MULT_BY_TABLE").whole(0, 1_000_000)
+    return CecTable(
+        _axis_value(input_item, axis_names),
+        _axis_value(output_item, axis_names),
+        part.table("$AN_CEC"),
+        direction,
+        multiplier,
+    )
+
+
+def _axis_value(item: Assignment, axis_names: Sequence[str]) -> int:
+    match = _AXIS_VALUE.fullmatch(item.value)
+    if match is None:
+        raise item.fail(f'{item.value[:40]!r} is not an axis; write ({axis_names[0]}) or "{axis_names[0]}"')
+    return axis_of(item, match.group(1) or match.group(2), axis_names)
+
+
+def _output(entry: CecTable, points: Points) -> FloatArray:
+    """Interpolated value of one table at the points, zero where its direction of travel is not the last one."""
+    value = entry.table.at(points.position_mm[:, entry.input_axis])
+    if entry.direction == 0:
+        return value
+    travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, entry.input_axis])
+    if np.any(travel == 0):
+        message = (
+            f"a table acts in one direction of {AXES[entry.input_axis]} only, and some points do not say from where "
+            "they were approached: there it is taken as not acting; give approach_x, approach_y, approach_z"
+        )
+        warnings.warn(message, CompgenWarning, stacklevel=3)
+    return np.where(travel == entry.direction, value, 0.0)

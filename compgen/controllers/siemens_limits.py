@@ -1,0 +1,107 @@
+"""Limits of SINUMERIK CEC tables: what the sum reaches over the volume, how fast it changes, and the rules of a set.
+
+Rules: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245-249, 264.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from compgen.controllers.siemens_products import CecMap, CecTable, sum_into_axes
+from compgen.controllers.siemens_syntax import table_violations
+from compgen.core.csvio import FloatArray
+from compgen.core.machine import Machine
+from compgen.core.names import AXES
+
+_MOST_POSITIONS = 81
+_MOST_ACROSS = 21
+
+
+def _positions(machine: Machine, tables: CecMap, axis: int, most: int | None) -> FloatArray:
+    """Nodes of all tables over an axis within its travel and the ends; thinned to ``most``, extremes of tables kept."""
+    low, high = machine.axes[axis].range_mm
+    own = [entry.table for entry in tables.values() if entry.input_axis == axis]
+    nodes = np.concatenate([[low, high], *(table.nodes_mm for table in own)])
+    nodes = np.unique(np.round(np.clip(nodes, low, high), 6))
+    if most is None or len(nodes) <= most:
+        return nodes
+    extremes = [table.nodes_mm[[np.argmin(table.numbers), np.argmax(table.numbers)]] for table in own]
+    picked = nodes[np.unique(np.linspace(0, len(nodes) - 1, most).round().astype(int))]
+    return np.unique(np.clip(np.concatenate([picked, *extremes]), low, high))
+
+
+def _sums(tables: CecMap, mode: str, positions: Sequence[FloatArray], travel: Sequence[int]) -> list[FloatArray]:
+    """Totals of the three axes over the grid of positions, each (nx, ny, nz), for one direction of travel per axis."""
+    outputs = {}
+    for index, entry in tables.items():
+        axis = entry.input_axis
+        acts = entry.direction in (0, travel[axis])
+        value = entry.table.at(positions[axis]) * float(acts)
+        outputs[index] = np.expand_dims(value, tuple(other for other in range(3) if other != axis))
+    shape = tuple(len(along) for along in positions)
+    return [np.broadcast_to(total, shape) for total in sum_into_axes(tables, mode, outputs)]
+
+
+def _travels(tables: CecMap) -> list[tuple[int, ...]]:
+    """Directions of travel that make a difference to some table."""
+    directed = {entry.input_axis for entry in tables.values() if entry.direction}
+    return list(product(*[(1, -1) if axis in directed else (1,) for axis in range(3)]))
+
+
+def largest_sums(machine: Machine, tables: CecMap, mode: str) -> list[tuple[float, tuple[float, float, float]]]:
+    """Return for each output axis the sum of largest size over the travel, with its sign (mm), and where it stands.
+
+    Sums are multilinear between nodes, so the largest stands on nodes; all are searched, up to 81 positions per axis.
+    """
+    positions = [_positions(machine, tables, axis, _MOST_POSITIONS) for axis in range(3)]
+    found = [(0.0, (0.0, 0.0, 0.0))] * 3
+    for travel in _travels(tables):
+        for output, total in enumerate(_sums(tables, mode, positions, travel)):
+            x, y, z = np.unravel_index(int(np.argmax(np.abs(total))), total.shape)
+            value = float(total[x, y, z])
+            if abs(value) >= abs(found[output][0]):
+                found[output] = value, (float(positions[0][x]), float(positions[1][y]), float(positions[2][z]))
+    return found
+
+
+def largest_slopes(machine: Machine, tables: CecMap, mode: str) -> FloatArray:
+    """Return the largest change of each output's sum per travel of each base axis, shape (3 outputs, 3 bases), mm/mm."""
+    slopes = np.zeros((3, 3))
+    for base in range(3):
+        most = [_MOST_ACROSS if axis != base else None for axis in range(3)]
+        positions = [_positions(machine, tables, axis, most[axis]) for axis in range(3)]
+        steps = np.expand_dims(np.diff(positions[base]), tuple(axis for axis in range(3) if axis != base))
+        for travel in _travels(tables):
+            for output, total in enumerate(_sums(tables, mode, positions, travel)):
+                slope = float(np.max(np.abs(np.diff(total, axis=base) / steps), initial=0.0))
+                slopes[output, base] = max(slopes[output, base], slope)
+    return slopes
+
+
+def set_violations(machine: Machine, tables: CecMap, max_points: int, tables_available: int | None) -> list[str]:
+    """Return broken rules of single tables and of the set: grid, travel, numbers of tables and nodes, references."""
+    found: list[str] = []
+    for index, entry in sorted(tables.items()):
+        what = f"table {index} ({AXES[entry.output_axis]} over {AXES[entry.input_axis]})"
+        found += table_violations(machine, entry.input_axis, entry.table, max_points, what)
+        found += _reference_violations(tables, index, entry, what)
+    needed = max(tables) + 1
+    if tables_available is not None and needed > tables_available:
+        found.append(f"{needed} tables are needed, the control has {tables_available}")
+    return found
+
+
+def _reference_violations(tables: CecMap, index: int, entry: CecTable, what: str) -> list[str]:
+    found = []
+    if entry.direction not in (-1, 0, 1):
+        found.append(f"{what}: DIRECTION is {entry.direction}; 0, 1 and -1 are allowed")
+    if entry.multiplier:
+        other = tables.get(entry.multiplier - 1)
+        if other is None:
+            found.append(f"{what}: MULT_BY_TABLE names table number {entry.multiplier}, which does not exist")
+        elif other.table.modulo != entry.table.modulo:
+            found.append(f"{what}: it and its multiplier {entry.multiplier - 1} are not both cyclic or both not")
+    return found
