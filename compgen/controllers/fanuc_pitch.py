@@ -1,0 +1,112 @@
+"""FANUC stored pitch error compensation: positioning of X, Y and Z, whole-number increments per section of travel.
+
+What the control is taken to do, and how sure that is, stands in ``templates/fanuc-pitch/format.toml``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.controllers.base import Controller, SourceFile, Term
+from compgen.controllers.fanuc_pitch_context import pitch_context
+from compgen.controllers.fanuc_pitch_grid import pitch_grid
+from compgen.controllers.fanuc_pitch_settings import PitchSettings, read_pitch_settings
+from compgen.controllers.fanuc_pitch_tables import PitchBlock, PitchTables, parse_pitch, pitch_violations
+from compgen.controllers.terms import one_dimensional_name, one_dimensional_terms
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.names import MM_PER_UM
+from compgen.core.points import Points
+
+
+class FanucPitch(Controller[PitchSettings, PitchTables]):
+    """Tables X(x), Y(y), Z(z) as numbers of counts, zero at the reference point."""
+
+    name = "fanuc-pitch"
+    anchored = True
+
+    def read_settings(self, machine: Machine) -> PitchSettings:
+        """Check ``[controllers.fanuc-pitch]``."""
+        return read_pitch_settings(machine)
+
+    def basis(self, machine: Machine, settings: PitchSettings, errors: ErrorTable) -> list[Term]:
+        """Return one table per axis whose nodes are the section ends, the reference point one of them."""
+        nodes = [pitch_grid(machine, settings, errors, axis).nodes_mm for axis in range(3)]
+        return one_dimensional_terms(machine, errors, nodes, [(axis, axis) for axis in range(3)], anchored=True)
+
+    def build(
+        self, machine: Machine, settings: PitchSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
+    ) -> PitchTables:
+        """Round the cumulative curves to counts, difference them, and give the axes consecutive point numbers."""
+        terms = {term.name: term for term in basis}
+        blocks: list[PitchBlock | None] = [None, None, None]
+        free = settings.first_number
+        for axis in range(3):
+            name = one_dimensional_name(axis, axis)
+            if name in terms:
+                reference_mm = machine.reference_point_mm[axis]
+                block = _block(settings, terms[name].nodes_mm - reference_mm, values[name], free)
+                blocks[axis], free = block, block.last + 1
+        return PitchTables((blocks[0], blocks[1], blocks[2]))
+
+    def context(self, machine: Machine, settings: PitchSettings, tables: PitchTables) -> dict[str, Any]:
+        """Return records, the plan point number -> value, the parameters to set and the statement of the sign."""
+        return pitch_context(machine, settings, tables)
+
+    def parse(self, machine: Machine, settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTables:
+        """Read parameters 3620 ... 3624 and the points they name; a ``.json`` plan among the files is passed over."""
+        return parse_pitch(settings, files)
+
+    def emulate(self, machine: Machine, settings: PitchSettings, tables: PitchTables, points: Points) -> FloatArray:
+        """Return sign * count * A at each point, A held beyond the first and the last section end."""
+        added = np.zeros((len(points), 3))
+        for axis, block in enumerate(tables.blocks):
+            if block is None:
+                continue
+            along = points.position_mm[:, axis] - machine.reference_point_mm[axis]
+            count_mm = block.magnification * settings.detection_unit_um * MM_PER_UM
+            if settings.interpolation == "linear":
+                counts = np.interp(along, block.curve_mm, block.curve)
+            else:
+                counts = _staircase(block, along).astype(np.float64)
+            added[:, axis] = settings.sign * count_mm * counts
+        return added
+
+    def violations(self, machine: Machine, settings: PitchSettings, tables: PitchTables) -> list[str]:
+        """Return broken limits: change per section, 16 bits, point numbers, overlaps, interval, travel left out."""
+        return pitch_violations(machine, settings, tables)
+
+    def resolution_mm(self, settings: PitchSettings) -> float:
+        """Return half a count: the cumulative curve is rounded to whole counts at every section end."""
+        return 0.5 * settings.count_mm
+
+
+def _block(settings: PitchSettings, along_mm: FloatArray, values_mm: FloatArray, free: int) -> PitchBlock:
+    """Table of one axis from corrections (n,) at section ends (n,) from the reference point, numbers from ``free``."""
+    below = int(np.argmin(np.abs(along_mm)))
+    corrections = np.asarray(values_mm) - values_mm[below]
+    curve = np.rint(settings.sign * corrections / settings.count_mm).astype(np.int64)
+    # The reference number itself is always kept, also where no travel lies on its negative side.
+    steps = np.diff(curve, prepend=[0]) if below == 0 else np.diff(curve)
+    interval = Decimal(repr(float(along_mm[-1] - along_mm[0]))) / (len(along_mm) - 1)
+    return PitchBlock(
+        reference=free + (below if settings.total else max(below - 1, 0)),
+        first=free,
+        values=tuple(int(value) for value in (curve if settings.total else steps)),
+        total=settings.total,
+        magnification=settings.magnification,
+        interval_mm=interval.quantize(settings.interval_quantum_mm).normalize(),
+    )
+
+
+def _staircase(block: PitchBlock, along_mm: FloatArray) -> NDArray[np.int64]:
+    """Curve where a section's value is put out at its beginning: A[n] for ((n-1-ref) d, (n-ref) d], shape (n,)."""
+    section = np.ceil(along_mm / float(block.interval_mm) - 1e-9) + block.reference
+    inside = np.clip(section, block.curve_numbers[0], block.last).astype(np.int64)
+    return np.asarray(block.curve[inside - block.curve_numbers[0]], dtype=np.int64)
