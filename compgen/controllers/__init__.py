@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from compgen.controllers.base import AnyController, Controller, Monomial, SourceFile, Term
+from compgen.controllers.etalon_exchange import EtalonExchange
+from compgen.controllers.isg_csv import IsgCsv
 from compgen.controllers.siemens_cec import SiemensCec
 from compgen.controllers.siemens_eec import SiemensEec
 from compgen.controllers.fanuc_pitch import FanucPitch
@@ -11,6 +13,8 @@ from compgen.errors import InputError
 
 #: Every control by its name on the command line.
 CONTROLLERS: dict[str, AnyController] = {
+    "isg-csv": IsgCsv(),
+    "etalon-exchange": EtalonExchange(),
     "fanuc-pitch": FanucPitch(),
     "siemens-cec": SiemensCec(),
     "siemens-eec": SiemensEec(),
