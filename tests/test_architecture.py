@@ -18,6 +18,7 @@ ORDER = (
     ("controllers",),
     ("export",),
     ("verify",),
+    ("pipeline",),
     ("report",),
     ("cli",),
 )
