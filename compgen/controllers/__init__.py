@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from compgen.controllers.base import AnyController, Controller, Monomial, SourceFile, Term
 from compgen.controllers.etalon_exchange import EtalonExchange
+from compgen.controllers.fanuc_pitch import FanucPitch
 from compgen.controllers.isg_csv import IsgCsv
 from compgen.controllers.siemens_cec import SiemensCec
 from compgen.controllers.siemens_eec import SiemensEec
-from compgen.controllers.fanuc_pitch import FanucPitch
 from compgen.core.text import nearest
 from compgen.errors import InputError
 
