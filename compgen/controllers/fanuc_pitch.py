@@ -95,13 +95,14 @@ def _block(settings: PitchSettings, along_mm: FloatArray, values_mm: FloatArray,
     # The reference number itself is always kept, also where no travel lies on its negative side.
     steps = np.diff(curve, prepend=[0]) if below == 0 else np.diff(curve)
     interval = Decimal(repr(float(along_mm[-1] - along_mm[0]))) / (len(along_mm) - 1)
+    written = interval.quantize(settings.interval_quantum_mm).normalize()
     return PitchBlock(
         reference=free + (below if settings.total else max(below - 1, 0)),
         first=free,
         values=tuple(int(value) for value in (curve if settings.total else steps)),
         total=settings.total,
         magnification=settings.magnification,
-        interval_mm=interval.quantize(settings.interval_quantum_mm).normalize(),
+        interval_mm=Decimal(f"{written:f}"),
     )
 
 

@@ -225,7 +225,7 @@ def _block_violations(settings: PitchSettings, name: str, block: PitchBlock) -> 
         messages.append(f"{name}: the magnification is 0, which switches the table off")
     if float(block.interval_mm) < settings.least_interval_mm - 1e-9:
         messages.append(
-            f"{name}: the interval {block.interval_mm} mm is shorter than the {settings.least_interval_mm:g} mm that "
+            f"{name}: the interval {block.interval_mm:f} mm is shorter than the {settings.least_interval_mm:g} mm that "
             f"{settings.max_feed_mm_min:g} mm/min need"
         )
     return messages

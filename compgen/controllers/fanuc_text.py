@@ -17,6 +17,10 @@ from compgen.errors import InputError
 
 #: No parameter file of a control is anywhere near this long.
 MOST_CHARACTERS = 4_000_000
+#: Nor are there more numbers than this.
+MOST_BLOCKS = 100_000
+#: Nor is any block as long as this: 99 axes with 20 characters each.
+MOST_IN_BLOCK = 2000
 
 _COMMENT = re.compile(r"\([^()]*\)")
 _RECORD = re.compile(r"[ \t]*N(\d{1,8})(?!\d)([A-Z0-9.+\- \t]*)", re.ASCII)
@@ -62,7 +66,7 @@ def read_records(file: SourceFile) -> Iterator[Record]:
     if len(file.text) > MOST_CHARACTERS:
         raise file.fail(f"holds {len(file.text)} characters; that is no parameter file (at most {MOST_CHARACTERS})")
     lines = file.text.split("\n" if "\n" in file.text else "\r")
-    inside, marks = False, 0
+    inside, marks, blocks = False, 0, 0
     for number, line in enumerate(lines, start=1):
         bare = _COMMENT.sub(" ", line) if "(" in line else line
         for piece in bare.split(";"):
@@ -70,6 +74,9 @@ def read_records(file: SourceFile) -> Iterator[Record]:
             if block == "%":
                 inside, marks = not inside, marks + 1
             elif block:
+                blocks += 1
+                if blocks > MOST_BLOCKS:
+                    raise file.fail(f"holds more than {MOST_BLOCKS} blocks; that is no parameter file", number)
                 yield _record(file, block, number, inside)
     if marks == 0:
         raise file.fail("holds no '%'; a FANUC file begins and ends with one")
@@ -80,6 +87,8 @@ def read_records(file: SourceFile) -> Iterator[Record]:
 def _record(file: SourceFile, block: str, line: int, inside: bool) -> Record:
     if not inside:
         raise file.fail(f"{one_line(block[:20])!r} stands outside the pair of '%'", line)
+    if len(block) > MOST_IN_BLOCK:
+        raise file.fail(f"this block has {len(block)} characters; at most {MOST_IN_BLOCK} are possible", line)
     found = _RECORD.match(block)
     if found is None:
         raise file.fail(f"{one_line(block[:20])!r} is not a block; 'N' and a number of at most 8 digits are due", line)
