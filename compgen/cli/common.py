@@ -42,7 +42,9 @@ CONTRACT_CONTROLLERS = (
     "linuxcnc-volumetric",
     "neutral",
 )
-stdout = Console(highlight=False)
+#: Tables into a pipe or a file get the width that they need, not that of an unknown terminal.
+PIPE_WIDTH = None if sys.stdout.isatty() else 130
+stdout = Console(highlight=False, width=PIPE_WIDTH)
 stderr = Console(stderr=True, highlight=False)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+from rich import box
 from rich.table import Table
 
 from compgen.cli.common import json_option, open_machine, print_json, stdout
@@ -39,7 +40,7 @@ def controllers_command(as_json: bool) -> int:
             }
         )
         return 0
-    table = Table("name", "control", "what it can express", "format")
+    table = Table("name", "control", "what it can express", "format", box=box.SIMPLE)
     for card in cards:
         table.add_row(card.name, card.title, card.expresses, card.evidence)
     stdout.print(table)
@@ -58,7 +59,7 @@ def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
     """
     local = Path("machines")
     files = machine_files((*((local,) if local.is_dir() else ()), *machines))
-    table = Table("name", "chain", "travel X, Y, Z (mm)", "errors", "file")
+    table = Table("name", "chain", "travel X, Y, Z (mm)", "errors", "file", box=box.SIMPLE)
     listing = {}
     for name, path in sorted(files.items()):
         machine = open_machine(str(path))

@@ -53,6 +53,8 @@ class Term:
     carrier : the correction in mm is the value times the sum of these monomials.
     start : natural values, shape (n,); kept in directions that the wanted correction does not determine.
     zero_at_mm : position where the interpolated value must be zero, or None.
+    keep_mm : positions where the value should stay at its start as far as the wanted correction leaves a choice (a
+        line may stand in a straightness or in a squareness); this keeps the zeros of the fitted curves.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Term:
     carrier: tuple[Monomial, ...]
     start: FloatArray
     zero_at_mm: float | None = None
+    keep_mm: tuple[float, ...] = ()
 
     def curve_matrix(self, position_mm: FloatArray) -> FloatArray:
         """Interpolation matrix (m, n) at commanded positions (m, 3)."""

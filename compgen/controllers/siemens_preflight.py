@@ -109,6 +109,12 @@ def cec_warnings(machine: Machine, names: Sequence[str], tables: CecMap, limits:
             f"{needed} tables with up to {nodes} nodes: a SINUMERIK 828D has {_TABLES_OF_828D} tables of "
             f"{_NODES_OF_828D} nodes, an 840D sl twice as many tables as axes; state tables_available"
         )
+    for axis, slopes in enumerate(largest_slopes(machine, tables, limits.mult_mode)):
+        if 100.0 * float(np.sum(slopes)) > DEFAULT_MAX_VELO_PERCENT:
+            found.append(
+                f"{names[axis]}: the sum changes by up to {float(np.sum(slopes)):.3g} mm per mm of travel; the usual "
+                f"MD32730 is {DEFAULT_MAX_VELO_PERCENT:g} % and would make it lag behind"
+            )
     return found + _jumps(machine, names, tables, limits.mult_mode)
 
 

@@ -36,8 +36,9 @@ MULT_MODES: dict[str, tuple[bool, bool]] = {
 }
 #: Decimals of tables in mm, and of the factors of a product and the tables that hold their folds.
 MM_DECIMALS, FACTOR_DECIMALS = 6, 9
-#: Angles below this are no angles: 1 nm over 1 km.
+#: Angles below this are no angles, and products that stay below half of the last decimal in mm are no products.
 NEGLIGIBLE_RAD = 1e-12
+NEGLIGIBLE_PRODUCT_MM = 0.5 * 10.0**-MM_DECIMALS
 
 _UNITS_PER_MM = 10**FACTOR_DECIMALS
 _UNITS_PER_MM_QUANTUM = 10 ** (FACTOR_DECIMALS - MM_DECIMALS)
@@ -125,7 +126,8 @@ def folded_tables(
     flip : True if the control subtracts its total: the ordinary terms and the angles change sign, the levers do not.
     mode : which direct terms are folded away, a key of :data:`MULT_MODES`.
 
-    Tables that are zero in every decimal are left out; if all are, the first ordinary one remains.
+    Ordinary tables that are zero in every decimal, and products that stay below half of the last decimal in mm, are
+    left out; if all are, the first ordinary table remains.
     """
     sign = -1 if flip else 1
     nodes = {term.axis: term.nodes_mm for term in terms if term.axis is not None}
@@ -138,11 +140,16 @@ def folded_tables(
         if part.lever is None:
             counts = np.rint(sign * part.sign * np.asarray(values[term.name]) * 10**MM_DECIMALS).astype(np.int64)
             work.ordinary[part.output, term.axis] = counts * _UNITS_PER_MM_QUANTUM
-        elif float(np.max(np.abs(values[term.name]))) >= NEGLIGIBLE_RAD:
+        elif _matters(values[term.name], nodes[part.lever] - part.origin_mm):
             products.setdefault((part.output, part.lever), []).append(term)
     for (output, lever), group in sorted(products.items()):
         _add_products(work, nodes[lever], output, lever, [(term, sign * values[term.name]) for term in group], mode)
     return _numbered(work, nodes)
+
+
+def _matters(angle_rad: FloatArray, lever_mm: FloatArray) -> bool:
+    largest = float(np.max(np.abs(angle_rad)))
+    return largest >= NEGLIGIBLE_RAD and largest * float(np.max(np.abs(lever_mm))) >= NEGLIGIBLE_PRODUCT_MM
 
 
 def _add_products(

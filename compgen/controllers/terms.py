@@ -53,7 +53,15 @@ def one_dimensional_terms(
         if reference is not None:
             start = start - np.interp(reference, nodes_mm[axis], start)
         terms.append(
-            Term(one_dimensional_name(output, axis), axis, nodes_mm[axis], (Monomial(output),), start, reference)
+            Term(
+                one_dimensional_name(output, axis),
+                axis,
+                nodes_mm[axis],
+                (Monomial(output),),
+                start,
+                reference,
+                _kept_mm(machine, axis, straightness=output != axis),
+            )
         )
     return terms
 
@@ -110,6 +118,7 @@ def product_terms(
             nodes_mm[axis],
             (Monomial(output, 1, lever, float(lever_origin_mm[lever])),),
             start,
+            keep_mm=_kept_mm(machine, axis, straightness=False),
         )
         for (output, axis, lever), start in sorted(found.items())
     ]
@@ -139,5 +148,11 @@ def error_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatAr
         start = errors.curves[name].at(nodes) if name in errors.curves else np.zeros(len(nodes))
         if name == "EYX":
             start = start - fold * nodes
-        terms.append(Term(name, axis, nodes, tuple(carrier), start))
+        keep_mm = _kept_mm(machine, axis, straightness=error_named(name).is_straightness)
+        terms.append(Term(name, axis, nodes, tuple(carrier), start, keep_mm=keep_mm))
     return terms
+
+
+def _kept_mm(machine: Machine, axis: int, *, straightness: bool) -> tuple[float, ...]:
+    """Where the fitted curves are zero: straightness at both travel ends, the others at the reference point."""
+    return machine.axes[axis].range_mm if straightness else (machine.reference_point_mm[axis],)

@@ -86,6 +86,14 @@ class ErrorTable:
                 )
                 return
 
+    def only(self, *names: str) -> ErrorTable:
+        """Return a table with just the errors ``names``; the others are zero."""
+        return ErrorTable(
+            {name: curve for name, curve in self.curves.items() if name in names},
+            {name: value for name, value in self.squareness.items() if name in names},
+            self.metadata,
+        )
+
     def replace(self, **parts: Mapping[str, object]) -> ErrorTable:
         """Return a copy with some of ``curves``, ``squareness``, ``metadata`` replaced."""
         fields = {"curves": self.curves, "squareness": self.squareness, "metadata": self.metadata, **parts}

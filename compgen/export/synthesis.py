@@ -17,13 +17,15 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.errors import ConvergenceError
-from compgen.model.basis import free_basis
+from compgen.model.basis import free_basis, hat_matrix
 from compgen.model.exact import exact_error
 from compgen.model.grid import volume_sample
 from compgen.model.volumetric import tool_of
 
-#: Directions of the basis that the volume does not determine keep their start values: a weight far below any data.
-RIDGE = 1e-9
+#: Where the volume leaves a choice, values stay at their start at the positions ``Term.keep_mm``; where even that
+#: leaves one, everywhere. Both weights lie far below that of any data (the normal matrix has unit diagonal).
+KEEP = 1e-7
+RIDGE = 1e-11
 CHUNK_POINTS = 4096
 
 
@@ -59,13 +61,18 @@ class Projector:
 
     def project(self, wanted_mm: FloatArray, start: FloatArray | None = None) -> FloatArray:
         """Return all table values (parameters,) whose field is closest to ``wanted_mm`` (n, 3)."""
-        first = np.zeros(len(self.transform)) if start is None else start
-        rest = wanted_mm - self.field(first)
-        right = np.zeros(len(self.scale))
-        for chunk, matrix in self._chunks():
-            right += matrix.T @ rest[chunk].ravel()
-        solution = self.scale * np.asarray(cho_solve(self.factor, right * self.scale))
-        return first + self.transform @ solution[: self.transform.shape[1]]
+        if start is None:
+            return np.asarray(self.project_all(wanted_mm[None])[0])
+        return np.asarray(start + self.project_all((wanted_mm - self.field(start))[None])[0])
+
+    def project_all(self, wanted_mm: FloatArray) -> FloatArray:
+        """Return table values (k, parameters) for k wanted fields (k, n, 3) at once."""
+        right = np.zeros((len(self.scale), len(wanted_mm)))
+        for chunk in _slices(len(self.position_mm)):
+            matrix = _design(self.basis, self.position_mm[chunk], self.tool_mm, self.transform, self.offsets)
+            right += matrix.T @ wanted_mm[:, chunk].reshape(len(wanted_mm), -1).T
+        solution = self.scale[:, None] * np.asarray(cho_solve(self.factor, right * self.scale[:, None]))
+        return np.asarray((self.transform @ solution[: self.transform.shape[1]]).T)
 
     def field(self, values: FloatArray, position_mm: FloatArray | None = None) -> FloatArray:
         """Return the correction field of table values at the sample points or at others, shape (n, 3), mm."""
@@ -76,12 +83,6 @@ class Projector:
         """Split a vector of all table values by term."""
         bounds = np.cumsum([0, *(len(term.nodes_mm) for term in self.basis)])
         return {term.name: values[bounds[k] : bounds[k + 1]] for k, term in enumerate(self.basis)}
-
-    def _chunks(self) -> list[tuple[slice, FloatArray]]:
-        return [
-            (chunk, _design(self.basis, self.position_mm[chunk], self.tool_mm, self.transform, self.offsets))
-            for chunk in _slices(len(self.position_mm))
-        ]
 
 
 def _slices(count: int) -> list[slice]:
@@ -136,9 +137,13 @@ def projector(machine: Machine, basis: Sequence[Term], *, anchored: bool) -> Pro
         matrix = _design(basis, position_mm[chunk], tool_mm, transform, offsets)
         normal += matrix.T @ matrix
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
-    ridge = RIDGE * np.eye(size)
-    ridge[transform.shape[1] :] = 0.0
-    factor = cho_factor(normal * scale[:, None] * scale + ridge, lower=True)
+    regular = RIDGE * np.eye(size)
+    regular[transform.shape[1] :] = 0.0
+    rows = _keep_rows(basis) @ transform
+    rows *= scale[: transform.shape[1]]
+    rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
+    regular[: transform.shape[1], : transform.shape[1]] += KEEP * rows.T @ rows
+    factor = cho_factor(normal * scale[:, None] * scale + regular, lower=True)
     return Projector(tuple(basis), position_mm, tool_mm, transform, offsets, factor, scale)
 
 
@@ -157,6 +162,18 @@ def _transform(basis: Sequence[Term]) -> FloatArray:
         total[row : row + block.shape[0], column : column + block.shape[1]] = block
         row, column = row + block.shape[0], column + block.shape[1]
     return total
+
+
+def _keep_rows(basis: Sequence[Term]) -> FloatArray:
+    """Rows (k, parameters) whose product with the values gives them at the positions ``keep_mm`` of every term."""
+    blocks, first, total = [], 0, sum(len(term.nodes_mm) for term in basis)
+    for term in basis:
+        rows = np.zeros((len(term.keep_mm) if term.axis is not None else 0, total))
+        if len(rows):
+            rows[:, first : first + len(term.nodes_mm)] = hat_matrix(term.nodes_mm, np.array(term.keep_mm))
+        blocks.append(rows)
+        first += len(term.nodes_mm)
+    return np.vstack(blocks)
 
 
 def synthesize(machine: Machine, errors: ErrorTable, basis: Sequence[Term], *, anchored: bool) -> dict[str, FloatArray]:

@@ -96,7 +96,7 @@ def _start(
     cp: Any = import_module("cvxpy")  # takes more than a second: only when a bound is active
 
     quadratic = _quadratic(smoother, mu)
-    scale = 1 / np.sqrt(quadratic.diagonal())
+    scale: FloatArray = np.asarray(1 / np.sqrt(quadratic.diagonal()), dtype=np.float64)
     stretch: Any = sp.dia_array((scale[None, :], [0]), shape=quadratic.shape)
     scaled = stretch @ quadratic @ stretch
     linear = scale * smoother.gather((smoother.weight * y)[:, None])[:, 0]

@@ -19,6 +19,8 @@ from compgen.fit.weight import Method, choose
 
 #: An uncertainty counts at least this fraction of the curve's median one, and this much (um, urad): exact data.
 _LEAST_FRACTION, _LEAST = 1e-3, 1e-6
+#: With fewer degrees of freedom left than this the residuals say nothing about the noise.
+_LEAST_LEFT = 0.5
 
 
 @dataclass(frozen=True)
@@ -123,8 +125,8 @@ def _report(
 ) -> CurveReport:
     residual = y - solved.curve
     used = smoother.degrees_of_freedom(solved.mu)
-    left = smoother.unknowns - used
-    noise2 = float(np.sum(smoother.weight * residual**2)) / left if left > 1e-6 else math.nan
+    left = smoother.residual_degrees(solved.mu)
+    noise2 = float(np.sum(smoother.weight * residual**2)) / left if left >= _LEAST_LEFT else math.nan
     return CurveReport(
         error=name,
         unit=error_named(name).unit,

@@ -88,9 +88,9 @@ def _warn_tools(machine: Machine, curves: Mapping[str, HeldCurve], change: Frame
     one_tool = observable_errors(machine)
     told_apart = [name for name in curves if name not in one_tool]
     turn = np.abs(np.subtract(change.tool_rotation_rad, change.rotation_rad))
-    if told_apart and turn.max() > NOTHING and any(change.tool_rotation_rad):
+    if told_apart and turn.max() > NOTHING:
         warnings.warn(
-            f"constant angles at the reference point are taken out; E stays the same for the machine's tool offset "
+            f"a rotation is taken out of the curves; E stays the same for the machine's tool offset "
             f"{machine.tool_offset_mm} mm and changes by a constant for the other tools that "
             f"{', '.join(told_apart)} speak of",
             CompgenWarning,

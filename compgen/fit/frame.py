@@ -37,8 +37,8 @@ class FrameChange:
 
     ``position`` is the commanded one; the tool offset of the machine is part of ``translation_mm``. ``squareness`` is
     what was added to each squareness error, in rad. ``tool_rotation_rad`` is the sum of the constant angles taken out:
-    for
-    a tool that differs by d from the machine's offset, E(input) - E(zeroed) has a further constant tool_rotation x d.
+    for a tool that differs by d from the machine's offset, E(input) - E(zeroed) has a further constant
+    tool_rotation x d (a rigid motion of all tool tips together would have rotation x d).
     """
 
     translation_mm: tuple[float, float, float]

@@ -32,9 +32,10 @@ class CurveReport:
     half_gain_mm : wave length that the smoothing halves, on even nodes; 0 if none is.
     degrees_of_freedom : effective ones, trace of the smoother without bounds; ``free_nodes`` is their largest number.
     rms_residual : root mean square of data minus fit, over all nodes, after the data were brought to zero ends.
-    reduced_chi_square : weighted square sum of the residuals over the degrees of freedom left; nan where the
-        uncertainties are unknown or nothing is left.
-    noise : standard deviation of the data's noise as the residuals show it (at unit weight); nan if nothing is left.
+    reduced_chi_square : weighted square sum of the residuals over its expectation, trace of (1 - S)^2 (Buckley,
+        Eagleson & Silverman 1988, Biometrika 75, 189): near 1 if the uncertainties are right; nan where they are
+        unknown or where less than half a degree of freedom is left.
+    noise : standard deviation of the data's noise at unit weight, from the same quotient; nan if too little is left.
     smoothing_bias_max, smoothing_bias_rms : how much the smoothing flattens a curve like the fitted one, S c - c.
     smoothing_bias : the same per position, shape (n,).
     active_bounds : where the curve touches a bound.

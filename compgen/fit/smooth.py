@@ -21,6 +21,8 @@ from compgen.fit.held import Row
 Step = tuple[int, int | None, float]
 _BAND = 4
 _BLOCK = 512
+#: Refinement ends when a step is smaller than this fraction, and after this many steps: it gains 2 digits or more each.
+_SETTLED, _REFINEMENTS = 1e-12, 6
 #: mu times the largest eigenvalue of the penalty is kept below this, so that 2 digits and the refinement remain.
 _LARGEST_SPREAD = 1e14
 
@@ -137,7 +139,7 @@ class Smoother:
         """
         root = 1 / np.sqrt(self.free_weight)
         scaled = np.zeros_like(self.penalty)
-        for d in range(_BAND + 1):
+        for d in range(min(_BAND + 1, len(root))):
             scaled[d, : len(root) - d] = self.penalty[d, : len(root) - d] * root[d:] * root[: len(root) - d]
         values = eigvals_banded(scaled[: len(root)], lower=True)
         found: FloatArray = np.zeros(self.unknowns)
@@ -193,18 +195,21 @@ class Smoother:
         band[0] += self.free_weight
         return np.asarray(cholesky_banded(band, lower=True, check_finite=False))
 
-    def inverse(self, mu: float, gathered: FloatArray, refinements: int = 2) -> FloatArray:
+    def inverse(self, mu: float, gathered: FloatArray) -> FloatArray:
         """Z A^-1 g for gathered right-hand sides (n, k): curves (n, k), refined against the product form of A."""
         factor = (self.factor(mu), True)
         x = cho_solve_banded(factor, gathered, check_finite=False)
-        for _ in range(refinements):
+        for _ in range(_REFINEMENTS):
             rest = gathered - self.apply(mu, self.expand(x))
-            x = x + cho_solve_banded(factor, rest, check_finite=False)
+            step = cho_solve_banded(factor, rest, check_finite=False)
+            x = x + step
+            if np.abs(step).max(initial=0.0) <= _SETTLED * np.abs(x).max(initial=0.0):
+                break
         return self.expand(x)
 
-    def solve(self, mu: float, y: FloatArray, refinements: int = 2) -> FloatArray:
+    def solve(self, mu: float, y: FloatArray) -> FloatArray:
         """Fitted curves (n, k) for data (n, k)."""
-        return self.inverse(mu, self.gather(self.weight[:, None] * y), refinements)
+        return self.inverse(mu, self.gather(self.weight[:, None] * y))
 
     def columns(self, mu: float) -> Iterator[tuple[slice, FloatArray]]:
         """Yield the smoother's matrix S (c = S y) in blocks of columns: (which, (n, block))."""
@@ -213,8 +218,13 @@ class Smoother:
             picked = slice(start, min(start + _BLOCK, n))
             unit = np.zeros((n, picked.stop - start))
             unit[np.arange(start, picked.stop), np.arange(picked.stop - start)] = 1.0
-            yield picked, self.solve(mu, unit, refinements=1)
+            yield picked, self.solve(mu, unit)
 
     def degrees_of_freedom(self, mu: float) -> float:
         """Effective degrees of freedom: trace of the smoother over the free unknowns."""
         return float(np.sum(1 / (1 + mu * self.eigenvalues)))
+
+    def residual_degrees(self, mu: float) -> float:
+        """Expected weighted square sum of the residuals of noise of unit weight: trace of (1 - S)^2."""
+        damped = mu * self.eigenvalues
+        return float(np.sum((damped / (1 + damped)) ** 2))

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from compgen.core.csvio import FloatArray
 
@@ -50,15 +49,19 @@ def _misfit(
 
 
 def _search(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    from scipy.optimize import least_squares  # imported here: slow to load, and rarely needed
+
     best: tuple[float, FloatArray] | None = None
+
+    def misfit(x: FloatArray) -> FloatArray:
+        return _residual(p, reading, member, x)
+
     for direction in np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3):
         for distance in (1.0, 3.0):
             start = direction * distance
             dead = np.linalg.norm(p - start, axis=1) - reading
             x0 = np.concatenate([start, member.T @ dead / member.sum(axis=0)])
-            found = least_squares(
-                lambda x: _residual(p, reading, member, x), x0, loss="soft_l1", f_scale=1e-3, max_nfev=60
-            )
+            found = least_squares(misfit, x0, loss="soft_l1", f_scale=1e-3, max_nfev=60)
             if best is None or found.cost < best[0]:
                 best = (float(found.cost), found.x)
     assert best is not None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import BSpline
 from scipy.linalg import null_space
 
 from compgen.core.csvio import FloatArray
@@ -36,6 +35,8 @@ def spline_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
     The knots are spread like the nodes (averages of three neighbouring nodes), first and last fourfold, so that the
     first and the last coefficient are the end values. Positions (m,) outside the range get the end value.
     """
+    from scipy.interpolate import BSpline  # imported here: slow to load, and linear curves do without
+
     nodes = np.asarray(nodes_mm, dtype=np.float64)
     inner = (nodes[1:-3] + nodes[2:-2] + nodes[3:-1]) / 3.0
     knots = np.concatenate([np.repeat(nodes[0], 4), inner, np.repeat(nodes[-1], 4)])

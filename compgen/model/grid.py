@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import qmc
 
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
@@ -59,6 +58,8 @@ def volume_sample(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int 
     ]
     if np.prod([len(level) for level in levels]) <= most:
         return VolumeGrid((levels[0], levels[1], levels[2])).position_mm
+    from scipy.stats import qmc  # imported here: it takes a quarter of a second, and few machines need it
+
     unit = qmc.Sobol(3, seed=1).random_base2(int(np.floor(np.log2(most))))
     corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return machine.lower_mm + np.vstack([unit, corners]) * (machine.upper_mm - machine.lower_mm)

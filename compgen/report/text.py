@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from rich import box
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -31,7 +32,17 @@ def identification_table(result: Identification) -> Group:
     ]
     if len(result.rejected) > 10:
         lines.append(f"... and {len(result.rejected) - 10} more in identify.json")
-    table = Table("error", "largest", "at (mm)", "u (k = 1)", "unit", title="identified errors", title_justify="left")
+    table = Table(
+        "error",
+        "largest",
+        "at (mm)",
+        "u (k = 1)",
+        "unit",
+        title="identified errors",
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE,
+    )
     for name in result.errors.names:
         unit = error_named(name).si_per_unit
         if name in result.errors.squareness:
@@ -47,7 +58,18 @@ def identification_table(result: Identification) -> Group:
 
 def fit_table(result: FitResult) -> Table:
     """Return what the fit did to each curve."""
-    table = Table("error", "smoothness", "chosen by", "free", "residual rms", "bias max", "unit", "solver", "bounds touched")
+    table = Table(
+        "error",
+        "smoothness",
+        "chosen by",
+        "free",
+        "residual rms",
+        "bias max",
+        "unit",
+        "solver",
+        "bounds touched",
+        box=box.SIMPLE,
+    )
     for name, item in result.report.items():
         table.add_row(
             name,
@@ -65,21 +87,20 @@ def fit_table(result: FitResult) -> Table:
 
 def verification_table(results: Sequence[Verification]) -> Group:
     """Return before and after for every control, read from the files, and why tables were not accepted."""
-    table = Table("control", title="error of the tool tip over the volume, um", title_justify="left")
-    for heading in ("before max", "rms", "after max", "rms", "after, rigid removed max", "rms", "cannot express"):
-        table.add_column(heading, justify="right")
-    table.add_column("verdict")
+    title = "error of the tool tip over the volume, max / rms in um, from the files read back"
+    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False)
+    table.add_column("control", no_wrap=True)
+    for heading in ("before", "after", "after*", "not expressible"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
     notes: list[Text] = []
     for item in results:
         verdict = Text("accepted", "green") if item.accepted else Text("NOT ACCEPTED", "bold red")
         table.add_row(
             item.controller,
-            f"{item.before.max_um:.1f}",
-            f"{item.before.rms_um:.1f}",
-            f"{item.after.max_um:.2f}",
-            f"{item.after.rms_um:.2f}",
-            f"{item.after_rigid_removed.max_um:.2f}",
-            f"{item.after_rigid_removed.rms_um:.2f}",
+            f"{item.before.max_um:.1f} / {item.before.rms_um:.1f}",
+            f"{item.after.max_um:.2f} / {item.after.rms_um:.2f}",
+            f"{item.after_rigid_removed.max_um:.2f} / {item.after_rigid_removed.rms_um:.2f}",
             f"{item.unrepresentable_um:.2f}",
             verdict,
         )
@@ -88,7 +109,7 @@ def verification_table(results: Sequence[Verification]) -> Group:
             listed = ", ".join(f"{name} {value:.1f} um" for name, value in list(item.uncorrected_um.items())[:8])
             more = f" and {len(item.uncorrected_um) - 8} more" if len(item.uncorrected_um) > 8 else ""
             notes.append(Text(f"{item.controller} leaves uncorrected: {listed}{more}"))
-    return Group(table, *notes)
+    return Group(table, Text("* after the best-fit rigid motion of the workpiece is taken out"), *notes)
 
 
 def run_json(result: RunResult) -> dict[str, Any]:

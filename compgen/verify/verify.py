@@ -223,14 +223,11 @@ def _shrink_reasons(machine: Machine, tables: ReadTables, errors: ErrorTable, po
 
 def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dict[str, float]:
     """Largest displacement in um that the best table leaves of each error alone (first order), where it matters."""
+    names = errors.names
+    wanted = np.stack([-volumetric_error(machine, errors.only(name), solver.position_mm) for name in names])
     found = {}
-    for name in errors.names:
-        alone = ErrorTable(
-            {name: errors.curves[name]} if name in errors.curves else {},
-            {name: errors.squareness[name]} if name in errors.squareness else {},
-        )
-        wanted = -volumetric_error(machine, alone, solver.position_mm)
-        rest = wanted - solver.field(solver.project(wanted))
+    for name, field_mm, values in zip(names, wanted, solver.project_all(wanted), strict=True):
+        rest = field_mm - solver.field(values)
         if solver.offsets:
             rest = rest - rest.mean(axis=0)
         largest = float(np.max(np.linalg.norm(rest, axis=1)))

@@ -1,0 +1,38 @@
+# make demo   sets up and runs the main job on the example
+# make test   sets up, checks style and types, runs the tests
+PYTHON ?= python3
+BIN := .venv/bin
+CONTROLLERS := isg-csv etalon-exchange siemens-eec siemens-cec fanuc-pitch
+
+.PHONY: demo test lint clean
+.DELETE_ON_ERROR:
+
+demo: .venv/ready
+	$(BIN)/compgen run zha-gantry examples/zha-gantry.lengths.csv $(foreach name,$(CONTROLLERS),--controller $(name)) --out demo-out
+	$(BIN)/python examples/against_truth.py demo-out
+
+test: lint
+	$(BIN)/python -m pytest -n 2 -ra
+
+lint: .venv/ready-dev
+	$(BIN)/ruff check compgen tests examples docs
+	$(BIN)/ruff format --check compgen tests examples docs
+	$(BIN)/mypy
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "compgen needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -m venv .venv || { rm -rf .venv; \
+	  [ "$$(id -u)" = 0 ] && apt-get install -y -qq python3-venv && $(PYTHON) -m venv .venv; } || \
+	  { rm -rf .venv; echo "no virtual environment: install your system's python3-venv package"; exit 1; }
+
+.venv/ready: .venv/bin/python requirements.txt pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e .
+	@touch $@
+
+.venv/ready-dev: .venv/ready requirements-dev.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	@touch $@
+
+clean:
+	rm -rf .venv demo-out
