@@ -18,7 +18,15 @@ from compgen.controllers.base import Controller, SourceFile, Term
 from compgen.controllers.grids import equidistant_grid
 from compgen.controllers.siemens_limits import largest_sums, set_violations
 from compgen.controllers.siemens_preflight import cec_parameters, cec_sign_statement, cec_warnings
-from compgen.controllers.siemens_products import MM_DECIMALS, MULT_MODES, CecMap, CecTable, folded_tables, sum_into_axes
+from compgen.controllers.siemens_products import (
+    MM_DECIMALS,
+    MULT_MODES,
+    NEGLIGIBLE_PRODUCT_MM,
+    CecMap,
+    CecTable,
+    folded_tables,
+    sum_into_axes,
+)
 from compgen.controllers.siemens_settings import take_axis_names, take_steps
 from compgen.controllers.siemens_syntax import (
     Assignment,
@@ -53,8 +61,10 @@ _SIGN_MISSING = (
     '"correction") and write sign = "error" or sign = "correction"'
 )
 _AXIS_VALUE = re.compile(r'\(\s*([A-Z0-9_]{1,32})\s*\)|"([A-Z0-9_]{1,32})"')
+#: Every output axis has three ordinary tables and, on every chain, at most three products.
+_ORDINARY_PER_AXIS = _PRODUCTS_PER_AXIS = 3
 #: Factors of a product have 9 decimals and stay below some mm: what their rounding may add up to on one axis.
-_PRODUCT_ROUNDING_MM = 1e-8
+_FACTOR_ROUNDING_MM = 1e-8
 
 
 @dataclass(frozen=True)
@@ -208,8 +218,9 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return found
 
     def resolution_mm(self, settings: CecSettings) -> float:
-        """Half of the last decimal of three tables per axis, and what the factors of products add."""
-        return 3 * 0.5 * 10.0**-MM_DECIMALS + (_PRODUCT_ROUNDING_MM if settings.products else 0.0)
+        """Half of the last decimal of every ordinary table and of every product that is too small to be written."""
+        ordinary = _ORDINARY_PER_AXIS * 0.5 * 10.0**-MM_DECIMALS
+        return ordinary + settings.products * (_PRODUCTS_PER_AXIS * NEGLIGIBLE_PRODUCT_MM + _FACTOR_ROUNDING_MM)
 
 
 def _max_sum(value: Any) -> tuple[float, float, float]:
