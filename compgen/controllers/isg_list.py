@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
 from compgen.controllers.base import SourceFile
-from compgen.controllers.isg_parameters import ISO_NAMES, check_complete, content_lines
+from compgen.controllers.isg_parameters import check_complete, content_lines
 from compgen.core.machine import Chain
 from compgen.core.text import nearest
 
@@ -66,13 +66,15 @@ def base_name(path: str) -> str:
 
 def is_list_file(source: SourceFile) -> bool:
     """Whether a file is a list file: by its suffix, else by its first line, which then is one key and one value."""
-    if source.path.suffix.lower() == ".lis":
-        return True
+    if source.path.suffix.lower() in (".lis", ".csv"):
+        return source.path.suffix.lower() == ".lis"
     for line in source.text[:20_000].split("\n"):
         words = line.partition("#")[0].split()
         if words and not words[0].startswith("//"):
-            known = words[0].lower() in (*_ACTING, *_INERT) or _INDEXED.fullmatch(words[0].lower())
-            return bool(known) and len(words) == 2 and words[1] not in (*ISO_NAMES, *"XYZABC")
+            key = words[0].lower()
+            if key in (*_ACTING, *_INERT) or _INDEXED.fullmatch(key):
+                return len(words) == 2 and (len(key) > 1 or words[1].isdigit())
+            return False
     return False
 
 

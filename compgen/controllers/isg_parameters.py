@@ -111,11 +111,11 @@ class ParameterFile:
 
 def content_lines(source: SourceFile, comment: str = "//") -> list[tuple[int, str]]:
     """Return the lines of a file without comments and blank lines, with their numbers; InputError for garbage."""
-    lines = source.text.split("\n")
-    if len(lines) > MOST_LINES:
-        raise source.fail(f"has {len(lines)} lines; at most {MOST_LINES} are read", MOST_LINES)
+    count = source.text.count("\n")
+    if count > MOST_LINES:
+        raise source.fail(f"has {count} lines; at most {MOST_LINES} are read", MOST_LINES)
     found = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(source.text.split("\n"), start=1):
         if len(line) > MOST_CHARACTERS:
             raise source.fail(f"the line has {len(line)} characters; at most {MOST_CHARACTERS} are read", number)
         text = line.partition(comment)[0].strip(" \t\r\f")

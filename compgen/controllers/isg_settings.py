@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from compgen.controllers.isg_list import Direction, ListFile, axis_letters, chain_text
-from compgen.controllers.isg_parameters import Field
+from compgen.controllers.isg_parameters import MOST_LINES, Field
 from compgen.core import tomlio
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
@@ -74,7 +74,7 @@ def read_isg_settings(machine: Machine, name: str, tool_position: bool) -> IsgSe
         negate=section.take("negate", axis_letters, reversed_axes),
         chain_direction=cast(Direction, section.take("chain_direction", directions, "workpiece_to_tool")),
         use_axis_offsets=section.take("use_axis_offsets", tomlio.whole(0, 1), 0),
-        max_records=section.take("max_records", tomlio.whole(1, 10_000_000), 2000),
+        max_records=section.take("max_records", tomlio.whole(1, MOST_LINES), 2000),
         path=section.take("path", _folder, ""),
         write_tool_position=tool_position and section.take("write_tool_position", tomlio.flag, False),
         lever_mm=float(np.max(np.maximum(np.abs(machine.lower_mm), np.abs(machine.upper_mm)) + tool)),
