@@ -86,7 +86,8 @@ def _quadratic(smoother: Smoother, mu: float) -> sp.csc_array:
     band = mu * smoother.penalty
     band[0] += smoother.free_weight
     lower: Any = sp.dia_array((band, -np.arange(len(band))), shape=(n, n))
-    return sp.csc_array(lower + lower.T - sp.dia_array((band[:1], [0]), shape=(n, n)))
+    middle: Any = sp.dia_array((band[:1], [0]), shape=(n, n))
+    return sp.csc_array(lower + lower.T - middle)
 
 
 def _start(
@@ -96,7 +97,7 @@ def _start(
     cp: Any = import_module("cvxpy")  # takes more than a second: only when a bound is active
 
     quadratic = _quadratic(smoother, mu)
-    scale: FloatArray = np.asarray(1 / np.sqrt(quadratic.diagonal()), dtype=np.float64)
+    scale = 1 / np.sqrt(quadratic.diagonal())
     stretch: Any = sp.dia_array((scale[None, :], [0]), shape=quadratic.shape)
     scaled = stretch @ quadratic @ stretch
     linear = scale * smoother.gather((smoother.weight * y)[:, None])[:, 0]

@@ -100,6 +100,8 @@ def propagate(smoother: Smoother, mu: float, held: HeldCurve) -> FloatArray:
     G takes the line or constant out that zeroing removed (G = 1 where nothing was removed), U holds the input's u.
     An unknown u counts only where the fit uses it; if it does, the result is nan.
     """
+    if np.isnan(held.u).all():
+        return np.where(smoother.expand(np.ones((len(held.u), 1)))[:, 0] == 0, 0.0, np.nan)
     shapes = held.shapes * held.moved
     smooth_shapes = smoother.solve(mu, shapes)
     functional = np.zeros((len(held.rows), len(held.value)))
