@@ -424,6 +424,25 @@ def test_a_table_for_one_direction_acts_only_after_travel_in_that_direction(simp
         assert not np.any(control.emulate(machine, own, tables, Points(np.zeros((1, 3)))))
 
 
+def test_tables_of_opposite_directions_never_add_up_in_the_largest_sum(simple):
+    machine, control, own = simple()
+    text = constant(0, "0.01").replace("DIRECTION[0]=0", "DIRECTION[0]=1")
+    text += constant(1, "0.03").replace("DIRECTION[1]=0", "DIRECTION[1]=-1")
+    tables = parsed(control, machine, own, text + constant(2, "-0.1") + "M17\n")
+    assert largest_sums(machine, tables.tables, "S1")[0][0] == pytest.approx(-0.09, abs=ARITHMETIC)
+
+
+@pytest.mark.parametrize(("sign", "moved"), [("error", "-0.050000"), ("correction", "+0.050000")])
+def test_the_sign_statement_says_where_the_axis_goes(tmp_path, sign, moved):
+    machine = simple_machine(tmp_path, f'sign = "{sign}"', "siemens-cec")
+    control = controller_named("siemens-cec")
+    own = control.read_settings(machine)
+    tables = parsed(control, machine, own, constant(0, "0.05") + "M17\n")
+    statement = control.context(machine, own, tables)["sign_statement"]
+    assert f"the sum into AX1 is +0.050000 mm, the axis is moved by {moved} mm" in statement
+    assert f'| {moved[:-3]} mm | `sign = "{sign}"` |' in preflight(control, machine, own, tables)
+
+
 def test_a_cyclic_table_repeats(simple):
     machine, control, own = simple()
     nodes = "$AN_CEC[0,0]=0.0\n$AN_CEC[0,1]=0.02\n$AN_CEC[0,2]=0.04\n$AN_CEC[0,3]=0.0\n"
