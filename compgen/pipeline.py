@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,8 @@ from compgen.core.error_table import ErrorTable, format_errors
 from compgen.core.files import OutputFolder, read_bytes, sha256_of
 from compgen.core.lengths import read_lengths
 from compgen.core.machine import Machine
-from compgen.export import Export, Provenance, export
+from compgen.errors import InputError
+from compgen.export import REJECTED_PREFIX, Export, Provenance, export, usable_format
 from compgen.fit import FitOptions, FitResult, fit
 from compgen.identify import Identification, IdentifyOptions, identify
 from compgen.verify import Verification, read_tables, verify
@@ -102,24 +102,34 @@ def export_and_verify(
     folder: str | Path,
     **export_options: Any,
 ) -> ControllerResult:
-    """Export, write to a hidden folder, read the bytes back from there, verify, and only then give the files a name.
+    """Export, write to a temporary folder, read the bytes back from there, verify, and only then write to ``folder``.
 
     The verification moves the exact model with the ``identified`` errors, not with the fitted ones that made the
     tables. Files that are not accepted are written as ``NOT-ACCEPTED-...``.
     """
+    OutputFolder(folder)
     exported = export(machine, fitted, controller, **export_options)
-    target = OutputFolder(folder).folder
-    target.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(prefix=".verify-", dir=target))
-    try:
+    return _write_result(exported, _read_back(machine, exported, identified), folder)
+
+
+def _read_back(machine: Machine, exported: Export, identified: ErrorTable) -> Verification:
+    """Verify what stands in the files after they were written; InputError if they cannot be read."""
+    with tempfile.TemporaryDirectory(prefix="compgen-") as staging:
         written = exported.write(staging, accepted=True)
-        verification = verify(machine, read_tables(machine, written, controller), identified)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-    paths = exported.write(target, accepted=verification.accepted)
-    named = tuple((path.name, digest) for path, (_, digest) in zip(paths, verification.files, strict=True))
-    verification = replace(verification, files=named)
-    write_all(target, {"result.json": json.dumps(verification.summary(), indent=2) + "\n"})
+        try:
+            tables = read_tables(machine, written, exported.controller)
+        except InputError as error:
+            name = Path(error.file).name if error.file else None
+            message = f"the rendered file cannot be read back, so its template is wrong: {error.message}"
+            raise InputError(message, file=name, line=error.line) from error
+        return verify(machine, tables, identified)
+
+
+def _write_result(exported: Export, verification: Verification, folder: str | Path) -> ControllerResult:
+    prefix = "" if verification.accepted else REJECTED_PREFIX
+    verification = replace(verification, files=tuple((prefix + name, digest) for name, digest in verification.files))
+    result = {"result.json": json.dumps(verification.summary(), indent=2) + "\n"}
+    paths = exported.write(folder, accepted=verification.accepted, beside=result)
     return ControllerResult(exported, verification, tuple(paths))
 
 
@@ -135,7 +145,7 @@ def run(
     allow_unverified: bool = False,
     progress: Progress = lambda _: None,
 ) -> RunResult:
-    """Run the whole chain and write everything to ``folder``.
+    """Run the whole chain and write everything to ``folder``, after the last step that may find bad input.
 
     Parameters
     ----------
@@ -147,9 +157,13 @@ def run(
     identify_options, fit_options, templates, allow_unverified : handed to the stages.
     progress : is told the name of each stage as it begins.
     """
-    OutputFolder(folder)
-    for name in controllers:  # wrong settings are found before the work begins
+    targets = {name: Path(folder) / name if len(set(controllers)) > 1 else Path(folder) for name in controllers}
+    if not targets:
+        raise InputError("no controller was given; name at least one")
+    for name, target in targets.items():  # wrong settings are found before the work begins
+        OutputFolder(target)
         controller_named(name).read_settings(machine)
+        usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
     lengths = read_lengths(measurements)
     provenance = provenance_of(machine.source, *measurements)
@@ -157,21 +171,18 @@ def run(
     identification = identify(machine, lengths, identify_options)
     progress("fitting smooth curves")
     fitted = fit(machine, identification.errors, fit_options or FitOptions())
-    write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted)})
-    results = []
-    for name in controllers:
+    checked: dict[str, tuple[Export, Verification]] = {}
+    for name in targets:
         progress(f"exporting, reading back and verifying: {name}")
-        target = Path(folder) / name if len(controllers) > 1 else Path(folder)
-        results.append(
-            export_and_verify(
-                machine,
-                fitted.errors,
-                identification.errors,
-                name,
-                target,
-                templates=templates,
-                allow_unverified=allow_unverified,
-                provenance=provenance,
-            )
+        exported = export(
+            machine,
+            fitted.errors,
+            name,
+            templates=templates,
+            allow_unverified=allow_unverified,
+            provenance=provenance,
         )
+        checked[name] = exported, _read_back(machine, exported, identification.errors)
+    write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted)})
+    results = [_write_result(*checked[name], target) for name, target in targets.items()]
     return RunResult(identification, fitted, tuple(results))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -94,8 +95,18 @@ def controller_option(*, multiple: bool = False) -> Callable[[Command], Command]
 
 
 def print_json(data: Any) -> None:
-    """Print one JSON object to stdout."""
-    click.echo(json.dumps(data, indent=2, default=str))
+    """Print one JSON object to stdout; a number that is not known (NaN) or not finite becomes null."""
+    click.echo(json.dumps(_strict(data), indent=2, default=str, allow_nan=False))
+
+
+def _strict(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {key: _strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_strict(item) for item in value]
+    return value
 
 
 @contextmanager
@@ -126,8 +137,7 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
         except click.exceptions.Exit as error:
             return error.exit_code
         except click.ClickException as error:
-            error.show()
-            return 2
+            return _usage(error, words)
         except (click.Abort, KeyboardInterrupt):
             stderr.print("stopped", markup=False)
             return 130
@@ -144,6 +154,16 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
             place = traceback.extract_tb(error.__traceback__)[-1]
             text = f"internal error: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
             return _fail(f"{text}; COMPGEN_TRACEBACK=1 shows more", 3, words)
+
+
+def _usage(error: click.ClickException, words: Sequence[str]) -> int:
+    """Report wrong usage as click does, with the place where help is to be had."""
+    context = getattr(error, "ctx", None)
+    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):  # click 8.2 and later
+        error.show()
+        return 2
+    hint = f"; see '{context.command_path} --help'" if context is not None else ""
+    return _fail(error.format_message().rstrip(".") + hint, 2, words)
 
 
 def _fail(message: str, code: int, words: Sequence[str]) -> int:

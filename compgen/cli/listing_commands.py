@@ -19,7 +19,9 @@ from compgen.model import modelled_errors
 @click.command("controllers")
 @json_option
 def controllers_command(as_json: bool) -> int:
-    """List the controls that compgen writes, and how well their format is documented.
+    """List the controls that compgen writes, what they can express, and how well their format is documented.
+
+    Nothing is computed; the units of each control's numbers (mm, rad, counts) stand in its preflight.md.
 
     \b
     Example:
@@ -51,7 +53,7 @@ def controllers_command(as_json: bool) -> int:
 @click.option("--machines", multiple=True, type=click.Path(path_type=Path), help="Further folder with machine files.")
 @json_option
 def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
-    """List the machines: the shipped ones, those in ./machines, and those in --machines folders.
+    """List the machines with their travel (mm): the shipped ones, those in ./machines, and those in --machines folders.
 
     \b
     Example:
@@ -59,7 +61,8 @@ def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
     """
     local = Path("machines")
     files = machine_files((*((local,) if local.is_dir() else ()), *machines))
-    table = Table("name", "chain", "travel X, Y, Z (mm)", "errors", "file", box=box.SIMPLE)
+    table = Table("name", "chain", "travel X, Y, Z (mm)", "errors", box=box.SIMPLE)
+    table.add_column("file", overflow="fold")
     listing = {}
     for name, path in sorted(files.items()):
         machine = open_machine(str(path))

@@ -1,6 +1,6 @@
 """From errors to controller files."""
 
-from compgen.export.export import REJECTED_PREFIX, Export, Provenance, export, program_version
+from compgen.export.export import REJECTED_PREFIX, Export, Provenance, export, program_version, usable_format
 from compgen.export.render import Format, load_format
 from compgen.export.synthesis import Projector, projector, synthesize, wanted_correction
 
@@ -15,5 +15,6 @@ __all__ = [
     "program_version",
     "projector",
     "synthesize",
+    "usable_format",
     "wanted_correction",
 ]

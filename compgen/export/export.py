@@ -50,8 +50,10 @@ class Export:
     violations: Sequence[str] = ()
     warnings: Sequence[str] = ()
 
-    def write(self, folder: str | Path, *, accepted: bool | None = None) -> list[Path]:
-        """Write everything atomically and return the paths of the controller files.
+    def write(
+        self, folder: str | Path, *, accepted: bool | None = None, beside: Mapping[str, str] | None = None
+    ) -> list[Path]:
+        """Write everything atomically, with the texts ``beside`` them, and return the paths of the controller files.
 
         Tables that are not accepted (by default: that break a limit) get ``NOT-ACCEPTED-`` before their name; a table
         of that name from an earlier run is then moved aside to ``PREVIOUS-`` so that it cannot be taken for the new one.
@@ -64,6 +66,8 @@ class Export:
         manifest = {**self.manifest, "accepted": good, "file_prefix": prefix}
         output.add("manifest.json", json.dumps(manifest, indent=2) + "\n")
         output.add("preflight.md", self.preflight)
+        for name, text in (beside or {}).items():
+            output.add(name, text)
         paths = output.commit()
         for name in self.files:
             stale = output.folder / (name if prefix else REJECTED_PREFIX + name)
@@ -77,6 +81,17 @@ class Provenance:
     """Where the errors came from: (name, SHA-256) of every input file, for manifest and file headers."""
 
     inputs: Sequence[tuple[str, str]] = field(default_factory=tuple)
+
+
+def usable_format(controller: str, templates: Path | None = None, *, allow_unverified: bool = False) -> Format:
+    """Return the card of a control's format; InputError if it is unverified and that was not allowed."""
+    card = load_format(controller, templates)
+    if card.evidence == "unverified" and not allow_unverified:
+        raise InputError(
+            f"the format {controller!r} is unverified ({'; '.join(card.unverified)}); "
+            "add --allow-unverified if you accept that"
+        )
+    return card
 
 
 def export(
@@ -106,12 +121,7 @@ def export(
     """
     control = controller_named(controller)
     settings = control.read_settings(machine)
-    card = load_format(controller, templates)
-    if card.evidence == "unverified" and not allow_unverified:
-        raise InputError(
-            f"the format {controller!r} is unverified ({'; '.join(card.unverified)}); "
-            "add --allow-unverified if you accept that"
-        )
+    card = usable_format(controller, templates, allow_unverified=allow_unverified)
     basis = control.basis(machine, settings, errors)
     values = synthesize(machine, errors, basis, anchored=control.anchored)
     tables = control.build(machine, settings, basis, values)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
-from jinja2 import ChoiceLoader, FileSystemLoader, StrictUndefined, TemplateError
+from jinja2 import ChoiceLoader, FileSystemLoader, StrictUndefined, TemplateError, TemplateSyntaxError
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from compgen.core import tomlio
@@ -16,6 +17,20 @@ from compgen.core.csvio import fixed
 from compgen.core.text import one_line
 from compgen.errors import InputError
 from compgen.resources import data_folder
+
+#: Files that are written beside those of the control.
+OWN_FILES = ("manifest.json", "preflight.md", "result.json")
+#: What a wrong template may raise: Jinja's own errors, and those of the expressions in it.
+_TEMPLATE_FAULTS = (
+    TemplateError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+    LookupError,
+    AttributeError,
+    RecursionError,
+    UnicodeError,
+)
 
 
 @dataclass(frozen=True)
@@ -59,26 +74,45 @@ def _prose(value: Any) -> str:
 
 def load_format(name: str, folder: Path | None = None) -> Format:
     """Load the card of format ``name`` from ``folder`` (the user's templates), else from the shipped ones."""
+    if folder is not None and not folder.is_dir():
+        raise InputError("no such folder; --templates needs a folder with a sub-folder per control", file=folder)
     for base in (*((folder,) if folder else ()), data_folder("templates")):
         path = base / name / "format.toml"
         if path.is_file():
-            return _read_format(path)
+            return _read_format(path, name)
     raise InputError(f"no format.toml for {name!r} in {folder or data_folder('templates')}")
 
 
-def _read_format(path: Path) -> Format:
+def _named(expected: str) -> Callable[[Any], str]:
+    def check(value: Any) -> str:
+        if value != expected:
+            raise ValueError(f"the name of the control, {expected!r}, is expected")
+        return expected
+
+    return check
+
+
+def _file_name(value: Any) -> str:
+    """A plain name of an output file: no folder, none of the names that compgen writes itself."""
+    name = tomlio.text(value)
+    if PurePath(name).name != name or "\\" in name or name.startswith(".") or name.lower() in OWN_FILES:
+        raise ValueError(f"a plain file name without folder, other than {', '.join(OWN_FILES)}, is expected")
+    return name
+
+
+def _read_format(path: Path, name: str) -> Format:
     root = tomlio.read_toml(path)
     files = []
     for section in root.sections("files"):
         spec = FileSpec(
             template=section.take("template", tomlio.text),
-            name=section.take("name", tomlio.text),
+            name=section.take("name", _file_name),
             line_end={"lf": "\n", "crlf": "\r\n"}[section.take("line_end", tomlio.choice("lf", "crlf"), "lf")],
         )
         section.finish()
         files.append(spec)
     card = Format(
-        name=root.take("name", tomlio.text),
+        name=root.take("name", _named(name)),
         title=root.take("title", tomlio.text),
         summary=root.take("summary", _prose),
         expresses=root.take("expresses", _prose),
@@ -89,6 +123,8 @@ def _read_format(path: Path) -> Format:
         sources=root.take("sources", _texts),
     )
     root.finish()
+    if not files or len({spec.name.lower() for spec in files}) != len(files):
+        raise root.fail("files", "at least one [[files]] is due, each with a name of its own")
     return card
 
 
@@ -135,10 +171,20 @@ def render(card: Format, template: str, context: Mapping[str, Any], folder: Path
     try:
         page = _environment(folders).get_template(f"{card.name}/{template}")
         return page.render({**{key: _inert(value) for key, value in context.items()}, "format": card})
-    except TemplateError as error:
-        raise InputError(
-            f"the template cannot be rendered: {error}", file=f"templates/{card.name}/{template}"
-        ) from error
+    except _TEMPLATE_FAULTS as error:
+        file, line = _place(error, folders)
+        message = f"the template cannot be rendered: {one_line(error)}"
+        raise InputError(message, file=file or f"templates/{card.name}/{template}", line=line) from error
+
+
+def _place(error: Exception, folders: Sequence[Path]) -> tuple[str | None, int | None]:
+    """Template file and line of an error: Jinja gives both in syntax errors, and rewrites tracebacks for the rest."""
+    if isinstance(error, TemplateSyntaxError):
+        return error.filename, error.lineno
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if any(Path(frame.filename).is_relative_to(folder) for folder in folders):
+            return frame.filename, frame.lineno
+    return None, None
 
 
 def render_files(card: Format, context: Mapping[str, Any], folder: Path | None = None) -> dict[str, str]:

@@ -14,7 +14,7 @@ from compgen.core.names import error_named
 from compgen.fit import FitResult
 from compgen.identify import Identification
 from compgen.pipeline import RunResult
-from compgen.verify import Verification
+from compgen.verify import Residuals, Verification
 
 
 def identification_table(result: Identification) -> Group:
@@ -58,22 +58,14 @@ def identification_table(result: Identification) -> Group:
 
 def fit_table(result: FitResult) -> Table:
     """Return what the fit did to each curve."""
-    table = Table(
-        "error",
-        "smoothness",
-        "chosen by",
-        "free",
-        "residual rms",
-        "bias max",
-        "unit",
-        "solver",
-        "bounds touched",
-        box=box.SIMPLE,
-    )
+    table = Table(box=box.SIMPLE, pad_edge=False, collapse_padding=True)
+    headings = ("error", "smoothness", "chosen by", "free", "residual rms", "bias max", "unit", "solver", "at a bound")
+    for heading in headings:
+        table.add_column(heading, overflow="fold", min_width=10 if heading == "smoothness" else None)
     for name, item in result.report.items():
         table.add_row(
             name,
-            f"{item.smoothness:.3g}",
+            f"{item.smoothness:.2g}",
             item.method,
             f"{item.degrees_of_freedom:.1f}",
             f"{item.rms_residual:.3f}",
@@ -85,31 +77,46 @@ def fit_table(result: FitResult) -> Table:
     return table
 
 
+def _um(value: float) -> str:
+    """A figure in um: two decimals below 10, none from 1000 on."""
+    return f"{value:.{2 if abs(value) < 9.995 else 1 if abs(value) < 999.95 else 0}f}"
+
+
+def _pair(figures: Residuals) -> str:
+    return f"{_um(figures.max_um)} / {_um(figures.rms_um)}"
+
+
 def verification_table(results: Sequence[Verification]) -> Group:
     """Return before and after for every control, read from the files, and why tables were not accepted."""
-    title = "error of the tool tip over the volume, max / rms in um, from the files read back"
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False)
-    table.add_column("control", no_wrap=True)
-    for heading in ("before", "after", "after*", "not expressible"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
+    title = "tool tip error over the volume, max / rms in um, by the files read back"
+    table = Table(
+        title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False, collapse_padding=True
+    )
+    table.add_column("control", overflow="fold", min_width=12)
+    for heading in ("before", "after", "after*", "not held"):
+        table.add_column(heading, justify="right", overflow="fold", min_width=8)
+    table.add_column("verdict", overflow="fold", min_width=8)
     notes: list[Text] = []
     for item in results:
         verdict = Text("accepted", "green") if item.accepted else Text("NOT ACCEPTED", "bold red")
         table.add_row(
             item.controller,
-            f"{item.before.max_um:.1f} / {item.before.rms_um:.1f}",
-            f"{item.after.max_um:.2f} / {item.after.rms_um:.2f}",
-            f"{item.after_rigid_removed.max_um:.2f} / {item.after_rigid_removed.rms_um:.2f}",
-            f"{item.unrepresentable_um:.2f}",
+            _pair(item.before),
+            _pair(item.after),
+            _pair(item.after_rigid_removed),
+            _um(item.unrepresentable_um),
             verdict,
         )
         notes += [Text(f"{item.controller}: {reason}", "red") for reason in item.reasons]
         if item.uncorrected_um:
-            listed = ", ".join(f"{name} {value:.1f} um" for name, value in list(item.uncorrected_um.items())[:8])
+            listed = ", ".join(f"{name} {_um(value)} um" for name, value in list(item.uncorrected_um.items())[:8])
             more = f" and {len(item.uncorrected_um) - 8} more" if len(item.uncorrected_um) > 8 else ""
             notes.append(Text(f"{item.controller} leaves uncorrected: {listed}{more}"))
-    return Group(table, Text("* after the best-fit rigid motion of the workpiece is taken out"), *notes)
+    legend = (
+        "before and after: as it stands, the reference point fixed; after*: the best-fit rigid motion of the workpiece "
+        "taken out; not held: the largest error that no table of this control can express"
+    )
+    return Group(table, Text(legend), *notes)
 
 
 def run_json(result: RunResult) -> dict[str, Any]:
