@@ -169,7 +169,7 @@ def grid_order(
 
 def check_complete(source: SourceFile, count: int, what: str = "records") -> None:
     """Refuse a cut file: one that declares its ``records`` in a comment must hold them and end with a line end."""
-    declared = next((found for line in source.text.split("\n") if (found := _DECLARED.search(line[:200]))), None)
+    declared = next((found for line in source.text.split("\n") if (found := _DECLARED.match(line[:200].strip()))), None)
     if declared is None:
         return
     if int(declared.group(1)) != count:

@@ -1,0 +1,142 @@
+"""Fixtures that several files share: a small machine with settings for every control, and the shipped example."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import compgen
+from compgen.core.names import error_named
+from compgen.model import modelled_errors
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: Ranges, node counts and reference point differ between the axes; the reference lies inside the travel.
+SMALL_MACHINE = """\
+name = "small-gantry"
+chain = "WFYXZT"
+tool_offset_mm = [0.0, 0.0, -80.0]
+reference_point_mm = [-50.0, 100.0, -40.0]
+[axes.X]
+range_mm = [-300.0, 200.0]
+nodes = 6
+[axes.Y]
+range_mm = [-100.0, 300.0]
+nodes = 5
+[axes.Z]
+range_mm = [-240.0, 0.0]
+nodes = 7
+[controllers.siemens-cec]
+sign = "error"
+"""
+
+SMALL_SCENARIO = """\
+name = "small"
+seed = 11
+[errors]
+[instrument]
+type = "laser-tracer"
+noise_um = 0.1
+noise_um_per_m = 0.15
+[[instrument.stations]]
+name = "S1"
+position_mm = [-420.0, -210.0, -420.0]
+dead_length_mm = 151.25
+[[instrument.stations]]
+name = "S2"
+position_mm = [330.0, -190.0, -405.0]
+dead_length_mm = 152.25
+[[instrument.stations]]
+name = "S3"
+position_mm = [310.0, 410.0, -415.0]
+dead_length_mm = 153.25
+[[instrument.stations]]
+name = "S4"
+position_mm = [-400.0, 430.0, -90.0]
+dead_length_mm = 154.25
+[trajectory]
+type = "grid"
+"""
+
+
+def smooth_errors(machine, seed=5, squareness_rad=(45e-6, -30e-6, 25e-6)):
+    """The machine's modelled errors as a fit leaves them: straightness zero at the ends, the rest at the reference."""
+    generator = np.random.default_rng(seed)
+    curves, constants = {}, {}
+    for name in modelled_errors(machine):
+        error = error_named(name)
+        if error.kind == "squareness":
+            constants[name] = (squareness_rad[len(constants)], 1e-6)
+            continue
+        nodes = machine.axes[error.axis].nodes_mm
+        share = (nodes - nodes[0]) / (nodes[-1] - nodes[0])
+        value = sum(generator.normal() * np.sin((k + 1) * (share * 3 + generator.uniform(0, 3))) for k in range(2))
+        if error.is_straightness:
+            value = value - value[0] - share * (value[-1] - value[0])
+        else:
+            value = value - np.interp(machine.reference_point_mm[error.axis], nodes, value)
+        value = value * (12e-3 if error.kind == "linear" else 25e-6) / np.max(np.abs(value))
+        curves[name] = compgen.Curve(nodes, value, np.full(len(nodes), 1e-4 if error.kind == "linear" else 1e-7))
+    return compgen.ErrorTable(curves, constants, {"machine": machine.name})
+
+
+@pytest.fixture(scope="session")
+def small_machine_file(tmp_path_factory):
+    """Path of the small machine's TOML file."""
+    path = tmp_path_factory.mktemp("machine") / "small-gantry.toml"
+    path.write_text(SMALL_MACHINE)
+    return path
+
+
+@pytest.fixture(scope="session")
+def small_machine(small_machine_file):
+    return compgen.load_machine(small_machine_file)
+
+
+@pytest.fixture(scope="session")
+def small_errors(small_machine):
+    return smooth_errors(small_machine)
+
+
+@pytest.fixture(scope="session")
+def make_errors():
+    """The function that draws smooth errors for a machine."""
+    return smooth_errors
+
+
+@pytest.fixture(scope="session")
+def small_lengths_file(small_machine, tmp_path_factory):
+    """Simulated readings of four tracers on the small machine."""
+    folder = tmp_path_factory.mktemp("lengths")
+    scenario = folder / "scenario.toml"
+    scenario.write_text(SMALL_SCENARIO)
+    compgen.write_simulation(compgen.simulate(small_machine, compgen.read_scenario(scenario)), folder)
+    return folder / "small.lengths.csv"
+
+
+@pytest.fixture(scope="session")
+def example():
+    """The shipped example, identified and fitted once: machine, truth, identified, fitted."""
+    machine = compgen.load_machine(ROOT / "machines" / "zha-gantry.toml")
+    lengths = compgen.read_lengths(ROOT / "examples" / "zha-gantry.lengths.csv")
+    identified = compgen.identify(machine, lengths)
+    return SimpleNamespace(
+        machine=machine,
+        truth=compgen.read_errors(ROOT / "examples" / "zha-gantry.truth.errors.csv"),
+        identified=identified,
+        fitted=compgen.fit(machine, identified.errors),
+    )
+
+
+@pytest.fixture
+def listing():
+    """A function that returns every path below a folder with its contents, hidden ones too."""
+
+    def contents(folder):
+        return {
+            str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+            for path in sorted(Path(folder).rglob("*"))
+        }
+
+    return contents
