@@ -621,6 +621,27 @@ def test_with_bounds_the_fit_is_the_readable_reference(n, mu):
     assert cost(found.curve) <= cost(expected) * (1 + 1e-7)
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_bounds_far_inside_wild_data_where_nearly_all_are_active_still_give_the_optimum(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(5, 40))
+    position = np.sort(rng.choice(np.arange(-800.0, 1.0), n, replace=False))
+    held = (interpolation_row(position, rng.uniform(position[0], position[-1])),)
+    smoother = Smoother.build(position, rng.uniform(0.5, 2, n), held)
+    y = rng.normal(size=n) * 50
+    limits = (10 ** rng.uniform(0, 1.5), 10 ** rng.uniform(-2.5, -0.5))
+    mu = float(rng.choice([0.0, 1e-3, 1.0, smoother.largest_mu]))
+    found = fit_bounded(smoother, mu, y, constraint_rows(position, smoother, *limits))
+    expected = reference_curve(position, y, smoother.weight, held, mu, limits)
+
+    def cost(c):
+        return np.sum(smoother.weight * (c - y) ** 2) + mu * np.sum(smoother.bend(c[:, None]) ** 2)
+
+    assert cost(found.curve) == pytest.approx(cost(expected), rel=1e-6)
+    assert np.abs(found.curve).max() <= limits[0] * (1 + 1e-8)
+    assert (np.abs(np.diff(found.curve)) / np.diff(position)).max() <= limits[1] * (1 + 1e-8)
+
+
 def test_bounds_of_kind_and_name_are_kept_and_reported_in_file_units():
     machine = machine_of()
     position = np.linspace(-800, 0, 11)

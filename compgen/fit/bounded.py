@@ -6,7 +6,8 @@ with the rows of G the node values over their bound and the slopes over theirs. 
 so the program always has a solution. It is written for cvxpy as a quadratic form of the banded A (a sum of squares
 would add a variable per second difference and slow the solver down a hundredfold). The solver's result serves to find
 the active bounds; with these as equations the system is solved directly, and the Karush-Kuhn-Tucker conditions
-(every bound kept, every multiplier of the right sign) prove that it is the optimum.
+(every bound kept, every multiplier of the right sign) prove that it is the optimum. Where the active bounds depend on
+one another, so that their multipliers are not unique, the solver's own curve is taken if its duality gap is closed.
 """
 
 from __future__ import annotations
@@ -26,9 +27,12 @@ from compgen.fit.smooth import Smoother
 #: Bounds are kept to this fraction of them.
 KEPT = 1e-9
 _SIGN = 1e-9
+#: Largest duality gap, as a fraction of what the bounds cost, of a solution whose active rows depend on one another.
+_GAP = 1e-8
 _SOLVERS: tuple[tuple[str, dict[str, float]], ...] = (
     ("OSQP", {"eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000}),
     ("CLARABEL", {}),
+    ("CLARABEL", {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}),
 )
 
 
@@ -42,6 +46,15 @@ class Bounded:
     curve: FloatArray
     active: FloatArray
     solver: str
+
+
+@dataclass(frozen=True)
+class _Start:
+    """A general solver's curve (n,), made to keep its bounds, its multipliers (rows,) and the active rows (-1, 0, 1)."""
+
+    curve: FloatArray
+    multiplier: FloatArray
+    active: FloatArray
 
 
 def constraint_rows(position_mm: FloatArray, smoother: Smoother, largest: float, steepest: float) -> sp.csr_array:
@@ -73,9 +86,12 @@ def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: sp.csr_array
     free = smoother.solve(mu, y[:, None])[:, 0]
     for solver, settings in _SOLVERS:
         start = _start(smoother, mu, y, rows, solver, settings)
-        found = _active_set(smoother, mu, free, rows, start) if start is not None else None
-        if found is not None:
-            return Bounded(*found, f"cvxpy+{solver}")
+        if start is not None:
+            found = _active_set(smoother, mu, free, rows, start.active)
+            if found is None and _gap(smoother, mu, free, rows, start) <= _GAP:
+                found = start.curve, start.active
+            if found is not None:
+                return Bounded(*found, f"cvxpy+{solver}")
     raise ConvergenceError(
         "the bounded fit found no optimum that passes its check; loosen the bounds or the smoothness"
     )
@@ -92,8 +108,8 @@ def _quadratic(smoother: Smoother, mu: float) -> sp.csc_array:
 
 def _start(
     smoother: Smoother, mu: float, y: FloatArray, rows: sp.csr_array, solver: str, settings: dict[str, float]
-) -> FloatArray | None:
-    """Active rows (-1, 0, 1) as a general solver sees them; None if it fails."""
+) -> _Start | None:
+    """Ask a general solver; None if it fails."""
     cp: Any = import_module("cvxpy")  # takes more than a second: only when a bound is active
 
     quadratic = _quadratic(smoother, mu)
@@ -115,10 +131,26 @@ def _start(
     if problem.status not in ("optimal", "optimal_inaccurate"):
         return None
     upper, lower = (np.asarray(limit.dual_value) for limit in limits)
-    strongest = max(upper.max(), lower.max())
-    active = np.zeros(rows.shape[0])
-    active[used] = (upper > 1e-6 * strongest).astype(float) - (lower > 1e-6 * strongest)
-    return active
+    multiplier = np.zeros(rows.shape[0])
+    multiplier[used] = np.maximum(upper, 0.0) - np.maximum(lower, 0.0)
+    curve = smoother.expand((scale * x.value)[:, None])[:, 0]
+    curve = curve / max(1.0, float(np.abs(rows @ curve).max()))  # the bounds allow every smaller multiple of a curve
+    active = np.where(np.abs(multiplier) > 1e-6 * np.abs(multiplier).max(), np.sign(multiplier), 0.0)
+    return _Start(curve, multiplier, active)
+
+
+def _gap(smoother: Smoother, mu: float, free: FloatArray, rows: sp.csr_array, start: _Start) -> float:
+    """Duality gap over the cost of the bounds: how far, at most, the start is from the optimum.
+
+    With e = x - free, cost e^T A e / 2 and the dual value for multipliers v (both against the free optimum), half the
+    squared distance to the optimum in the norm of A is at most their difference (A is the program's only curvature).
+    """
+    e = start.curve - free
+    cost = 0.5 * float(e @ smoother.apply(mu, e[:, None])[:, 0])
+    pull = np.asarray(rows.T @ start.multiplier)
+    reach = smoother.inverse(mu, pull[:, None])[:, 0]
+    value = float(pull @ free - np.abs(start.multiplier).sum() - 0.5 * pull @ reach)
+    return (cost - value) / cost
 
 
 def _active_set(
@@ -129,16 +161,12 @@ def _active_set(
     One row enters (the one most outside its bound) or leaves (the one with the most wrong multiplier) at a time.
     """
     active = active.copy()
-    scale = float(np.abs(smoother.free_weight).max() * np.abs(free).max())
-    for _ in range(10 + 2 * len(free)):
+    for _ in range(20 + 4 * len(free)):
         picked = np.flatnonzero(active)
-        signed = rows[picked].toarray() * active[picked, None]
-        reach = smoother.inverse(mu, signed.T) if len(picked) else np.zeros((len(free), 0))
-        multiplier = np.linalg.lstsq(signed @ reach, signed @ free - 1.0, rcond=1e-13)[0]
-        if len(picked) and multiplier.min() < -_SIGN * max(scale, np.abs(multiplier).max()):
+        curve, multiplier = _equalities(smoother, mu, free, rows[picked].toarray() * active[picked, None])
+        if len(picked) and multiplier.min() < -_SIGN * np.abs(multiplier).max():
             active[picked[np.argmin(multiplier)]] = 0.0
             continue
-        curve = free - reach @ multiplier
         values = np.asarray(rows @ curve)
         if np.abs(values).max() <= 1.0 + KEPT:
             return curve, active
@@ -147,3 +175,22 @@ def _active_set(
             return None
         active[worst] = np.sign(values[worst])
     return None
+
+
+def _equalities(smoother: Smoother, mu: float, free: FloatArray, signed: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Curve (n,) with the ``signed`` rows (k, n) at 1, and their multipliers (k,) times the root of their reach.
+
+    Solved by the Schur complement of A, each row scaled to 1 on its diagonal, and refined against what is left.
+    """
+    if not len(signed):
+        return free, np.zeros(0)
+    reach = smoother.inverse(mu, signed.T)
+    schur = signed @ reach
+    scale = 1 / np.sqrt(np.maximum(np.diag(schur), np.finfo(float).tiny))
+    scaled, spread = schur * scale * scale[:, None], reach * scale
+    curve, multiplier = free, np.zeros(len(signed))
+    for _ in range(3):
+        more = np.linalg.lstsq(scaled, scale * (signed @ curve - 1.0), rcond=1e-13)[0]
+        curve = smoother.expand((curve - spread @ more)[:, None])[:, 0]
+        multiplier = multiplier + more
+    return curve, multiplier
