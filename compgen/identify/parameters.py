@@ -87,13 +87,17 @@ def error_parameters(machine: Machine, names: Sequence[str], *, several_tools: b
     single_tool = observable_errors(machine)
     bare = next(axis for axis in range(3) if not [lever for lever in machine.chain.lever_axes(axis) if lever != axis])
     curves: list[CurveParameters] = []
+    known: dict[tuple[int, bool, bool], FloatArray] = {}
     size = 0
     for name in names:
         if name in SQUARENESS_NAMES:
             continue
         error = error_named(name)
         released = several_tools and error.kind == "angular" and error.axis == bare and name not in single_tool
-        free = _free_coefficients(machine, error, released=released)
+        key = (error.axis, error.is_straightness, released)
+        if key not in known:
+            known[key] = _free_coefficients(machine, error, released=released)
+        free = known[key]
         curves.append(
             CurveParameters(error, machine.axes[error.axis].nodes_mm, free, slice(size, size + free.shape[1]))
         )

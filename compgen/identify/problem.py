@@ -10,35 +10,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.identify.parameters import ErrorParameters
+from compgen.identify.state import IntArray, State
 from compgen.model.exact import exact_columns, tip_position
 from compgen.model.volumetric import tool_of
 
-IntArray = NDArray[np.int64]
 CHUNK_POSES = 2048
-
-
-@dataclass(frozen=True)
-class State:
-    """Current values of the unknowns: errors (size,), stations (S, 3), dead lengths (groups,); mm and rad."""
-
-    errors: FloatArray
-    stations_mm: FloatArray
-    dead_length_mm: FloatArray
-
-    def moved(self, step: FloatArray) -> State:
-        """Return the state after a step (unknowns in the order errors, stations, dead lengths)."""
-        first, second = len(self.errors), len(self.errors) + self.stations_mm.size
-        return State(
-            self.errors + step[:first],
-            self.stations_mm + step[first:second].reshape(-1, 3),
-            self.dead_length_mm + step[second:],
-        )
 
 
 @dataclass(frozen=True)
@@ -90,10 +71,14 @@ class LengthProblem:
         distance = np.linalg.norm(tip[self.pose] - state.stations_mm[self.station], axis=1)
         return np.asarray(distance - state.dead_length_mm[self.group] - self.length_mm)
 
-    def cost(self, state: State) -> float:
-        """Half the weighted sum of squares."""
+    def evaluate(self, state: State) -> tuple[float, FloatArray]:
+        """Half the weighted sum of squares, and its gradient (size,)."""
         residuals = self.residuals(state)
-        return 0.5 * float(np.dot(self.weight, residuals**2))
+        return 0.5 * float(np.dot(self.weight, residuals**2)), self.normal_equations(state)[1]
+
+    def normal_matrix(self, state: State) -> FloatArray:
+        """J^T W J (size, size) with the exact derivative at ``state``."""
+        return self.normal_equations(state)[0]
 
     def normal_equations(self, state: State) -> tuple[FloatArray, FloatArray]:
         """Normal matrix J^T W J (size, size) and gradient J^T W r (size,) with the derivative at ``state``."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
-from compgen.identify.problem import LengthProblem
+from compgen.identify.state import IntArray, Problem
 
 #: Eigenvalues of the normal matrix with unit diagonal below this count as zero. A determined problem stays above
 #: about 1e-7, an undetermined direction falls to 1e-14: there is a wide gap.
@@ -30,8 +30,13 @@ class Rank:
     combinations: tuple[str, ...]
 
 
-def analyse_rank(problem: LengthProblem, matrix: FloatArray, stations: tuple[str, ...]) -> Rank:
-    """Analyse the normal matrix (size, size) of a problem; ``stations`` are the names for the messages."""
+def analyse_rank(
+    problem: Problem, matrix: FloatArray, stations: tuple[str, ...], station: IntArray, group: IntArray
+) -> Rank:
+    """Analyse the normal matrix (size, size) of a problem.
+
+    ``stations`` are the names, ``station`` and ``group`` (dead length) the indices of each reading, for the messages.
+    """
     diagonal = np.diag(matrix)
     empty = diagonal <= 1e-14 * np.median(diagonal[diagonal > 0])
     scale = 1.0 / np.sqrt(np.where(empty, 1.0, diagonal))
@@ -45,15 +50,12 @@ def analyse_rank(problem: LengthProblem, matrix: FloatArray, stations: tuple[str
         size=len(matrix),
         condition=float(kept[-1] / kept[0]) if len(kept) else np.inf,
         undetermined=undetermined,
-        combinations=_combinations(problem, vectors[:, null], empty, stations),
+        combinations=_combinations(unknown_names(problem, stations, station, group), vectors[:, null], empty),
     )
 
 
-def _combinations(
-    problem: LengthProblem, null_vectors: FloatArray, empty: NDArray[np.bool_], stations: tuple[str, ...]
-) -> tuple[str, ...]:
+def _combinations(names: list[str], null_vectors: FloatArray, empty: NDArray[np.bool_]) -> tuple[str, ...]:
     texts = []
-    names = unknown_names(problem, stations)
     without = [names[k] for k in np.flatnonzero(empty)]
     if without:
         texts.append(f"no data at all for: {_shortened(without)}")
@@ -82,7 +84,7 @@ def _sparse_directions(vectors: FloatArray) -> FloatArray:
     return np.column_stack(found) if found else vectors
 
 
-def unknown_names(problem: LengthProblem, stations: tuple[str, ...]) -> list[str]:
+def unknown_names(problem: Problem, stations: tuple[str, ...], station: IntArray, group: IntArray) -> list[str]:
     """Names of all unknowns, e.g. ``EXX at -80 mm``, ``EC0Y``, ``LT1 x``, ``LT1 dead length``."""
     names: list[str] = []
     for curve in problem.parameters.curves:
@@ -90,9 +92,9 @@ def unknown_names(problem: LengthProblem, stations: tuple[str, ...]) -> list[str
             strongest = int(np.argmax(np.abs(column)))
             names.append(f"{curve.error.name} at {curve.nodes_mm[strongest]:g} mm")
     names += problem.parameters.squareness
-    names += [f"{station} {letter}" for station in stations for letter in "xyz"]
-    owner = {int(group): stations[int(station)] for group, station in zip(problem.group, problem.station, strict=True)}
-    names += [f"{owner[group]} dead length" for group in range(problem.groups)]
+    names += [f"{name} {letter}" for name in stations for letter in "xyz"]
+    owner = dict(zip(group.tolist(), station.tolist(), strict=True))
+    names += [f"{stations[owner[k]]} dead length" for k in sorted(owner)]
     return names
 
 

@@ -1,79 +1,141 @@
-"""Levenberg-Marquardt on the scaled normal equations (Zha & Zhang 2024, eq. 28)."""
+"""Levenberg-Marquardt on the scaled normal equations (Zha & Zhang 2024, eq. 28), with a frozen factor.
+
+The factor of one normal matrix serves as long as it makes good progress: convergence is then linear with a small
+ratio, and every pass costs only residuals and gradient. The exact gradient decides where the optimum is.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dpocon, dpotrf, dpotrs
 
 from compgen.core.csvio import FloatArray
 from compgen.errors import ConvergenceError
-from compgen.identify.problem import LengthProblem, State
+from compgen.identify.state import Problem, State
 
-#: A step below this (mm; angles count at a lever of one metre) ends the iteration. Convergence is linear with a
-#: ratio below 1e-2, so the optimum is then met to about 1e-9 mm.
-STEP_TOLERANCE_MM = 1e-7
-MAX_ITERATIONS = 60
+#: The remaining distance to the optimum, estimated from the last two steps, that ends the iteration (mm; angles count
+#: at a lever of one metre).
+TOLERANCE_MM = 1e-10
+MAX_ITERATIONS = 80
+#: After a step of this size the lines of sight have turned so much that a new factor pays.
+FAR_MM = 0.5
+#: A step that shrinks less than this against the one before asks for a new factor.
+SLOW = 0.2
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Cholesky factor of a normal matrix with unit diagonal, plus damping; ``rcond`` estimates 1/condition."""
+
+    matrix: FloatArray
+    lower: FloatArray
+    scale: FloatArray
+    rcond: float
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return the solution for one right side (size,) or several (size, k)."""
+        scale = self.scale if right.ndim == 1 else self.scale[:, None]
+        solution, _ = dpotrs(self.lower, right * scale, lower=1)
+        return np.asarray(scale * solution)
+
+
+def factorise(matrix: FloatArray, damping: float = 0.0) -> Factor:
+    """Factorise a normal matrix (size, size); LinAlgError if it is not positive definite."""
+    diagonal = np.diag(matrix)
+    if not diagonal.min() > 0.0:
+        raise LinAlgError("an unknown has no data")
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = matrix * (scale[:, None] * scale)
+    if damping:
+        scaled[np.diag_indices(len(scaled))] += damping
+    norm = float(np.abs(scaled).sum(axis=0).max())
+    lower, failed = dpotrf(scaled, lower=1, overwrite_a=1)
+    if failed:
+        raise LinAlgError("not positive definite")
+    rcond, _ = dpocon(lower, norm, uplo="L")
+    return Factor(matrix, lower, scale, float(rcond))
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Optimum of a problem; ``matrix`` is the normal matrix there, ``iterations`` the accepted steps."""
+    """Optimum of a problem; ``factor`` of the last normal matrix, ``iterations`` the passes over the data."""
 
     state: State
     cost: float
-    matrix: FloatArray
+    factor: Factor
     iterations: int
+    factorisations: int
 
 
-def solve(problem: LengthProblem, start: State) -> Solution:
-    """Minimise the weighted sum of squares from ``start``; ConvergenceError if no optimum is reached.
+def solve(problem: Problem, start: State, factor: Factor | None = None) -> Solution:
+    """Minimise the weighted sum of squares from ``start``.
 
-    The diagonal is scaled to 1. A plain Gauss-Newton step is tried first; the damping grows when the Cholesky
-    factorisation fails or the cost rises, and falls after every success.
+    Parameters
+    ----------
+    problem, start : what to minimise and from where.
+    factor : of a normal matrix near ``start``, if there is one already.
+
+    Raises
+    ------
+    ConvergenceError
+        if no step lowers the cost, or no optimum is reached; never a silent wrong answer.
     """
-    state, cost = start, problem.cost(start)
-    damping = 0.0
-    for iteration in range(MAX_ITERATIONS):
-        matrix, gradient = problem.normal_equations(state)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-        scaled = matrix * scale[:, None] * scale
-        for _ in range(40):
-            step = _damped_step(scaled, gradient * scale, damping)
-            if step is not None:
-                candidate = state.moved(scale * step)
-                new_cost = problem.cost(candidate)
-                if np.isfinite(new_cost) and new_cost <= cost * (1 + 1e-12) + 1e-18:
-                    break
-            damping = max(10.0 * damping, 1e-6)
-        else:
-            raise ConvergenceError("the iteration found no step that lowers the residuals; check stations and units")
-        moved = _step_size_mm(problem, scale * step)
-        state, cost = candidate, new_cost
-        damping = damping / 10.0 if damping > 1e-9 else 0.0
-        if moved < STEP_TOLERANCE_MM:
-            return Solution(state, cost, matrix, iteration + 1)
+    state = start
+    cost, gradient = problem.evaluate(state)
+    damping, previous, factorisations = 0.0, np.inf, 0
+    fresh = False
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        if factor is None:
+            factor, damping = _positive_factor(problem.normal_matrix(state), damping)
+            factorisations += 1
+            fresh = True
+        step = -factor.solve(gradient)
+        size = step_size_mm(problem, step)
+        candidate = state.moved(step)
+        new_cost, new_gradient = problem.evaluate(candidate)
+        if not new_cost <= cost * (1 + 1e-9) + 1e-18:
+            if fresh:
+                damping = max(10.0 * damping, 1e-6)
+                if damping > 1e6:
+                    raise ConvergenceError(
+                        "the iteration found no step that lowers the residuals; check stations and units"
+                    )
+            factor = None
+            continue
+        state, cost, gradient = candidate, new_cost, new_gradient
+        ratio = size / previous if np.isfinite(previous) else 1.0
+        if not damping and size * min(ratio, 1.0) < TOLERANCE_MM:
+            return Solution(state, cost, factor, iteration, factorisations)
+        if damping:
+            damping = damping / 10.0 if damping > 1e-8 else 0.0
+            factor = None
+        elif size > FAR_MM or (ratio > SLOW and np.isfinite(previous)):
+            factor = None
+        previous, fresh = size, False
     raise ConvergenceError(
-        f"no optimum after {MAX_ITERATIONS} iterations (last step {moved * 1000:.3g} um); "
+        f"no optimum after {MAX_ITERATIONS} passes (last step {size * 1000:.3g} um); "
         "the data may not determine all unknowns"
     )
 
 
-def _damped_step(scaled: FloatArray, gradient: FloatArray, damping: float) -> FloatArray | None:
-    try:
-        factor = cho_factor(scaled + damping * np.eye(len(scaled)), lower=True)
-    except LinAlgError:
-        return None
-    return -np.asarray(cho_solve(factor, gradient))
+def _positive_factor(matrix: FloatArray, damping: float) -> tuple[Factor, float]:
+    while damping < 1e6:
+        try:
+            return factorise(matrix, damping), damping
+        except LinAlgError:
+            damping = max(10.0 * damping, 1e-6)
+    raise ConvergenceError("the normal matrix is not positive definite; the data do not determine the unknowns")
 
 
-def _step_size_mm(problem: LengthProblem, step: FloatArray) -> float:
+def step_size_mm(problem: Problem, step: FloatArray) -> float:
     """Largest change of any unknown, angles at a lever of 1000 mm."""
     size = np.abs(step)
-    for curve in problem.parameters.curves:
+    parameters = problem.parameters
+    for curve in parameters.curves:
         if curve.error.kind == "angular":
             size[curve.columns] *= 1000.0
-    first = problem.parameters.size - len(problem.parameters.squareness)
-    size[first : problem.parameters.size] *= 1000.0
+    size[parameters.size - len(parameters.squareness) : parameters.size] *= 1000.0
     return float(size.max())

@@ -29,13 +29,45 @@ def station_start(points_mm: FloatArray, length_mm: FloatArray, group: NDArray[n
     p = (points_mm - centre) / scale
     reading = length_mm / scale
     member = group[:, None] == np.arange(groups)
-    columns = np.column_stack([2 * p, 2 * reading[:, None] * member, -1.0 * member])
     target = np.einsum("ij,ij->i", p, p) - reading**2
-    solution, _, rank, _ = np.linalg.lstsq(columns, target, rcond=1e-9)
+    offset = reading.mean()
+    columns = np.column_stack([2 * p, 2 * (reading - offset)[:, None] * member, member, target])
+    normal = columns.T @ columns
+    size = 3 + 2 * groups
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(normal)[:size], 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(normal[:size, :size] * unit * unit[:, None])
+    kept = eigenvalues > 1e-11 * eigenvalues[-1]
+    right = vectors[:, kept].T @ (normal[:size, size] * unit)
+    solution = unit * (vectors[:, kept] @ (right / eigenvalues[kept]))
     position, dead = solution[:3], solution[3 : 3 + groups]
-    if rank < columns.shape[1] or _misfit(p, reading, member, position, dead) > 1e-2:
+    if not kept.all() or _misfit(p, reading, member, position, dead) > 1e-2:
         position, dead = _search(p, reading, member)
     return StationStart(position * scale + centre, dead * scale)
+
+
+def station_start_from_moments(
+    moments: FloatArray, offset: FloatArray, centre_mm: FloatArray, scale_mm: float
+) -> StationStart | None:
+    """Locate one station from the moments of its set-ups (g, 6, 6) as ``grid_problem.start_moments`` has them.
+
+    None where they do not determine it.
+    """
+    groups = len(moments)
+    size = 3 + 2 * groups
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    for k, part in enumerate(moments):
+        index = [0, 1, 2, 3 + k, 3 + groups + k]
+        normal[np.ix_(index, index)] += part[:5, :5]
+        right[index] += part[:5, 5]
+    diagonal = np.diag(normal)
+    if not diagonal.min() > 0:
+        return None
+    unit = 1.0 / np.sqrt(diagonal)
+    eigenvalues, vectors = np.linalg.eigh(normal * unit * unit[:, None])
+    if eigenvalues[0] < 1e-10 * eigenvalues[-1]:
+        return None
+    solution = unit * (vectors @ ((vectors.T @ (right * unit)) / eigenvalues))
+    return StationStart(solution[:3] * scale_mm + centre_mm, (solution[3 : 3 + groups] - offset) * scale_mm)
 
 
 def _residual(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_], x: FloatArray) -> FloatArray:

@@ -11,6 +11,8 @@ carriage. A workpiece-side carriage stands at -q with small motion (-delta, -eps
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from compgen.core.csvio import FloatArray
@@ -141,3 +143,65 @@ def _add_squareness(machine: Machine, columns: FloatArray, turn: FloatArray, tra
         derivative = _rotation_derivative(turn, travel)
         columns[:, :, ERROR_INDEX["EA0Z"]] += derivative[:, :, 0]
         columns[:, :, ERROR_INDEX["EB0Z"]] += derivative[:, :, 1]
+
+
+def rotation_matrices(eps_rad: FloatArray) -> FloatArray:
+    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3) in rad."""
+    return level_rotations(eps_rad)[0]
+
+
+def level_rotations(eps_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation matrices and left Jacobians J_l of SO(3), each (n, 3, 3), of rotation vectors (n, 3) in rad.
+
+    R(eps + d) = R(J_l d) R(eps) to first order in d.
+    """
+    square = np.einsum("ij,ij->i", eps_rad, eps_rad)
+    first, second = _sine_ratios(np.sqrt(square))
+    cross = cross_matrices(eps_rad)
+    twice = cross @ cross
+    identity = np.eye(3)
+    rotation = identity + first[:, None, None] * cross + second[:, None, None] * twice
+    jacobian = identity + second[:, None, None] * cross + (1 / 6 - square / 120)[:, None, None] * twice
+    return rotation, jacobian
+
+
+def cross_matrices(vectors: FloatArray) -> FloatArray:
+    """Matrices (n, 3, 3) of the cross product with vectors (n, 3) from the left."""
+    matrices = np.zeros((len(vectors), 3, 3))
+    matrices[:, 2, 1], matrices[:, 0, 2], matrices[:, 1, 0] = vectors.T
+    matrices[:, 1, 2], matrices[:, 2, 0], matrices[:, 0, 1] = -vectors.T
+    return matrices
+
+
+def travel_directions(machine: Machine, squareness_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Directions of travel of X, Y, Z for EC0Y, EB0Z, EA0Z (3,) in rad, and their derivatives by the three.
+
+    The directions are the unit vectors turned by the squareness, written out: a turn about Z of X or Y, and the turn
+    (EA0Z, EB0Z, 0) of Z.
+
+    Returns
+    -------
+    directions : shape (3, 3), one row per axis.
+    derivatives : shape (3, 3, 3), [axis, component, squareness].
+    """
+    c0y, b0z, a0z = (float(value) for value in squareness_rad)
+    directions, derivatives = np.eye(3), np.zeros((3, 3, 3))
+    sine, cosine = math.sin(c0y), math.cos(c0y)
+    if machine.squareness_reference == "Y":
+        directions[0] = (cosine, -sine, 0.0)
+        derivatives[0, :, 0] = (-sine, -cosine, 0.0)
+    else:
+        directions[1] = (-sine, cosine, 0.0)
+        derivatives[1, :, 0] = (-cosine, -sine, 0.0)
+    angle = math.hypot(a0z, b0z)
+    ratio = math.sin(angle) / angle if angle > 1e-9 else 1.0
+    slope = -1.0 / 3.0 if angle < 1e-3 else (math.cos(angle) - ratio) / angle**2  # (d ratio/d angle)/angle
+    directions[2] = (b0z * ratio, -a0z * ratio, math.cos(angle))
+    derivatives[2, :, 1] = (ratio + b0z * b0z * slope, -a0z * b0z * slope, -b0z * ratio)
+    derivatives[2, :, 2] = (b0z * a0z * slope, -ratio - a0z * a0z * slope, -a0z * ratio)
+    return directions, derivatives
+
+
+def passing_order(machine: Machine) -> list[tuple[int, bool]]:
+    """Axes in the order in which a point passes them from tool to workpiece, with True for the tool side."""
+    return _bodies(machine)

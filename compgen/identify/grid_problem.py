@@ -1,0 +1,615 @@
+"""The same least-squares problem on a grid of levels: the fast path (``docs/method.md``, "Fast solver").
+
+Every distinct axis position is a level. Readings of one station at one pose are merged into their weighted mean, so
+the data become arrays over (station, x, y, z) in which a missing reading has weight zero.
+
+* One pass (``evaluate``) gives cost and gradient of the EXACT model. The chain is passed body by body; each adds one
+  axis, so that only the outermost works on the full grid. The gradient runs back along the same chain.
+* ``normal_matrix`` needs only small moment tables of w u u^T over pairs of levels, because every entry of C is a
+  monomial in the axis coordinates. It uses C in place of the exact derivative: the matrix steers the iteration, the
+  optimum is where the exact gradient vanishes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+
+from compgen.core.csvio import FloatArray
+from compgen.core.names import SQUARENESS_NAMES
+from compgen.identify.parameters import ErrorParameters
+from compgen.identify.state import IntArray, State
+from compgen.model.exact import level_rotations, passing_order, travel_directions
+
+#: Index into the six different entries of a symmetric 3 x 3 matrix.
+_SYMMETRIC = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+
+
+@dataclass(frozen=True)
+class Kind:
+    """An unknown displacement of ``output`` at every level of ``axis``, times the coordinate of ``lever`` (or 1)."""
+
+    output: int
+    axis: int
+    lever: int | None
+
+
+@dataclass(frozen=True)
+class Entries:
+    """Sparse matrix from unknowns to the levels of an axis: level, column of the unknown and value of each entry."""
+
+    level: IntArray
+    column: IntArray
+    value: FloatArray
+
+    def scaled(self, factor: FloatArray) -> Entries:
+        """Return the entries with each level's row multiplied by ``factor`` (levels,)."""
+        return Entries(self.level, self.column, self.value * factor[self.level])
+
+    def times(self, factor: float) -> Entries:
+        """Return the entries multiplied by a number."""
+        return Entries(self.level, self.column, self.value * factor)
+
+
+def reduced_entries(parameters: ErrorParameters, bases: Sequence[FloatArray]) -> tuple[Entries, ...]:
+    """Return the entries of basis times free coefficients for every curve."""
+    found = []
+    for curve in parameters.curves:
+        matrix = bases[curve.error.axis] @ curve.free
+        level, column = np.nonzero(matrix)
+        found.append(Entries(level, column + curve.columns.start, matrix[level, column]))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class LevelMap:
+    """How the unknown errors act at the levels: as a list of kinds and a matrix from unknowns to kinds and levels.
+
+    ``kinds`` by axis; ``transposed`` (size, levels of all kinds), sparse, the kinds of one axis after another.
+    """
+
+    kinds: tuple[tuple[Kind, ...], tuple[Kind, ...], tuple[Kind, ...]]
+    transposed: csr_array
+
+
+#: Entries of C smaller than this are left out of the normal matrix; they would only slow it down.
+SMALL = 1e-3
+
+
+def level_map(
+    parameters: ErrorParameters,
+    levels_mm: Sequence[FloatArray],
+    reduced: Sequence[Entries],
+    tool_mm: FloatArray,
+    squareness_rad: FloatArray,
+) -> LevelMap:
+    """Build the map for one tool offset (3,) at given squareness errors (3,); curve errors count as zero.
+
+    ``reduced`` holds the entries of basis times free coefficients of every curve.
+    """
+    chain = parameters.machine.chain
+    directions, derivatives = travel_directions(parameters.machine, squareness_rad)
+    parts: dict[Kind, list[Entries]] = {}
+    for curve, entries in zip(parameters.curves, reduced, strict=True):
+        axis, direction = curve.error.axis, curve.error.direction
+        if curve.error.kind == "linear":
+            parts.setdefault(Kind(direction, axis, None), []).append(entries)
+            continue
+        after, before = (direction + 1) % 3, (direction + 2) % 3
+        levers: list[tuple[int | None, FloatArray]] = [(None, tool_mm)]
+        levers += [(lever, directions[lever]) for lever in chain.lever_axes(axis)]
+        for lever, arm in levers:
+            for output, share in ((after, -float(arm[before])), (before, float(arm[after]))):  # e_direction x arm
+                if abs(share) > SMALL:
+                    kind = Kind(output, axis, None if lever == axis else lever)
+                    scaled = entries.scaled(levels_mm[axis] * share) if lever == axis else entries.times(share)
+                    parts.setdefault(kind, []).append(scaled)
+    first = parameters.size - len(parameters.squareness)
+    for k, name in enumerate(parameters.squareness):
+        for axis, output in np.argwhere(np.abs(derivatives[:, :, SQUARENESS_NAMES.index(name)]) > SMALL).tolist():
+            count = len(levels_mm[axis])
+            values = derivatives[axis, output, SQUARENESS_NAMES.index(name)] * levels_mm[axis]
+            column = Entries(np.arange(count), np.full(count, first + k), values)
+            parts.setdefault(Kind(output, axis, None), []).append(column)
+    return _assemble_map(parts, [len(levels) for levels in levels_mm], parameters.size)
+
+
+def _assemble_map(parts: dict[Kind, list[Entries]], counts: Sequence[int], size: int) -> LevelMap:
+    kinds = tuple(tuple(kind for kind in parts if kind.axis == axis) for axis in range(3))
+    rows, columns, values, start = [], [], [], 0
+    for group in kinds:
+        for kind in group:
+            for entries in parts[kind]:
+                rows.append(entries.level + start)
+                columns.append(entries.column)
+                values.append(entries.value)
+            start += counts[kind.axis]
+    where = (np.concatenate(columns), np.concatenate(rows))
+    return LevelMap(kinds, coo_array((np.concatenate(values), where), shape=(size, start)).tocsr())  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class ToolData:
+    """The merged readings taken with one tool: weight and length, each (groups, n_out, n_mid * n_in)."""
+
+    tool_mm: FloatArray
+    weight: FloatArray
+    length_mm: FloatArray
+
+
+@dataclass(frozen=True)
+class GridProblem:
+    """Readings on a full grid of levels; see the module's head.
+
+    Parameters
+    ----------
+    parameters : the unknown errors.
+    order : axes from the outermost body of the chain (the last to be passed) to the innermost.
+    levels_mm, bases, reduced : levels of X, Y, Z, the curve bases there, and these times the free coefficients.
+    tools : the data by tool.
+    station_of : station of each group (dead length).
+    cell : for each reading (tool, index into the flattened (groups, n_out, n_mid * n_in)).
+    reading_mm, reading_weight : the readings before merging.
+    scatter : weighted square sum of the readings about their means, half of it is part of the cost.
+    """
+
+    parameters: ErrorParameters
+    order: tuple[int, int, int]
+    levels_mm: tuple[FloatArray, FloatArray, FloatArray]
+    bases: tuple[FloatArray, FloatArray, FloatArray]
+    reduced: tuple[Entries, ...]
+    tools: tuple[ToolData, ...]
+    station_of: IntArray
+    cell: tuple[IntArray, IntArray]
+    reading_mm: FloatArray
+    reading_weight: FloatArray
+    scatter: float
+
+    @property
+    def stations(self) -> int:
+        """Number of stations."""
+        return int(self.station_of.max()) + 1
+
+    @property
+    def groups(self) -> int:
+        """Number of dead lengths."""
+        return len(self.station_of)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.parameters.size + 3 * self.stations + self.groups
+
+    def weighted(self, weight: FloatArray) -> GridProblem:
+        """Return the same problem with other weights of the readings."""
+        shape = self.tools[0].weight.shape
+        tools, scatter = _merge(self.tools, shape, self.cell, self.reading_mm, weight)
+        return replace(self, tools=tools, reading_weight=weight, scatter=scatter)
+
+    def evaluate(self, state: State) -> tuple[float, FloatArray]:
+        """Half the weighted sum of squares with the exact model, and its exact gradient (size,)."""
+        cost = 0.5 * self.scatter
+        gradient = np.zeros(self.size)
+        bodies = _bodies(self, state)
+        for data in self.tools:
+            tips = _tips(bodies, data.tool_mm)
+            cost += self._backward(state, data, bodies, tips, gradient)
+        return cost, gradient
+
+    def _backward(
+        self, state: State, data: ToolData, bodies: Sequence[_Body], tips: Sequence[FloatArray], gradient: FloatArray
+    ) -> float:
+        first, second = self.parameters.size, self.parameters.size + 3 * self.stations
+        cost, force = 0.0, np.zeros_like(tips[-1])
+        for group, station in enumerate(self.station_of.tolist()):
+            sight = tips[-1] - state.stations_mm[station][:, None]
+            distance = _lengths(sight)
+            residual = distance - data.length_mm[group]
+            residual -= state.dead_length_mm[group]
+            pull = data.weight[group] * residual
+            cost += 0.5 * float(np.vdot(pull, residual))
+            gradient[second + group] -= pull.sum()
+            pull /= distance
+            sight *= pull[:, None, :]
+            gradient[first + 3 * station : first + 3 * station + 3] -= sight.sum(axis=2).sum(axis=0)
+            force += sight
+        _pull_back(self.parameters, bodies, tips, force, gradient)
+        return cost
+
+    def predicted(self, state: State) -> list[FloatArray]:
+        """Model readings by tool, each (groups, n_out, n_mid * n_in), mm."""
+        bodies = _bodies(self, state)
+        found = []
+        for data in self.tools:
+            tip = _tips(bodies, data.tool_mm)[-1]
+            sight = tip[None] - state.stations_mm[self.station_of][:, None, :, None]
+            distance = np.sqrt(np.einsum("glkm,glkm->glm", sight, sight))
+            found.append(distance - state.dead_length_mm[:, None, None])
+        return found
+
+    def residuals(self, state: State) -> FloatArray:
+        """Model minus reading of every reading, shape (n,), mm."""
+        tool, cell = self.cell
+        predicted = np.stack([part.ravel() for part in self.predicted(state)])
+        return np.asarray(predicted[tool, cell] - self.reading_mm)
+
+    def normal_matrix(self, state: State) -> FloatArray:
+        """J^T W J (size, size) with C in place of the exact derivative."""
+        matrix = np.zeros((self.size, self.size))
+        bodies = _bodies(self, state)
+        for data in self.tools:
+            _add_normal(self, data, _tips(bodies, data.tool_mm)[-1], state, matrix)
+        lower = np.tril_indices(self.size, -1)
+        matrix[lower] = matrix.T[lower]
+        return matrix
+
+
+@dataclass(frozen=True)
+class _Body:
+    """One carriage at its levels: rotation R (n, 3, 3), J_l (n, 3, 3), travel plus delta (n, 3)."""
+
+    axis: int
+    tool_side: bool
+    rotation: FloatArray
+    jacobian: FloatArray
+    shift: FloatArray
+    position_mm: FloatArray
+    direction_derivative: FloatArray
+    basis: FloatArray
+
+
+def _squareness(parameters: ErrorParameters, state: State) -> FloatArray:
+    """EC0Y, EB0Z, EA0Z in rad, those that are not unknown being zero."""
+    values = np.zeros(3)
+    for k, name in enumerate(parameters.squareness):
+        values[SQUARENESS_NAMES.index(name)] = state.errors[parameters.size - len(parameters.squareness) + k]
+    return values
+
+
+def _bodies(problem: GridProblem, state: State) -> list[_Body]:
+    """Bodies in the order in which the tool point passes them (innermost first)."""
+    parameters = problem.parameters
+    directions, derivatives = travel_directions(parameters.machine, _squareness(parameters, state))
+    motion = [np.zeros((len(levels), 6)) for levels in problem.levels_mm]
+    for curve in parameters.curves:
+        column = curve.error.direction + (3 if curve.error.kind == "angular" else 0)
+        motion[curve.error.axis][:, column] = problem.bases[curve.error.axis] @ (
+            curve.free @ state.errors[curve.columns]
+        )
+    bodies = []
+    for axis, tool_side in passing_order(parameters.machine):
+        levels = problem.levels_mm[axis]
+        delta, eps = motion[axis][:, :3], motion[axis][:, 3:]
+        rotation, jacobian = level_rotations(eps)
+        bodies.append(
+            _Body(
+                axis,
+                tool_side,
+                rotation,
+                jacobian,
+                levels[:, None] * directions[axis] + delta,
+                levels,
+                derivatives[axis],
+                problem.bases[axis],
+            )
+        )
+    return bodies
+
+
+def _tips(bodies: Sequence[_Body], tool_mm: FloatArray) -> list[FloatArray]:
+    """Points before the first body (1, 3, 1) and after each body (n_axis, 3, product of the earlier levels)."""
+    points = [tool_mm.reshape(1, 3, 1)]
+    for body in bodies:
+        before = _flat(points[-1])
+        shift = body.shift if body.tool_side else np.einsum("lij,lj->li", body.rotation, body.shift)
+        points.append(shift[:, :, None] + body.rotation @ before)
+    return points
+
+
+def _lengths(vectors: FloatArray) -> FloatArray:
+    """Lengths of vectors (n, 3, m): shape (n, m)."""
+    squares = vectors * vectors
+    total = squares[:, 0] + squares[:, 1]
+    total += squares[:, 2]
+    return np.sqrt(total, out=total)
+
+
+def _flat(points: FloatArray) -> FloatArray:
+    """(n, 3, m) -> (3, n * m)."""
+    return np.ascontiguousarray(points.transpose(1, 0, 2)).reshape(3, -1)
+
+
+def _pull_back(
+    parameters: ErrorParameters,
+    bodies: Sequence[_Body],
+    tips: Sequence[FloatArray],
+    force: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Add the gradient by the errors for forces on the tips (n_out, 3, m): back along the chain, body by body."""
+    first = parameters.size - len(parameters.squareness)
+    slots = {
+        (curve.error.axis, curve.error.direction + 3 * (curve.error.kind == "angular")): curve
+        for curve in parameters.curves
+    }
+    for body, before in zip(reversed(bodies), reversed(tips[:-1]), strict=True):
+        flat = _flat(before)
+        turned = body.rotation.transpose(0, 2, 1) @ force
+        arm = turned @ flat.T  # [level, force component, arm component]
+        moment = arm[:, (2, 0, 1), (1, 2, 0)] - arm[:, (1, 2, 0), (2, 0, 1)]
+        total = turned.sum(axis=2)
+        if body.tool_side:
+            by_delta = force.sum(axis=2)
+        else:
+            by_delta = total
+            moment += np.cross(body.shift, total)
+        by_eps = (body.jacobian.transpose(0, 2, 1) @ (body.rotation @ moment[:, :, None]))[:, :, 0]
+        nodal = body.basis.T @ np.hstack([by_delta, by_eps])
+        for column in range(6):
+            curve = slots.get((body.axis, column))
+            if curve is not None:
+                gradient[curve.columns] += nodal[:, column] @ curve.free
+        by_direction = body.position_mm @ by_delta
+        for k, name in enumerate(parameters.squareness):
+            derivative = body.direction_derivative[:, SQUARENESS_NAMES.index(name)]
+            gradient[first + k] += float(by_direction @ derivative)
+        force = turned.sum(axis=0).reshape(3, before.shape[0], before.shape[2]).transpose(1, 0, 2)
+
+
+def _add_normal(problem: GridProblem, data: ToolData, tip: FloatArray, state: State, matrix: FloatArray) -> None:
+    """Add the part of one tool to the upper triangle of the normal matrix."""
+    shape = tuple(len(problem.levels_mm[axis]) for axis in problem.order)
+    level = level_map(
+        problem.parameters, problem.levels_mm, problem.reduced, data.tool_mm, _squareness(problem.parameters, state)
+    )
+    levels = level.transposed
+    first, second = problem.parameters.size, problem.parameters.size + 3 * problem.stations
+    weighted = np.zeros((6, *shape))
+    for group, station in enumerate(problem.station_of.tolist()):
+        sight = tip - state.stations_mm[station][:, None]
+        unit = sight / _lengths(sight)[:, None, :]
+        moments = _outer_products(unit, data.weight[group], shape)  # 6 of w u u^T, 3 of w u, 1 of w
+        weighted += moments[:6]
+        station_part, dead_part = _station_moments(problem, level, moments)
+        columns = slice(first + 3 * station, first + 3 * station + 3)
+        matrix[:first, columns] -= levels @ station_part
+        matrix[:first, second + group] -= levels @ dead_part
+        sums = moments.sum(axis=(1, 2, 3))
+        matrix[columns, columns] += sums[_SYMMETRIC]
+        matrix[columns, second + group] += sums[6:9]
+        matrix[second + group, second + group] += sums[9]
+    matrix[:first, :first] += levels @ (levels @ _level_matrix(problem, level, weighted)).T
+
+
+def _outer_products(unit: FloatArray, weight: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """W u u^T (xx, yy, zz, xy, xz, yz), w u (x, y, z) and w on the grid, shape (10, n_out, n_mid, n_in)."""
+    x, y, z = unit[:, 0], unit[:, 1], unit[:, 2]
+    moments = np.empty((10, *weight.shape))
+    moments[9] = weight
+    for k, component in enumerate((x, y, z)):
+        np.multiply(weight, component, out=moments[6 + k])
+        np.multiply(moments[6 + k], component, out=moments[k])
+    np.multiply(moments[6], y, out=moments[3])
+    np.multiply(moments[6], z, out=moments[4])
+    np.multiply(moments[7], z, out=moments[5])
+    return moments.reshape(10, *shape)
+
+
+def _powers(levels_mm: FloatArray, count: int) -> FloatArray:
+    return np.vander(levels_mm, count, increasing=True)
+
+
+def _station_moments(problem: GridProblem, level: LevelMap, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Per kind and level: sum of w q u_o u^T (levels, 3) and of w q u_o (levels,), q the kind's lever."""
+    out, mid, inner = (_powers(problem.levels_mm[axis], 2) for axis in problem.order)
+    nine = moments[:9]
+    over_inner = nine @ inner  # [9, out, mid, q_in]
+    by_out = over_inner.transpose(0, 1, 3, 2) @ mid  # [9, out, q_in, q_mid]
+    by_mid = over_inner.transpose(0, 2, 3, 1) @ out  # [9, mid, q_in, q_out]
+    over_out = _contract_first(nine, out)  # [9, q_out, mid, in]
+    by_inner = (over_out.transpose(0, 1, 3, 2) @ mid).transpose(0, 2, 3, 1)  # [9, in, q_mid, q_out]
+    axis_out, axis_mid, axis_in = problem.order
+    tables = {
+        axis_out: (by_out, axis_in, axis_mid),
+        axis_mid: (by_mid, axis_in, axis_out),
+        axis_in: (by_inner, axis_mid, axis_out),
+    }
+    stations, dead = [], []
+    for axis, kinds in enumerate(level.kinds):
+        table, first_lever, second_lever = tables[axis]
+        for kind in kinds:
+            part = table[:, :, int(kind.lever == first_lever), int(kind.lever == second_lever)]
+            stations.append(part[_SYMMETRIC[kind.output]].T)
+            dead.append(part[6 + kind.output])
+    return np.concatenate(stations), np.concatenate(dead)
+
+
+def _contract_first(table: FloatArray, powers: FloatArray) -> FloatArray:
+    """Sum over the second axis of (k, a, b, c) with powers (a, q): (k, q, b, c) by matrix products."""
+    count, first = table.shape[:2]
+    return (powers.T @ table.reshape(count, first, -1)).reshape(count, powers.shape[1], *table.shape[2:])
+
+
+def _level_matrix(problem: GridProblem, level: LevelMap, weighted: FloatArray) -> FloatArray:
+    """Normal matrix of the kinds at their levels, from moments of w u u^T (6, n_out, n_mid, n_in) over pairs."""
+    out, mid, inner = problem.order
+    powers = {axis: _powers(problem.levels_mm[axis], 3) for axis in range(3)}
+    pair = {
+        (out, mid): (weighted @ powers[inner]).transpose(3, 0, 1, 2),  # [power of the third, 6, first, second]
+        (out, inner): (powers[mid].T @ weighted).transpose(2, 0, 1, 3),
+        (mid, inner): _contract_first(weighted, powers[out]).transpose(1, 0, 2, 3),
+    }
+    sizes = [len(problem.levels_mm[axis]) for axis in range(3)]
+    starts = np.cumsum([0, *(len(level.kinds[axis]) * sizes[axis] for axis in range(3))])
+    result = np.zeros((int(starts[3]), int(starts[3])))
+    for (a, b), table in pair.items():
+        block = _pair_block(level.kinds[a], level.kinds[b], table, problem.levels_mm[a], problem.levels_mm[b])
+        rows, columns = slice(starts[a], starts[a + 1]), slice(starts[b], starts[b + 1])
+        result[rows, columns] = block
+        result[columns, rows] = block.T
+    for axis, (first, second) in {out: (out, mid), mid: (out, mid), inner: (out, inner)}.items():
+        table = pair[(first, second)]
+        other = second if axis == first else first
+        turned = table if axis == first else table.transpose(0, 1, 3, 2)
+        along = (turned @ powers[other]).transpose(3, 0, 1, 2)  # [power of other, of third, 6, level]
+        third = 3 - first - second
+        result[starts[axis] : starts[axis + 1], starts[axis] : starts[axis + 1]] = _own_block(
+            level.kinds[axis], along, other, third
+        )
+    return result
+
+
+def _pair_block(
+    kinds_a: Sequence[Kind], kinds_b: Sequence[Kind], table: FloatArray, levels_a: FloatArray, levels_b: FloatArray
+) -> FloatArray:
+    """Block of two different axes: kinds and levels of the first by those of the second."""
+    a, b = kinds_a[0].axis, kinds_b[0].axis
+    third = 3 - a - b
+    power = np.array([[int(p.lever == third) + int(q.lever == third) for q in kinds_b] for p in kinds_a])
+    entry = _SYMMETRIC[np.ix_([p.output for p in kinds_a], [q.output for q in kinds_b])]
+    block = table[power, entry]  # [kind a, kind b, level a, level b]
+    scale_b = np.array([levels_b if p.lever == b else np.ones(len(levels_b)) for p in kinds_a])
+    scale_a = np.array([levels_a if q.lever == a else np.ones(len(levels_a)) for q in kinds_b])
+    block = block * scale_b[:, None, None, :] * scale_a[None, :, :, None]
+    return np.ascontiguousarray(block.transpose(0, 2, 1, 3)).reshape(
+        len(kinds_a) * len(levels_a), len(kinds_b) * len(levels_b)
+    )
+
+
+def _own_block(kinds: Sequence[Kind], along: FloatArray, other: int, third: int) -> FloatArray:
+    """Block of one axis with itself: diagonal in the levels; ``along`` is [power of other, of third, 6, level]."""
+    first = np.array([[int(p.lever == other) + int(q.lever == other) for q in kinds] for p in kinds])
+    second = np.array([[int(p.lever == third) + int(q.lever == third) for q in kinds] for p in kinds])
+    outputs = [kind.output for kind in kinds]
+    diagonal = along[first, second, _SYMMETRIC[np.ix_(outputs, outputs)]]  # [kind, kind, level]
+    count = along.shape[3]
+    block = np.zeros((len(kinds), count, len(kinds), count))
+    index = np.arange(count)
+    block[:, index, :, index] = diagonal.transpose(2, 0, 1)
+    return block.reshape(len(kinds) * count, -1)
+
+
+def _merge(
+    tools: Sequence[ToolData],
+    shape: tuple[int, ...],
+    cell: tuple[IntArray, IntArray],
+    reading_mm: FloatArray,
+    weight: FloatArray,
+) -> tuple[tuple[ToolData, ...], float]:
+    """Merge the readings of each cell into their weighted mean; also return the scatter about the means."""
+    tool, index = cell
+    count = int(np.prod(shape))
+    merged, scatter = [], 0.0
+    for k, data in enumerate(tools):
+        rows = slice(None) if len(tools) == 1 else np.flatnonzero(tool == k)
+        cells, w, reading = index[rows], weight[rows], reading_mm[rows]
+        total = np.bincount(cells, w, count).astype(np.float64)
+        mean = np.bincount(cells, w * reading, count) / np.where(total > 0, total, 1.0)
+        scatter += float(np.dot(w, (reading - mean[cells]) ** 2))
+        merged.append(replace(data, weight=total.reshape(shape), length_mm=mean.reshape(shape)))
+    return tuple(merged), scatter
+
+
+def _levels(position_mm: FloatArray) -> FloatArray:
+    """Distinct values (k,) of (n,); a sample is tried first, because sorting everything takes most of the set-up."""
+    sample = np.unique(position_mm[:: max(1, len(position_mm) // 1999) | 1])
+    found = np.minimum(np.searchsorted(sample, position_mm), len(sample) - 1)
+    return sample if np.array_equal(sample[found], position_mm) else np.unique(position_mm)
+
+
+def start_moments(problem: GridProblem) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return what the closed-form start needs of the readings, in centred and scaled coordinates.
+
+    With p = (target - centre)/scale and L = reading/scale - offset of the group: sums over the readings of each group
+    of products of (2 p, 2 L, 1, |p|^2 - L^2).
+
+    Returns
+    -------
+    moments (groups, 6, 6), offset (groups,), centre in mm (3,), scale in mm.
+    """
+    zero = State(np.zeros(problem.parameters.size), np.zeros((problem.stations, 3)), np.zeros(problem.groups))
+    bodies = _bodies(problem, zero)
+    targets = [_tips(bodies, data.tool_mm)[-1].transpose(1, 0, 2).reshape(3, -1) for data in problem.tools]
+    centre = targets[0].mean(axis=1)
+    scale = max(float(np.ptp(targets[0], axis=1).max()), 1.0)
+    readings = np.sum([np.sum(data.length_mm * (data.weight > 0), axis=(1, 2)) for data in problem.tools], axis=0)
+    counts = np.sum([np.count_nonzero(data.weight, axis=(1, 2)) for data in problem.tools], axis=0)
+    offset = readings / np.maximum(counts, 1) / scale
+    moments = np.zeros((problem.groups, 6, 6))
+    for data, target in zip(problem.tools, targets, strict=True):
+        p = (target - centre[:, None]) / scale
+        columns = np.ones((6, p.shape[1]))
+        columns[:3] = 2.0 * p
+        square = np.einsum("km,km->m", p, p)
+        for group in range(problem.groups):
+            reading = data.length_mm[group].ravel() / scale - offset[group]
+            columns[3] = 2.0 * reading
+            columns[5] = square - reading**2
+            present = (data.weight[group] > 0).ravel()
+            moments[group] += (columns * present) @ columns.T
+    return moments, offset, centre, scale
+
+
+#: A grid is used when at least this share of its cells holds readings.
+LEAST_FILL = 0.1
+
+
+def grid_problem(
+    parameters: ErrorParameters,
+    position_mm: FloatArray,
+    tool_mm: FloatArray,
+    station: IntArray,
+    group: IntArray,
+    reading_mm: FloatArray,
+) -> GridProblem | None:
+    """Sort readings into a grid of levels, all weights 1; None where their positions form no grid.
+
+    Parameters
+    ----------
+    parameters : the unknown errors.
+    position_mm : commanded positions of the readings, shape (n, 3).
+    tool_mm : their tool offsets, (3,) or (n, 3).
+    station, group, reading_mm : of each reading, shape (n,).
+    """
+    count = len(reading_mm)
+    levels = [_levels(position_mm[:, axis]) for axis in range(3)]
+    if tool_mm.ndim == 1:
+        tools, tool = tool_mm[None], np.zeros(count, dtype=np.int64)
+    else:
+        tools, tool = np.unique(tool_mm, axis=0, return_inverse=True)
+        tool = tool.ravel()
+    groups = int(group.max()) + 1
+    cells = groups * int(np.prod([len(level) for level in levels]))
+    if len(tools) * cells * LEAST_FILL > count:
+        return None
+    order = tuple(axis for axis, _ in reversed(passing_order(parameters.machine)))
+    out, mid, inner = order
+    size_mid, size_in = len(levels[mid]), len(levels[inner])
+    at = [np.searchsorted(levels[axis], position_mm[:, axis]) for axis in range(3)]
+    index = group * len(levels[out]) + at[out]
+    index = (index * size_mid + at[mid]) * size_in + at[inner]
+    station_of = np.zeros(groups, dtype=np.int64)
+    station_of[group] = station
+    shape = (groups, len(levels[out]), size_mid * size_in)
+    bases = tuple(parameters.basis(axis, levels[axis]) for axis in range(3))
+    nothing = np.zeros((0, 0, 0))
+    empty = [ToolData(offset, nothing, nothing) for offset in tools]
+    cell = (tool.astype(np.int64), index.astype(np.int64))
+    weight = np.ones(count)
+    merged, scatter = _merge(empty, shape, cell, reading_mm, weight)
+    return GridProblem(
+        parameters=parameters,
+        order=order,  # type: ignore[arg-type]
+        levels_mm=tuple(levels),  # type: ignore[arg-type]
+        bases=bases,  # type: ignore[arg-type]
+        reduced=reduced_entries(parameters, bases),
+        tools=merged,
+        station_of=station_of,
+        cell=cell,
+        reading_mm=reading_mm,
+        reading_weight=weight,
+        scatter=scatter,
+    )

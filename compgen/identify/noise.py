@@ -1,0 +1,70 @@
+"""The uncertainty of the readings: stated by the user, by the file, or assumed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.lengths import Lengths
+from compgen.core.names import MM_PER_UM
+from compgen.errors import InputError
+
+#: Standard uncertainty of a laser tracer's length when neither the file nor the user states one: half of the usual
+#: statement 0.2 um + 0.3 um/m at k = 2.
+ASSUMED_U_UM = 0.1
+ASSUMED_U_UM_PER_M = 0.15
+
+
+@dataclass(frozen=True)
+class IdentifyOptions:
+    """What the user may say beyond the machine and the readings.
+
+    ``u_length_um`` and ``u_length_um_per_m`` are the standard uncertainty a + b L of a reading; without them the
+    comments of that name in the file count, else the usual statement of a laser tracer. ``reject`` False keeps all
+    readings.
+    """
+
+    u_length_um: float | None = None
+    u_length_um_per_m: float | None = None
+    reject: bool = True
+
+
+@dataclass(frozen=True)
+class ReadingNoise:
+    """Standard uncertainty a + b L of a reading; ``source`` is "stated" or "assumed"."""
+
+    source: str
+    constant_um: float
+    proportional_um_per_m: float
+
+    def sigma_mm(self, distance_mm: FloatArray) -> FloatArray:
+        """Standard uncertainty in mm of readings over the given distances."""
+        return (self.constant_um + self.proportional_um_per_m * distance_mm / 1000.0) * MM_PER_UM
+
+
+def reading_noise(lengths: Lengths, options: IdentifyOptions) -> ReadingNoise:
+    """Return the uncertainty of the readings: options first, then the file's comments, then the usual statement."""
+    constant = _stated(lengths, "u_length_um", options.u_length_um)
+    proportional = _stated(lengths, "u_length_um_per_m", options.u_length_um_per_m)
+    if constant is None and proportional is None:
+        return ReadingNoise("assumed", ASSUMED_U_UM, ASSUMED_U_UM_PER_M)
+    noise = ReadingNoise("stated", constant or 0.0, proportional or 0.0)
+    values = (noise.constant_um, noise.proportional_um_per_m)
+    if min(values) < 0 or not sum(values) > 0 or not np.isfinite(sum(values)):
+        raise InputError(f"the uncertainty of a length is {values[0]:g} um + {values[1]:g} um/m; it must be above zero")
+    return noise
+
+
+def _stated(lengths: Lengths, key: str, option: float | None) -> float | None:
+    if option is not None:
+        return option
+    text = lengths.metadata.get(key)
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        file = lengths.origin[0][0] if lengths.origin else None
+        raise InputError(f"the comment {key} = {text!r} is not a number", file=file) from None

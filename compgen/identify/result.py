@@ -1,0 +1,103 @@
+"""What an identification returns, and the contents of ``identify.json``."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.names import MM_PER_UM
+from compgen.identify.outliers import Rejected
+from compgen.identify.parameters import ErrorParameters
+
+
+@dataclass(frozen=True)
+class StationResult:
+    """One station and set-up: position and dead length with standard uncertainties, mm, and residual RMS in um."""
+
+    station: str
+    setup: int
+    position_mm: tuple[float, float, float]
+    u_position_mm: tuple[float, float, float]
+    dead_length_mm: float
+    u_dead_length_mm: float
+    readings: int
+    rms_um: float
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Result of :func:`identify`.
+
+    Parameters
+    ----------
+    errors : the identified errors with standard uncertainties.
+    stations : one entry for every station and set-up.
+    residual_mm : model minus reading of every reading (n,), also of the rejected ones.
+    accepted : which readings were used, (n,).
+    rms_um, degrees_of_freedom, reduced_chi_square : of the used readings; chi-square with the stated uncertainty.
+    u_source : "stated" or "assumed"; with "assumed", and whenever the residuals are larger than stated, the
+        uncertainties are scaled by the root of the reduced chi-square (``u_scale``).
+    unobservable : combinations that the model leaves out because nothing can show them, in words.
+    rejected : readings that were not used, with the reason.
+    rank, unknowns, condition, iterations : of the least-squares problem.
+    worst_u : largest standard uncertainty by unit ("um", "urad") with its error.
+    covariance : of the unknown errors in the order of ``unknowns`` of the layout, mm and rad.
+    layout : the unknown errors and their bases.
+    """
+
+    errors: ErrorTable
+    stations: tuple[StationResult, ...]
+    residual_mm: FloatArray
+    accepted: NDArray[np.bool_]
+    rms_um: float
+    degrees_of_freedom: int
+    reduced_chi_square: float
+    u_source: str
+    u_length_um: float
+    u_length_um_per_m: float
+    u_scale: float
+    unobservable: tuple[str, ...]
+    rejected: tuple[Rejected, ...]
+    rank: int
+    unknowns: int
+    condition: float
+    iterations: int
+    worst_u: dict[str, tuple[float, str]]
+    covariance: FloatArray
+    layout: ErrorParameters
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of ``identify.json``."""
+        return {
+            "residual_rms_um": self.rms_um,
+            "residual_max_um": float(np.max(np.abs(self.residual_mm[self.accepted]))) / MM_PER_UM,
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "reduced_chi_square": self.reduced_chi_square,
+            "u_length": {
+                "source": self.u_source,
+                "constant_um": self.u_length_um,
+                "proportional_um_per_m": self.u_length_um_per_m,
+                "scaled_by": self.u_scale,
+            },
+            "readings": len(self.accepted),
+            "readings_used": int(np.count_nonzero(self.accepted)),
+            "rank": self.rank,
+            "unknowns": self.unknowns,
+            "condition": self.condition,
+            "iterations": self.iterations,
+            "identified": list(self.errors.names),
+            "unobservable": list(self.unobservable),
+            "rejected": [asdict(item) for item in self.rejected],
+            "worst_standard_uncertainty": {
+                unit: {"value": value, "error": name} for unit, (value, name) in self.worst_u.items()
+            },
+            "squareness_urad": {
+                name: {"value": value * 1e6, "u": u * 1e6} for name, (value, u) in self.errors.squareness.items()
+            },
+            "stations": [asdict(station) for station in self.stations],
+        }
