@@ -71,6 +71,12 @@ class Term:
             return np.ones((len(position_mm), 1))
         return hat_matrix(self.nodes_mm, position_mm[:, self.axis])
 
+    def curve(self, values: FloatArray, position_mm: FloatArray) -> FloatArray:
+        """Interpolated values (n,) at commanded positions (m, 3): shape (m,)."""
+        if self.axis is None:
+            return np.full(len(position_mm), values[0])
+        return np.interp(position_mm[:, self.axis], self.nodes_mm, values)
+
     def carrier_field(self, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
         """Carrier at commanded positions (m, 3) with tool offset (3,) or (m, 3): shape (m, 3)."""
         field = np.zeros((len(position_mm), 3))

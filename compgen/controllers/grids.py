@@ -15,7 +15,9 @@ from compgen.core.names import MM_PER_UM, error_named
 from compgen.model.basis import hat_matrix
 
 #: Loss by interpolation between table nodes that is not worth another node, as a displacement of the tool.
-NEGLIGIBLE_LOSS_MM = 0.02 * MM_PER_UM
+NEGLIGIBLE_LOSS_MM = 0.05 * MM_PER_UM
+#: A table is not refined beyond this many intervals, whatever the control could take.
+MOST_INTERVALS = 400
 
 
 @dataclass(frozen=True)
@@ -61,18 +63,26 @@ def equidistant_grid(
     low, high = machine.axes[axis].range_mm
     if step_mm is not None:
         return _grid(machine, axis, Decimal(repr(step_mm)), anchor)
-    nodes = curve_nodes_mm(machine, errors, axis)
-    least = len(nodes) - 1
-    best: Grid | None = None
-    for intervals in range(max(1, min(least, most - 2)), most - 1):
-        step = _round_up(Decimal(repr(high - low)) / intervals)
-        grid = _grid(machine, axis, step, anchor)
+    least = len(curve_nodes_mm(machine, errors, axis)) - 1
+    best: tuple[float, Grid] | None = None
+    for intervals in _interval_counts(least, most - 2 if anchor else most - 1):
+        grid = _grid(machine, axis, _round_up(Decimal(repr(high - low)) / intervals), anchor)
         if grid.count > most:
+            continue
+        loss = _loss_mm(machine, errors, axis, grid)
+        if best is None or loss < best[0]:
+            best = loss, grid
+        if loss <= NEGLIGIBLE_LOSS_MM:
             break
-        best = grid
-        if _loss_mm(machine, errors, axis, grid) <= NEGLIGIBLE_LOSS_MM:
-            break
-    return best if best is not None else _grid(machine, axis, _round_up(Decimal(repr(high - low))), anchor)
+    return best[1] if best is not None else _grid(machine, axis, _round_up(Decimal(repr(high - low))), anchor)
+
+
+def _interval_counts(least: int, most: int) -> list[int]:
+    """Numbers of intervals to try: those of the curves, their multiples up to ten (nodes stay nodes), then 15 % more each."""
+    counts = [least * k for k in range(1, 11)]
+    while counts[-1] < min(most, MOST_INTERVALS):
+        counts.append(int(1.15 * counts[-1]) + 1)
+    return [count for count in counts if count <= most] or [max(1, most)]
 
 
 def _round_up(step: Decimal) -> Decimal:

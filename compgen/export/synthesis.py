@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import block_diag, coo_array, csr_array, hstack
 
 from compgen.controllers.base import Term
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.errors import ConvergenceError
-from compgen.model.basis import free_basis, hat_matrix
+from compgen.model.basis import free_basis, hat_entries, hat_matrix
 from compgen.model.exact import exact_error
 from compgen.model.grid import volume_sample
 from compgen.model.volumetric import tool_of
@@ -26,7 +27,6 @@ from compgen.model.volumetric import tool_of
 #: leaves one, everywhere. Both weights lie far below that of any data (the normal matrix has unit diagonal).
 KEEP = 1e-7
 RIDGE = 1e-11
-CHUNK_POINTS = 4096
 
 
 def wanted_correction(
@@ -48,14 +48,15 @@ class Projector:
     """Least squares of a basis over sample points, with the normal matrix factorised once.
 
     ``transform`` (parameters, free) builds in the zeros at the reference point; ``offsets`` is 3 when a constant per
-    axis is fitted beside the tables because the control cannot express it.
+    axis is fitted beside the tables because the control cannot express it. ``design`` (3 n, free + offsets) is sparse.
     """
 
     basis: tuple[Term, ...]
     position_mm: FloatArray
     tool_mm: FloatArray
-    transform: FloatArray
+    transform: csr_array
     offsets: int
+    design: csr_array
     factor: tuple[FloatArray, bool]
     scale: FloatArray
 
@@ -67,10 +68,7 @@ class Projector:
 
     def project_all(self, wanted_mm: FloatArray) -> FloatArray:
         """Return table values (k, parameters) for k wanted fields (k, n, 3) at once."""
-        right = np.zeros((len(self.scale), len(wanted_mm)))
-        for chunk in _slices(len(self.position_mm)):
-            matrix = _design(self.basis, self.position_mm[chunk], self.tool_mm, self.transform, self.offsets)
-            right += matrix.T @ wanted_mm[:, chunk].reshape(len(wanted_mm), -1).T
+        right = self.design.T @ wanted_mm.reshape(len(wanted_mm), -1).T
         solution = self.scale[:, None] * np.asarray(cho_solve(self.factor, right * self.scale[:, None]))
         return np.asarray((self.transform @ solution[: self.transform.shape[1]]).T)
 
@@ -85,33 +83,36 @@ class Projector:
         return {term.name: values[bounds[k] : bounds[k + 1]] for k, term in enumerate(self.basis)}
 
 
-def _slices(count: int) -> list[slice]:
-    return [slice(k, min(k + CHUNK_POINTS, count)) for k in range(0, count, CHUNK_POINTS)]
-
-
 def basis_field(basis: Sequence[Term], values: FloatArray, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
     """Return the correction field of a basis with the given values (all terms in a row) at points (n, 3)."""
     field = np.zeros((len(position_mm), 3))
     first = 0
     for term in basis:
         part = values[first : first + len(term.nodes_mm)]
-        field += term.carrier_field(position_mm, tool_mm) * (term.curve_matrix(position_mm) @ part)[:, None]
+        field += term.carrier_field(position_mm, tool_mm) * term.curve(part, position_mm)[:, None]
         first += len(term.nodes_mm)
     return field
 
 
-def _design(
-    basis: Sequence[Term], position_mm: FloatArray, tool_mm: FloatArray, transform: FloatArray, offsets: int
-) -> FloatArray:
-    """Design matrix (3 n, free + offsets) at points (n, 3)."""
-    blocks = [
-        term.carrier_field(position_mm, tool_mm)[:, :, None] * term.curve_matrix(position_mm)[:, None, :]
-        for term in basis
-    ]
-    full = np.concatenate(blocks, axis=2).reshape(3 * len(position_mm), -1) @ transform
-    if not offsets:
-        return full
-    return np.hstack([full, np.tile(np.eye(3), (len(position_mm), 1))])
+def _design(basis: Sequence[Term], position_mm: FloatArray, tool_mm: FloatArray) -> csr_array:
+    """Design matrix (3 n, parameters) at points (n, 3), sparse: each table has two values at a point."""
+    rows, columns, entries = [], [], []
+    first, points = 0, np.arange(len(position_mm))
+    for term in basis:
+        carrier = term.carrier_field(position_mm, tool_mm)
+        if term.axis is None or len(term.nodes_mm) == 1:
+            left, share = np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
+        else:
+            left, share = hat_entries(term.nodes_mm, position_mm[:, term.axis])
+        right = np.minimum(left + 1, len(term.nodes_mm) - 1)
+        for output in sorted({part.output for part in term.carrier}):
+            for node, weight in ((left, 1.0 - share), (right, share)):
+                rows.append(3 * points + output)
+                columns.append(first + node)
+                entries.append(carrier[:, output] * weight)
+        first += len(term.nodes_mm)
+    where = (np.concatenate(rows), np.concatenate(columns))
+    return coo_array((np.concatenate(entries), where), shape=(3 * len(points), first)).tocsr()
 
 
 def projector(machine: Machine, basis: Sequence[Term], *, anchored: bool) -> Projector:
@@ -132,36 +133,30 @@ def projector(machine: Machine, basis: Sequence[Term], *, anchored: bool) -> Pro
     transform = _transform(basis)
     offsets = 3 if anchored else 0
     size = transform.shape[1] + offsets
-    normal = np.zeros((size, size))
-    for chunk in _slices(len(position_mm)):
-        matrix = _design(basis, position_mm[chunk], tool_mm, transform, offsets)
-        normal += matrix.T @ matrix
+    design = _design(basis, position_mm, tool_mm) @ transform
+    if offsets:
+        constants = coo_array(np.tile(np.eye(3), (len(position_mm), 1)))
+        design = hstack([design, constants], format="csr")
+    normal = (design.T @ design).toarray()
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
     regular = RIDGE * np.eye(size)
     regular[transform.shape[1] :] = 0.0
-    rows = _keep_rows(basis) @ transform
+    rows = np.asarray(_keep_rows(basis) @ transform)
     rows *= scale[: transform.shape[1]]
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
     regular[: transform.shape[1], : transform.shape[1]] += KEEP * rows.T @ rows
     factor = cho_factor(normal * scale[:, None] * scale + regular, lower=True)
-    return Projector(tuple(basis), position_mm, tool_mm, transform, offsets, factor, scale)
+    return Projector(tuple(basis), position_mm, tool_mm, transform, offsets, design, factor, scale)
 
 
-def _transform(basis: Sequence[Term]) -> FloatArray:
+def _transform(basis: Sequence[Term]) -> csr_array:
     blocks = []
     for term in basis:
         rows = np.zeros((0, len(term.nodes_mm)))
         if term.zero_at_mm is not None and term.axis is not None:
-            point = np.zeros((1, 3))
-            point[0, term.axis] = term.zero_at_mm
-            rows = term.curve_matrix(point)
+            rows = hat_matrix(term.nodes_mm, np.array([term.zero_at_mm]))
         blocks.append(free_basis(np.where(np.abs(rows) < 1e-14, 0.0, rows), len(term.nodes_mm)))
-    total = np.zeros((sum(len(block) for block in blocks), sum(block.shape[1] for block in blocks)))
-    row = column = 0
-    for block in blocks:
-        total[row : row + block.shape[0], column : column + block.shape[1]] = block
-        row, column = row + block.shape[0], column + block.shape[1]
-    return total
+    return csr_array(block_diag(blocks))
 
 
 def _keep_rows(basis: Sequence[Term]) -> FloatArray:

@@ -3,9 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from compgen.core.csvio import FloatArray
+
+
+def hat_entries(nodes_mm: FloatArray, position_mm: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+    """Left node (m,) of the interval of each position, and the share (m,) of the right node in the value there.
+
+    Linear between ``nodes_mm`` (n,), n > 1, constant outside.
+    """
+    left = np.clip(np.searchsorted(nodes_mm, position_mm, side="right") - 1, 0, len(nodes_mm) - 2)
+    share = np.clip((position_mm - nodes_mm[left]) / (nodes_mm[left + 1] - nodes_mm[left]), 0.0, 1.0)
+    return left, share
 
 
 def hat_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
@@ -18,12 +29,11 @@ def hat_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
     """
     nodes, position = np.asarray(nodes_mm), np.asarray(position_mm)
     matrix = np.zeros((len(position), len(nodes)))
-    rows = np.arange(len(position))
     if len(nodes) == 1:
         matrix[:, 0] = 1.0
         return matrix
-    left = np.clip(np.searchsorted(nodes, position, side="right") - 1, 0, len(nodes) - 2)
-    share = np.clip((position - nodes[left]) / (nodes[left + 1] - nodes[left]), 0.0, 1.0)
+    left, share = hat_entries(nodes, position)
+    rows = np.arange(len(position))
     matrix[rows, left] = 1.0 - share
     matrix[rows, left + 1] += share
     return matrix
