@@ -43,6 +43,8 @@ CONTRACT_CONTROLLERS = (
     "linuxcnc-volumetric",
     "neutral",
 )
+#: Exit codes beyond the contract's, as shells use them: nothing is said about the result.
+STOPPED, READER_GONE = 130, 141
 #: Tables into a pipe or a file get the width that they need, not that of an unknown terminal.
 PIPE_WIDTH = None if sys.stdout.isatty() else 130
 stdout = Console(highlight=False, width=PIPE_WIDTH)
@@ -140,10 +142,9 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
             return _usage(error, words)
         except (click.Abort, KeyboardInterrupt):
             stderr.print("stopped", markup=False)
-            return 130
-        except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
+            return STOPPED
+        except SystemExit:  # click and rich leave so when the reader of a pipe has gone
+            return READER_GONE
         except CompgenError as error:
             return _fail(str(error), error.exit_code, words)
         except MemoryError:
