@@ -18,7 +18,7 @@ from compgen.verify import residuals
 
 @click.command("simulate")
 @machine_argument
-@click.option("--scenario", required=True, type=click.Path(path_type=Path), help="Scenario TOML; see docs/simulate.md.")
+@click.option("--scenario", required=True, type=click.Path(path_type=Path), help="Scenario TOML; see docs/files.md.")
 @out_option
 @click.option("--seed", type=click.IntRange(min=0), help="Seed in place of the scenario's own.")
 @json_option

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from compgen.core.error_table import ErrorTable
+from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
+from compgen.core.names import error_named
 from compgen.fit.curve import fit_curve
 from compgen.fit.endpoints import zero_ends
 from compgen.fit.options import FitOptions
@@ -32,7 +33,7 @@ def fit(machine: Machine, errors: ErrorTable, options: FitOptions = _DEFAULT) ->
     ConvergenceError
         when the bounded fit does not pass its check.
     """
-    zeroed = zero_ends(machine, errors)
+    zeroed = zero_ends(machine, _as_independent(machine, errors))
     fitted = {name: fit_curve(name, held, options) for name, held in zeroed.curves.items()}
     reference = ", ".join(f"{value:g}" for value in machine.reference_point_mm)
     table = ErrorTable(
@@ -41,3 +42,18 @@ def fit(machine: Machine, errors: ErrorTable, options: FitOptions = _DEFAULT) ->
         metadata={**errors.metadata, "reference_point_mm": reference},
     )
     return FitResult(table, {name: report for name, (_, report) in fitted.items()}, zeroed.change)
+
+
+def _as_independent(machine: Machine, errors: ErrorTable) -> ErrorTable:
+    """Give the points of cubic curves the uncertainty that independent points of the same information would have.
+
+    A cubic curve is written at more positions than it has coefficients, so that its points repeat each other; taken
+    as independent they would claim too much, and the smoothing would believe them.
+    """
+    if machine.curves != "cubic":
+        return errors
+    curves = {}
+    for name, curve in errors.curves.items():
+        surplus = len(curve.position_mm) / len(machine.axes[error_named(name).axis].nodes_mm)
+        curves[name] = Curve(curve.position_mm, curve.value, curve.u * max(1.0, surplus) ** 0.5)
+    return errors.replace(curves=curves)

@@ -6,6 +6,7 @@ Zha & Zhang 2024, section 5 (eq. 22-28), with the exact machine model in place o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,14 +76,15 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
 def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification:
     _check_readings(machine, lengths)
     task = _task(machine, lengths)
-    start = _start(task)
+    start, searched = _start(task)
     noise = reading_noise(lengths, options)
     distance = task.target_mm - start.stations_mm[task.station]
     sigma_mm = noise.sigma_mm(np.sqrt(np.einsum("ij,ij->i", distance, distance)))
     weights = (sigma_mm.min() / sigma_mm) ** 2
     task = replace(task, problem=task.problem.weighted(weights))
     factor, rank = _determined(task, start)
-    solution, accepted = _solve_robustly(task.problem, start, weights, factor, reject=options.reject)
+    start = _unmirrored(task, start, searched)
+    solution, accepted = _solve_robustly(task.problem, start, weights, factor, sigma_mm, reject=options.reject)
     return _result(task, solution, accepted, sigma_mm, noise, rank)
 
 
@@ -133,7 +135,8 @@ def _groups(lengths: Lengths) -> IntArray:
     return group.ravel().astype(np.int64)
 
 
-def _start(task: _Task) -> State:
+def _start(task: _Task) -> tuple[State, list[int]]:
+    """Return the start values, and the stations that the closed form could not locate."""
     stations = np.zeros((len(task.lengths.stations), 3))
     groups = int(task.group.max()) + 1
     dead = np.zeros(groups)
@@ -141,6 +144,7 @@ def _start(task: _Task) -> State:
     station_of[task.group] = task.station
     moments = start_moments(task.problem) if isinstance(task.problem, GridProblem) else None
     readings = np.bincount(task.station, minlength=len(stations))
+    searched: list[int] = []
     for k in range(len(stations)):
         own = np.flatnonzero(station_of == k)
         if readings[k] < 4 + len(own):
@@ -152,9 +156,11 @@ def _start(task: _Task) -> State:
         if moments is not None:
             sums, offset, centre, scale = moments
             found = station_start_from_moments(sums[own], offset[own], centre, scale)
-        found = found or _start_by_search(task, k)
+        if found is None:
+            found = _start_by_search(task, k)
+            searched.append(k)
         stations[k], dead[own] = found.position_mm, found.dead_length_mm
-    return State(np.zeros(task.problem.parameters.size), stations, dead)
+    return State(np.zeros(task.problem.parameters.size), stations, dead), searched
 
 
 def _start_by_search(task: _Task, station: int) -> StationStart:
@@ -185,15 +191,47 @@ def _determined(task: _Task, start: State) -> tuple[Factor, Rank | None]:
     return factorise(matrix), rank
 
 
+def _unmirrored(task: _Task, start: State, searched: Sequence[int]) -> State:
+    """Choose the side for stations whose targets all lie in a plane: its mirror image explains the readings as well.
+
+    Only the machine's errors, seen from the other stations, tell the two apart; so both are tried.
+    """
+    for k in searched:
+        targets = task.target_mm[task.station == k]
+        centre = targets.mean(axis=0)
+        _, spread, directions = np.linalg.svd(np.cov((targets - centre).T))
+        if spread[2] > 1e-6 * spread[0]:
+            continue
+        across = directions[2]
+        mirrored = start.stations_mm.copy()
+        mirrored[k] -= 2.0 * across * float(across @ (mirrored[k] - centre))
+        other = State(start.errors, mirrored, start.dead_length_mm)
+        if _cost_from(task.problem, other) < _cost_from(task.problem, start):
+            start = other
+    return start
+
+
+def _cost_from(problem: GridProblem | LengthProblem, start: State) -> float:
+    try:
+        return solve(problem, start).cost
+    except ConvergenceError:
+        return np.inf
+
+
 def _solve_robustly(
-    problem: GridProblem | LengthProblem, start: State, weights: FloatArray, factor: Factor, *, reject: bool
+    problem: GridProblem | LengthProblem,
+    start: State,
+    weights: FloatArray,
+    factor: Factor,
+    sigma_mm: FloatArray,
+    *,
+    reject: bool,
 ) -> tuple[Solution, NDArray[np.bool_]]:
     """Solve, reject what lies beyond the robust limit, and repeat until the same readings are kept."""
     accepted = np.ones(len(weights), dtype=bool)
-    roots = np.sqrt(weights)
     solution = solve(problem, start, factor)
     for _ in range(20 if reject else 0):
-        keep = accepted_readings(problem.residuals(solution.state) * roots)
+        keep = accepted_readings(problem.residuals(solution.state) / sigma_mm)
         if np.count_nonzero(keep) < 0.7 * len(keep):
             raise ConvergenceError(
                 f"{np.count_nonzero(~keep)} of {len(keep)} readings do not fit the model; check the machine file's chain, "

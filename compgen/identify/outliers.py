@@ -31,13 +31,16 @@ class Rejected:
     line: int = 0
 
 
-def accepted_readings(standardised: FloatArray, floor: float = 1.0) -> NDArray[np.bool_]:
-    """Mark the readings whose standardised residual (n,) lies within the robust limit.
+def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
+    """Mark the readings whose residual over its standard uncertainty (n,) lies within the robust limit.
 
-    ``floor`` keeps the scale from collapsing when more than half the residuals are exactly zero.
+    The scale is not let below a thousandth of the uncertainty, so that rounding in noise-free data rejects nothing.
     """
+    size = np.abs(standardised)
+    if float(size.max()) <= LIMIT * 1e-3:
+        return np.ones(len(size), dtype=bool)
     spread = 1.4826 * float(np.median(np.abs(standardised - np.median(standardised))))
-    return np.abs(standardised) <= LIMIT * max(spread, floor * 1e-3)
+    return np.asarray(size <= LIMIT * max(spread, 1e-3))
 
 
 def explain_rejected(

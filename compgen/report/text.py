@@ -93,8 +93,8 @@ def verification_table(results: Sequence[Verification]) -> Group:
         title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False, collapse_padding=True
     )
     table.add_column("control", overflow="fold", min_width=12)
-    for heading in ("before", "after", "after*", "not held"):
-        table.add_column(heading, justify="right", overflow="fold", min_width=8)
+    for heading in ("before", "after", "before*", "after*", "not held"):
+        table.add_column(heading, justify="right", overflow="fold", min_width=6)
     table.add_column("verdict", overflow="fold", min_width=8)
     notes: list[Text] = []
     for item in results:
@@ -103,18 +103,21 @@ def verification_table(results: Sequence[Verification]) -> Group:
             item.controller,
             _pair(item.before),
             _pair(item.after),
+            _pair(item.before_rigid_removed),
             _pair(item.after_rigid_removed),
             _um(item.unrepresentable_um),
             verdict,
         )
         notes += [Text(f"{item.controller}: {reason}", "red") for reason in item.reasons]
+        if item.accepted and item.after.rms_um > item.before.rms_um + 0.005:
+            notes.append(Text(f"{item.controller}: grows as it stands, by a rigid motion; see before* and after*"))
         if item.uncorrected_um:
             listed = ", ".join(f"{name} {_um(value)} um" for name, value in list(item.uncorrected_um.items())[:8])
             more = f" and {len(item.uncorrected_um) - 8} more" if len(item.uncorrected_um) > 8 else ""
             notes.append(Text(f"{item.controller} leaves uncorrected: {listed}{more}"))
     legend = (
-        "before and after: as it stands, the reference point fixed; after*: the best-fit rigid motion of the workpiece "
-        "taken out; not held: the largest error that no table of this control can express"
+        "before, after: as it stands, the reference point fixed; before*, after*: the best-fit rigid motion of the "
+        "workpiece taken out; not held: the largest error that no table of this control can express"
     )
     return Group(table, Text(legend), *notes)
 

@@ -16,13 +16,15 @@ from compgen.model.grid import VolumeGrid
 def components(grid: VolumeGrid, field_mm: FloatArray) -> dict[str, FloatArray]:
     """Split a field (n, 3) on the grid's points; returns arrays of shape (nx, ny, nz) that broadcast, by name.
 
-    Names: ``X linear in y`` (slope), ``X(y)`` (the rest of the main effect), ``X(x,z)`` (interaction of a pair),
-    ``X(x,y,z)``; constants are left out. The parts are orthogonal on the grid, so that none hides another.
+    Names: ``X constant``, ``X linear in y`` (slope), ``X(y)`` (the rest of the main effect), ``X(x,z)`` (interaction of
+    a pair), ``X(x,y,z)``. The parts are orthogonal on the grid, so that none hides another.
     """
     parts: dict[str, FloatArray] = {}
     for output, letter in enumerate(AXES):
         rest = field_mm[:, output].reshape(grid.shape)
-        rest = rest - rest.mean()
+        constant = rest.mean(keepdims=True)
+        parts[f"{letter} constant"] = constant
+        rest = rest - constant
         for axis in range(3):
             others = tuple(k for k in range(3) if k != axis)
             main = rest.mean(axis=others, keepdims=True)

@@ -20,15 +20,18 @@ from compgen.core.points import Points
 from compgen.errors import InputError
 from compgen.export.synthesis import Projector, projector, wanted_correction
 from compgen.model.exact import exact_error
-from compgen.model.grid import volume_grid
+from compgen.model.grid import VolumeGrid, volume_grid
 from compgen.model.volumetric import tool_of, volumetric_error
 from compgen.verify.components import components, rms
 from compgen.verify.residuals import Residuals, residuals, without_rigid_motion
+from compgen.verify.scan import displacement_uncertainty, point_reasons, scan_lines
 
 #: A component of the correction may miss the best possible one by this share of it ...
 COMPONENT_SHARE = 0.3
-#: ... or by this much, whichever is larger; the quantum of the format comes on top.
+#: ... or by this much, whichever is larger; the quantum of the format comes on top, and this many standard
+#: uncertainties of the errors (what smoothing may take away), up to COMPONENT_SHARE of the whole correction.
 COMPONENT_FLOOR_MM = 0.2 * MM_PER_UM
+COMPONENT_UNCERTAINTIES = 0.5
 #: Errors that stay uncorrected by less than this are not named.
 NAMED_FROM_MM = 0.1 * MM_PER_UM
 
@@ -135,25 +138,27 @@ def verify(machine: Machine, tables: ReadTables, errors: ErrorTable, points: Poi
     machine : the machine.
     tables : from :func:`read_tables`.
     errors : usually the identified errors; the exact model moves with them.
-    points : where the residuals are reported; default the grid of the curve nodes and the middles between them. The
-        judgement itself is always made on that grid.
+    points : where the residuals are reported; default the grid of the nodes of curves and tables and the middles
+        between them. The judgement itself is always made on that grid and on lines along the axes.
     """
-    nodes = tuple(curve_nodes_mm(machine, errors, axis) for axis in range(3))
+    control = tables.controller
+    solver = projector(machine, control.basis(machine, tables.settings, errors), anchored=control.anchored)
+    nodes = _nodes(machine, errors, solver)
     grid = volume_grid(machine, nodes)
     where = points or Points(grid.position_mm)
     before, after = _errors_before_after(machine, tables, errors, where)
     nominal = where.position_mm + tool_of(machine, where.tool_mm)
-    control = tables.controller
-    solver = projector(machine, control.basis(machine, tables.settings, errors), anchored=control.anchored)
     wanted = wanted_correction(machine, errors, grid.position_mm)
-    best = _best_correction(machine, errors, solver, grid.position_mm)
+    values = _best_values(machine, errors, solver)
+    best = solver.field(values, grid.position_mm)
     rest = wanted - best
     if control.anchored:
         rest = rest - rest.mean(axis=0)
     correction = tables.correction(machine, Points(grid.position_mm))
     reasons = [
         *control.violations(machine, tables.settings, tables.tables),
-        *_component_reasons(grid, correction, best, control.resolution_mm(tables.settings)),
+        *_component_reasons(grid, correction, best, _slack(machine, tables, errors, best, grid.position_mm)),
+        *_scan_reasons(machine, tables, errors, solver, values, nodes),
         *_shrink_reasons(machine, tables, errors, Points(grid.position_mm)),
     ]
     return Verification(
@@ -183,23 +188,62 @@ def _errors_before_after(
     return before, after
 
 
-def _best_correction(machine: Machine, errors: ErrorTable, solver: Projector, position_mm: FloatArray) -> FloatArray:
-    """Return the correction of the best table within the control's basis, before rounding."""
+def _nodes(machine: Machine, errors: ErrorTable, solver: Projector) -> tuple[FloatArray, ...]:
+    """Return the positions of the curves and of the control's tables, by axis."""
+    return tuple(
+        np.unique(
+            np.concatenate(
+                [curve_nodes_mm(machine, errors, axis), *(t.nodes_mm for t in solver.basis if t.axis == axis)]
+            ).round(6)
+        )
+        for axis in range(3)
+    )
+
+
+def _best_values(machine: Machine, errors: ErrorTable, solver: Projector) -> FloatArray:
+    """Return all values of the best table within the control's basis, before rounding."""
     start = np.concatenate([term.start for term in solver.basis])
-    wanted = wanted_correction(machine, errors, solver.position_mm)
-    return solver.field(solver.project(wanted, start), position_mm)
+    return solver.project(wanted_correction(machine, errors, solver.position_mm), start)
 
 
-def _component_reasons(grid: Any, correction_mm: FloatArray, best_mm: FloatArray, resolution_mm: float) -> list[str]:
+def _scan_reasons(
+    machine: Machine,
+    tables: ReadTables,
+    errors: ErrorTable,
+    solver: Projector,
+    values: FloatArray,
+    nodes_mm: tuple[FloatArray, ...],
+) -> list[str]:
+    """Name points on densely sampled lines along the axes where the correction misses the best possible one."""
+    resolution_mm = tables.controller.resolution_mm(tables.settings)
+    reasons = []
+    for position_mm in scan_lines(machine, nodes_mm):
+        u_mm = displacement_uncertainty(machine, errors, position_mm)
+        correction_mm = tables.correction(machine, Points(position_mm))
+        reasons += point_reasons(position_mm, correction_mm, solver.field(values, position_mm), u_mm, resolution_mm)
+    return reasons
+
+
+def _slack(
+    machine: Machine, tables: ReadTables, errors: ErrorTable, best_mm: FloatArray, position_mm: FloatArray
+) -> FloatArray:
+    """What the quantum of the format and the uncertainty of the errors explain of a component, shape (3,), mm."""
+    u = COMPONENT_UNCERTAINTIES * displacement_uncertainty(machine, errors, position_mm)
+    most = COMPONENT_SHARE * np.std(best_mm, axis=0)
+    return np.asarray(tables.controller.resolution_mm(tables.settings) + np.minimum(u, most))
+
+
+def _component_reasons(
+    grid: VolumeGrid, correction_mm: FloatArray, best_mm: FloatArray, slack_mm: FloatArray
+) -> list[str]:
     """Name every component of the correction that misses the best possible one by more than its share."""
     miss, best, own = (components(grid, part) for part in (correction_mm - best_mm, best_mm, correction_mm))
     reasons = []
     for name in miss:
-        limit = max(COMPONENT_SHARE * rms(best[name]), COMPONENT_FLOOR_MM) + resolution_mm
+        limit = max(COMPONENT_SHARE * rms(best[name]), COMPONENT_FLOOR_MM) + slack_mm["XYZ".index(name[0])]
         if rms(miss[name]) > limit:
-            shape = np.broadcast_shapes(best[name].shape, own[name].shape)
             ratio = np.sum(own[name] * best[name]) / max(float(np.sum(best[name] ** 2)), 1e-30)
-            hint = "; its sign is reversed" if abs(ratio + 1) < 0.1 and shape else ""
+            hint = "; its sign is reversed" if abs(ratio + 1) < 0.1 else ""
             reasons.append(
                 f"correction {name}: {rms(own[name]) / MM_PER_UM:.2f} um rms in the table, "
                 f"{rms(best[name]) / MM_PER_UM:.2f} um rms needed, they differ by {rms(miss[name]) / MM_PER_UM:.2f} um{hint}"

@@ -1,0 +1,71 @@
+"""Lines along the axes, sampled densely: a single wrong node of a fine table shows here and not in any mean."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.names import AXES, MM_PER_UM
+from compgen.model.volumetric import c_matrix
+
+#: Positions along a line beside the nodes of the tables: evenly spread over the travel.
+POSITIONS = 1001
+#: At a point the correction may miss the best possible one by this share of the range of the best one ...
+POINT_SHARE = 0.3
+#: ... or by this much, whichever is larger; on top come the quantum and this many standard uncertainties of the
+#: errors, up to POINT_SHARE of the range.
+POINT_FLOOR_MM = 1.0 * MM_PER_UM
+POINT_UNCERTAINTIES = 5.0
+
+
+def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> Iterator[FloatArray]:
+    """Yield for each axis the positions (n, 3) of nine lines along it: the other two at both ends and in the middle."""
+    low, high = machine.lower_mm, machine.upper_mm
+    for axis in range(3):
+        nodes = nodes_mm[axis][(nodes_mm[axis] >= low[axis]) & (nodes_mm[axis] <= high[axis])]
+        along = np.unique(np.concatenate([np.linspace(low[axis], high[axis], POSITIONS), nodes]))
+        levels = [np.array([low[k], 0.5 * (low[k] + high[k]), high[k]]) for k in range(3)]
+        levels[axis] = along
+        yield np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def displacement_uncertainty(machine: Machine, errors: ErrorTable, position_mm: FloatArray) -> FloatArray:
+    """Standard uncertainty of E = C P at positions (n, 3) from those of the errors, shape (3,): the largest, mm.
+
+    Correlations are left out; an uncertainty that is not known counts as zero.
+    """
+    curves = {name: replace(curve, value=np.nan_to_num(curve.u)) for name, curve in errors.curves.items()}
+    squareness = {name: (float(np.nan_to_num(u)), 0.0) for name, (_, u) in errors.squareness.items()}
+    u = ErrorTable(curves, squareness).at(position_mm)
+    return np.asarray(np.sqrt(np.einsum("nij,nj->ni", c_matrix(machine, position_mm) ** 2, u**2)).max(axis=0))
+
+
+def point_reasons(
+    position_mm: FloatArray,
+    correction_mm: FloatArray,
+    best_mm: FloatArray,
+    u_mm: FloatArray,
+    resolution_mm: float,
+) -> list[str]:
+    """Name for each axis the point (of n) where the correction (n, 3) misses the best one most, if it is too far.
+
+    ``u_mm`` (3,) is the standard uncertainty that the errors give the correction, ``resolution_mm`` the format's.
+    """
+    reasons = []
+    for output, letter in enumerate(AXES):
+        miss = np.abs(correction_mm[:, output] - best_mm[:, output])
+        worst = int(np.argmax(miss))
+        share = POINT_SHARE * float(np.ptp(best_mm[:, output]))
+        limit = max(share, POINT_FLOOR_MM) + min(POINT_UNCERTAINTIES * u_mm[output], share) + resolution_mm
+        if miss[worst] > limit:
+            x, y, z = position_mm[worst]
+            reasons.append(
+                f"correction {letter} at X {x:g} Y {y:g} Z {z:g} mm: {correction_mm[worst, output] / MM_PER_UM:+.2f} um "
+                f"in the table, {best_mm[worst, output] / MM_PER_UM:+.2f} um needed"
+            )
+    return reasons
