@@ -1,11 +1,13 @@
 """The command line: help, exit codes, what goes to stdout and to stderr, and that bad input writes nothing."""
 
+import io
 import json
 import os
 import shutil
 import stat
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -160,7 +162,7 @@ def test_a_result_that_is_not_acceptable_exits_with_1(call, small_machine_file, 
     assert not (tmp_path / "out" / "volcomp0.csv").exists()
     code, stdout, _ = call(*words, "--out", tmp_path / "out")
     assert code == 1
-    assert "NOT ACCEPTED" in stdout.replace("\n", " ")
+    assert "REJECTED" in stdout
     assert "isg-csv: correction" in stdout
 
 
@@ -607,3 +609,29 @@ def test_a_reader_that_stops_early_gets_no_verdict_and_no_traceback(words):
     with os.fdopen(write_end, "wb") as pipe:
         done = subprocess.run([script, *words], stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+# --- the width of a terminal -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("width", [80, 100, 130])
+@pytest.mark.parametrize("name", ["isg-csv", "linuxcnc-volumetric"])
+def test_no_figure_and_no_verdict_is_cut_off(width, name, small_machine, small_errors, tmp_path):
+    """Also with figures of four digits, a long name and a table that is rejected."""
+    from rich.console import Console
+
+    from compgen.report.text import verification_table
+
+    paths = compgen.export(small_machine, small_errors, "isg-csv").write(tmp_path)
+    result = compgen.verify(small_machine, compgen.read_tables(small_machine, paths, "isg-csv"), small_errors)
+    figures = compgen.Residuals(4321.0, 1234.0, 1.0, 1.0, 1.0, 1.0)
+    for reasons, verdict in ((), "accepted"), (("first", "second"), "REJECTED"):
+        wide = replace(result, controller=name, before=figures, after=figures, reasons=reasons)
+        console = Console(width=width, record=True, file=io.StringIO())
+        console.print(verification_table([wide]))
+        text = console.export_text()
+        assert verdict in text
+        assert "…" not in text
+        assert text.count("4321") == text.count("1234") == 2
+        assert all(reason in text for reason in reasons)
+        assert max(map(len, text.splitlines())) <= width

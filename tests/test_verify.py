@@ -322,6 +322,55 @@ def test_a_large_squareness_does_not_hide_a_small_wrong_curve(name, small_machin
     assert not judged(small_machine, errors, name, wrong, tmp_path).accepted
 
 
+@pytest.mark.parametrize("name", ["isg-csv", "siemens-eec", "siemens-cec"])
+def test_a_constant_offset_is_rejected(name, small_machine, small_errors, exported, tmp_path):
+    """The positioning table of X (in a CEC set: table 0) is shifted by 0.05 mm as a whole."""
+    shifts = {
+        "isg-csv": lambda text: IsgText.edit(text, lambda key, word: f"{float(word) + 0.05 * (key == 'EXX'):.12f}"),
+        "siemens-eec": lambda text: EecText.edit(text, lambda axis, value: value + 0.05 * (axis == "AX1")),
+        "siemens-cec": lambda text: CecText.edit(text, lambda table, value: value + 0.05 * (table == "0")),
+    }
+    files = spoiled(exported, name, lambda spoiler, text: shifts[name](text))
+    result = judged(small_machine, small_errors, name, files, tmp_path)
+    assert any(reason.startswith("correction X constant: ") for reason in result.reasons), result.reasons
+
+
+@pytest.mark.parametrize("node", [1, 7, 33, 98])
+def test_a_single_wrong_node_of_a_fine_table_is_found(node, small_machine, small_errors, tmp_path):
+    """With a node every 5 mm the one that is wrong lies between the points where means are taken."""
+    section = tomlio.Section({"step_mm": {"X": 5.0}}, path=None, name="controllers.siemens-eec")
+    machine = replace(small_machine, controllers={"siemens-eec": section})
+    files = dict(export(machine, small_errors, "siemens-eec").files)
+    assert judged(machine, small_errors, "siemens-eec", files, tmp_path).accepted
+    files[EecText.file] = re.sub(rf"(\$AA_ENC_COMP\[0,{node},AX1\]=)\S+", r"\g<1>0.250000", files[EecText.file])
+    result = judged(machine, small_errors, "siemens-eec", files, tmp_path)
+    place = f"correction X at X {-300 + 5 * node:g} Y "
+    assert any(reason.startswith(place) and "-250.00 um in the table" in reason for reason in result.reasons)
+
+
+def test_a_peak_between_the_nodes_is_found(small_machine, small_errors, exported, tmp_path):
+    """Three rows are put into the X block of a table whose nodes are 100 mm apart."""
+    lines = exported["isg-csv"]["volcomp0.csv"].splitlines()
+    row = next(k for k, line in enumerate(lines) if line.split()[:1] == ["-200.000000"])
+    width = len(lines[row].split())
+    lines[row:row] = [
+        " ".join([f"{x}.000000", *["0.300000"] * (x == -222), *["0.0"] * (width - 1)][:width])
+        for x in (-223, -222, -221)
+    ]
+    text = re.sub(r"// records: (\d+)", lambda match: f"// records: {int(match[1]) + 3}", "\n".join(lines) + "\n")
+    result = judged(small_machine, small_errors, "isg-csv", {"volcomp0.csv": text}, tmp_path)
+    assert any(reason.startswith("correction X at X -222 Y ") for reason in result.reasons), result.reasons
+
+
+@pytest.mark.parametrize("u_factor", [1.0, 1e6])
+def test_uncertain_errors_do_not_excuse_a_wrong_sign(u_factor, small_machine, small_errors, exported, tmp_path):
+    vague = {key: replace(curve, u=curve.u * u_factor) for key, curve in small_errors.curves.items()}
+    errors = small_errors.replace(curves=vague)
+    files = spoiled(exported, "isg-csv", lambda spoiler, text: spoiler.scaled(text, -1))
+    assert not judged(small_machine, errors, "isg-csv", files, tmp_path).accepted
+    assert judged(small_machine, errors, "isg-csv", exported["isg-csv"], tmp_path).accepted
+
+
 def test_a_byte_that_is_not_ascii_is_named_with_its_line(small_machine, tmp_path):
     path = tmp_path / "volcomp0.csv"
     path.write_bytes(b"// first\n// caf\xc3\xa9\n")
@@ -509,3 +558,15 @@ def test_the_example_without_products_names_the_angular_errors(example, tmp_path
     assert result.accepted, result.reasons
     assert set(result.uncorrected_um) == {"EAX", "EBX", "EAY", "EBY", "ECY"}
     assert result.unrepresentable_um > 1.0
+
+
+@pytest.mark.parametrize(("noise_um", "seed"), [(0.1, 1), (2.0, 6), (5.0, 7)])
+def test_tables_of_a_noisy_measurement_are_accepted(noise_um, seed, small_machine, small_lengths_file, tmp_path):
+    """The fit takes noise out of the identified curves; within their uncertainty that is no fault of the table."""
+    scenario = compgen.read_scenario(small_lengths_file.parent / "scenario.toml")
+    noisy = replace(scenario, instrument=replace(scenario.instrument, noise_um=noise_um))
+    identified = compgen.identify(small_machine, compgen.simulate(small_machine, noisy, seed).lengths).errors
+    files = export(small_machine, compgen.fit(small_machine, identified).errors, "siemens-cec").files
+    result = judged(small_machine, identified, "siemens-cec", files, tmp_path)
+    assert result.accepted, result.reasons
+    assert result.after.rms_um < 0.1 * result.before.rms_um

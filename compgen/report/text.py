@@ -16,6 +16,9 @@ from compgen.identify import Identification
 from compgen.pipeline import RunResult
 from compgen.verify import Residuals, Verification
 
+#: Reasons and rejected readings beyond this number stand in the JSON files only.
+MOST_REASONS = 10
+
 
 def identification_table(result: Identification) -> Group:
     """Return the summary of an identification."""
@@ -28,10 +31,10 @@ def identification_table(result: Identification) -> Group:
     ]
     lines += [
         f"rejected: {item.station} point {item.point} (line {item.line}): {item.reason}"
-        for item in result.rejected[:10]
+        for item in result.rejected[:MOST_REASONS]
     ]
-    if len(result.rejected) > 10:
-        lines.append(f"... and {len(result.rejected) - 10} more in identify.json")
+    if len(result.rejected) > MOST_REASONS:
+        lines.append(f"... and {len(result.rejected) - MOST_REASONS} more in identify.json")
     table = Table(
         "error",
         "largest",
@@ -95,10 +98,10 @@ def verification_table(results: Sequence[Verification]) -> Group:
     table.add_column("control", overflow="fold", min_width=12)
     for heading in ("before", "after", "before*", "after*", "not held"):
         table.add_column(heading, justify="right", overflow="fold", min_width=6)
-    table.add_column("verdict", overflow="fold", min_width=8)
+    table.add_column("verdict", no_wrap=True, min_width=9)
     notes: list[Text] = []
     for item in results:
-        verdict = Text("accepted", "green") if item.accepted else Text("NOT ACCEPTED", "bold red")
+        verdict = Text("accepted", "green") if item.accepted else Text("REJECTED", "bold red")
         table.add_row(
             item.controller,
             _pair(item.before),
@@ -108,7 +111,9 @@ def verification_table(results: Sequence[Verification]) -> Group:
             _um(item.unrepresentable_um),
             verdict,
         )
-        notes += [Text(f"{item.controller}: {reason}", "red") for reason in item.reasons]
+        notes += [Text(f"{item.controller}: {reason}", "red") for reason in item.reasons[:MOST_REASONS]]
+        if len(item.reasons) > MOST_REASONS:
+            notes.append(Text(f"{item.controller}: and {len(item.reasons) - MOST_REASONS} more in result.json", "red"))
         if item.accepted and item.after.rms_um > item.before.rms_um + 0.005:
             notes.append(Text(f"{item.controller}: grows as it stands, by a rigid motion; see before* and after*"))
         if item.uncorrected_um:

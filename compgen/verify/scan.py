@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -23,15 +22,16 @@ POINT_FLOOR_MM = 1.0 * MM_PER_UM
 POINT_UNCERTAINTIES = 5.0
 
 
-def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> Iterator[FloatArray]:
-    """Yield for each axis the positions (n, 3) of nine lines along it: the other two at both ends and in the middle."""
+def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> FloatArray:
+    """Return the points (n, 3) of nine lines along each axis: the other two at both ends and in the middle."""
     low, high = machine.lower_mm, machine.upper_mm
+    lines = []
     for axis in range(3):
         nodes = nodes_mm[axis][(nodes_mm[axis] >= low[axis]) & (nodes_mm[axis] <= high[axis])]
-        along = np.unique(np.concatenate([np.linspace(low[axis], high[axis], POSITIONS), nodes]))
         levels = [np.array([low[k], 0.5 * (low[k] + high[k]), high[k]]) for k in range(3)]
-        levels[axis] = along
-        yield np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3)
+        levels[axis] = np.unique(np.concatenate([np.linspace(low[axis], high[axis], POSITIONS), nodes]))
+        lines.append(np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3))
+    return np.vstack(lines)
 
 
 def displacement_uncertainty(machine: Machine, errors: ErrorTable, position_mm: FloatArray) -> FloatArray:
@@ -65,7 +65,11 @@ def point_reasons(
         if miss[worst] > limit:
             x, y, z = position_mm[worst]
             reasons.append(
-                f"correction {letter} at X {x:g} Y {y:g} Z {z:g} mm: {correction_mm[worst, output] / MM_PER_UM:+.2f} um "
-                f"in the table, {best_mm[worst, output] / MM_PER_UM:+.2f} um needed"
+                f"correction {letter} at X {x:g} Y {y:g} Z {z:g} mm: {_um(correction_mm[worst, output])} um in the table, "
+                f"{_um(best_mm[worst, output])} um needed"
             )
     return reasons
+
+
+def _um(value_mm: float) -> str:
+    return f"{round(float(value_mm) / MM_PER_UM, 2) + 0.0:+.2f}"

@@ -157,9 +157,9 @@ def verify(machine: Machine, tables: ReadTables, errors: ErrorTable, points: Poi
     correction = tables.correction(machine, Points(grid.position_mm))
     reasons = [
         *control.violations(machine, tables.settings, tables.tables),
+        *_shrink_reasons(machine, tables, errors, Points(grid.position_mm)),
         *_component_reasons(grid, correction, best, _slack(machine, tables, errors, best, grid.position_mm)),
         *_scan_reasons(machine, tables, errors, solver, values, nodes),
-        *_shrink_reasons(machine, tables, errors, Points(grid.position_mm)),
     ]
     return Verification(
         controller=control.name,
@@ -215,13 +215,10 @@ def _scan_reasons(
     nodes_mm: tuple[FloatArray, ...],
 ) -> list[str]:
     """Name points on densely sampled lines along the axes where the correction misses the best possible one."""
-    resolution_mm = tables.controller.resolution_mm(tables.settings)
-    reasons = []
-    for position_mm in scan_lines(machine, nodes_mm):
-        u_mm = displacement_uncertainty(machine, errors, position_mm)
-        correction_mm = tables.correction(machine, Points(position_mm))
-        reasons += point_reasons(position_mm, correction_mm, solver.field(values, position_mm), u_mm, resolution_mm)
-    return reasons
+    position_mm = scan_lines(machine, nodes_mm)
+    correction_mm, best_mm = tables.correction(machine, Points(position_mm)), solver.field(values, position_mm)
+    u_mm = displacement_uncertainty(machine, errors, position_mm)
+    return point_reasons(position_mm, correction_mm, best_mm, u_mm, tables.controller.resolution_mm(tables.settings))
 
 
 def _slack(
