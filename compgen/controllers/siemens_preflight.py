@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from compgen.controllers.siemens_limits import largest_slopes
-from compgen.controllers.siemens_products import MM_DECIMALS, CecMap, sum_into_axes
+from compgen.controllers.siemens_products import CecMap, sum_into_axes
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 
@@ -34,6 +34,10 @@ class CecLimits(Protocol):
     @property
     def max_sum_mm(self) -> tuple[float, float, float] | None:
         """MD32720."""
+
+
+#: A jump of an axis at switch-on below this is not worth a warning.
+NOTICEABLE_JUMP_MM = 5e-4
 
 
 def cec_sign_statement(names: Sequence[str], subtracts: bool, sums: Sums) -> str:
@@ -127,5 +131,5 @@ def _jumps(machine: Machine, names: Sequence[str], tables: CecMap, mode: str) ->
         f"{names[axis]}: the sum at the reference point is {total:+.6f} mm ({AXES[axis]}); the axis jumps by it when "
         "the compensation is enabled"
         for axis, total in enumerate(totals)
-        if abs(total) > 3 * 10.0**-MM_DECIMALS
+        if abs(total) > NOTICEABLE_JUMP_MM
     ]

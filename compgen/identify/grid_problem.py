@@ -273,24 +273,24 @@ def _bodies(problem: GridProblem, state: State) -> list[_Body]:
     """Bodies in the order in which the tool point passes them (innermost first)."""
     parameters = problem.parameters
     directions, derivatives = travel_directions(parameters.machine, _squareness(parameters, state))
-    motion = [np.zeros((len(levels), 6)) for levels in problem.levels_mm]
+    counts = [len(levels) for levels in problem.levels_mm]
+    starts = [0, counts[0], counts[0] + counts[1]]
+    motion = np.zeros((sum(counts), 6))
     for curve in parameters.curves:
-        column = curve.error.direction + (3 if curve.error.kind == "angular" else 0)
-        motion[curve.error.axis][:, column] = problem.bases[curve.error.axis] @ (
-            curve.free @ state.errors[curve.columns]
-        )
+        axis, column = curve.error.axis, curve.error.direction + (3 if curve.error.kind == "angular" else 0)
+        value = problem.bases[axis] @ (curve.free @ state.errors[curve.columns])
+        motion[starts[axis] : starts[axis] + counts[axis], column] = value
+    rotation, jacobian = level_rotations(motion[:, 3:])
     bodies = []
     for axis, tool_side in passing_order(parameters.machine):
-        levels = problem.levels_mm[axis]
-        delta, eps = motion[axis][:, :3], motion[axis][:, 3:]
-        rotation, jacobian = level_rotations(eps)
+        levels, own = problem.levels_mm[axis], slice(starts[axis], starts[axis] + counts[axis])
         bodies.append(
             _Body(
                 axis,
                 tool_side,
-                rotation,
-                jacobian,
-                levels[:, None] * directions[axis] + delta,
+                rotation[own],
+                jacobian[own],
+                levels[:, None] * directions[axis] + motion[own, :3],
                 levels,
                 derivatives[axis],
                 problem.bases[axis],
@@ -513,11 +513,14 @@ def _merge(
     return tuple(merged), scatter
 
 
-def _levels(position_mm: FloatArray) -> FloatArray:
-    """Distinct values (k,) of (n,); a sample is tried first, because sorting everything takes most of the set-up."""
+def _levels(position_mm: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Distinct values (k,) of (n,) and the index of each position; a sample is tried first, sorting all is slow."""
     sample = np.unique(position_mm[:: max(1, len(position_mm) // 1999) | 1])
     found = np.minimum(np.searchsorted(sample, position_mm), len(sample) - 1)
-    return sample if np.array_equal(sample[found], position_mm) else np.unique(position_mm)
+    if np.array_equal(sample[found], position_mm):
+        return sample, found
+    levels = np.unique(position_mm)
+    return levels, np.searchsorted(levels, position_mm)
 
 
 def start_moments(problem: GridProblem) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -575,7 +578,8 @@ def grid_problem(
     station, group, reading_mm : of each reading, shape (n,).
     """
     count = len(reading_mm)
-    levels = [_levels(position_mm[:, axis]) for axis in range(3)]
+    found = [_levels(np.ascontiguousarray(position_mm[:, axis])) for axis in range(3)]
+    levels, at = [item[0] for item in found], [item[1] for item in found]
     if tool_mm.ndim == 1:
         tools, tool = tool_mm[None], np.zeros(count, dtype=np.int64)
     else:
@@ -588,7 +592,6 @@ def grid_problem(
     order = tuple(axis for axis, _ in reversed(passing_order(parameters.machine)))
     out, mid, inner = order
     size_mid, size_in = len(levels[mid]), len(levels[inner])
-    at = [np.searchsorted(levels[axis], position_mm[:, axis]) for axis in range(3)]
     index = group * len(levels[out]) + at[out]
     index = (index * size_mid + at[mid]) * size_in + at[inner]
     station_of = np.zeros(groups, dtype=np.int64)

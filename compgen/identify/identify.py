@@ -291,8 +291,11 @@ def _result(
 
 def _inverse(factor: Factor) -> FloatArray:
     lower, _ = dpotri(factor.lower, lower=1)
-    full = np.tril(lower) + np.tril(lower, -1).T
-    return np.asarray(full * (factor.scale[:, None] * factor.scale))
+    full: FloatArray = np.tril(lower)
+    full += np.tril(lower, -1).T
+    full *= factor.scale
+    full *= factor.scale[:, None]
+    return full
 
 
 def _error_table(layout: ErrorParameters, unknowns: FloatArray, covariance: FloatArray) -> ErrorTable:

@@ -60,10 +60,12 @@ def free_basis(constraints: FloatArray, size: int) -> FloatArray:
     Rows with a single entry just drop that unknown, so that the rest keep their meaning (and exact zeros).
     """
     rows = np.atleast_2d(constraints) if np.size(constraints) else np.zeros((0, size))
-    single = np.count_nonzero(rows, axis=1) == 1
-    dropped = {int(np.flatnonzero(row)[0]) for row in rows[single]}
-    kept = [k for k in range(size) if k not in dropped]
-    basis = np.eye(size)[:, kept]
+    present = rows != 0.0
+    single = present.sum(axis=1) == 1
+    keep = ~present[single].any(axis=0)
+    basis = np.eye(size)[:, keep]
+    if single.all():
+        return basis
     rest = rows[~single] @ basis
     rest = rest[np.any(rest != 0.0, axis=1)]
     return basis @ np.asarray(null_space(rest), dtype=np.float64) if len(rest) else basis

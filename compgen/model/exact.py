@@ -156,7 +156,11 @@ def level_rotations(eps_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
     R(eps + d) = R(J_l d) R(eps) to first order in d.
     """
     square = np.einsum("ij,ij->i", eps_rad, eps_rad)
-    first, second = _sine_ratios(np.sqrt(square))
+    if square.size and square.max() > 1e-4:
+        first, second = _sine_ratios(np.sqrt(square))
+    else:  # the series is exact to the last digit for angles below 0.01 rad
+        first = 1 - square / 6 * (1 - square / 20)
+        second = 0.5 - square / 24 * (1 - square / 30)
     cross = cross_matrices(eps_rad)
     twice = cross @ cross
     identity = np.eye(3)
