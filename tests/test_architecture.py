@@ -21,6 +21,7 @@ ORDER = (
     ("pipeline",),
     ("report",),
     ("cli",),
+    ("__main__",),
 )
 RANK = {stage: rank for rank, stages in enumerate(ORDER) for stage in stages}
 
