@@ -24,6 +24,8 @@ from compgen.identify.parameters import ErrorParameters
 from compgen.identify.state import IntArray, State
 from compgen.model.exact import level_rotations, passing_order, travel_directions
 
+#: Numbers that a batch of stations may hold: small ones save calls, larger ones leave the cache.
+BATCH = 60_000
 #: Index into the six different entries of a symmetric 3 x 3 matrix.
 _SYMMETRIC = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
@@ -149,6 +151,7 @@ class GridProblem:
     parameters : the unknown errors.
     order : axes from the outermost body of the chain (the last to be passed) to the innermost.
     levels_mm, bases, reduced : levels of X, Y, Z, the curve bases there, and these times the free coefficients.
+    motion : from the unknowns to delta and eps at the levels of X, Y, Z in a row, shape (levels * 6, size).
     tools : the data by tool.
     station_of : station of each group (dead length).
     cell : for each reading (tool, index into the flattened (groups, n_out, n_mid * n_in)).
@@ -161,6 +164,7 @@ class GridProblem:
     levels_mm: tuple[FloatArray, FloatArray, FloatArray]
     bases: tuple[FloatArray, FloatArray, FloatArray]
     reduced: tuple[Entries, ...]
+    motion: FloatArray
     tools: tuple[ToolData, ...]
     station_of: IntArray
     cell: tuple[IntArray, IntArray]
@@ -204,19 +208,23 @@ class GridProblem:
     ) -> float:
         first, second = self.parameters.size, self.parameters.size + 3 * self.stations
         cost, force = 0.0, np.zeros_like(tips[-1])
-        for group, station in enumerate(self.station_of.tolist()):
-            sight = tips[-1] - state.stations_mm[station][:, None]
+        step = max(1, BATCH // max(1, tips[-1].size))
+        for start in range(0, self.groups, step):
+            batch = slice(start, min(start + step, self.groups))
+            station = self.station_of[batch]
+            sight = tips[-1] - state.stations_mm[station][:, None, :, None]
             distance = _lengths(sight)
-            residual = distance - data.length_mm[group]
-            residual -= state.dead_length_mm[group]
-            pull = data.weight[group] * residual
+            residual = distance - data.length_mm[batch]
+            residual -= state.dead_length_mm[batch, None, None]
+            pull = data.weight[batch] * residual
             cost += 0.5 * float(np.vdot(pull, residual))
-            gradient[second + group] -= pull.sum()
+            gradient[second + batch.start : second + batch.stop] -= pull.sum(axis=(1, 2))
             pull /= distance
-            sight *= pull[:, None, :]
-            gradient[first + 3 * station : first + 3 * station + 3] -= sight.sum(axis=2).sum(axis=0)
-            force += sight
-        _pull_back(self.parameters, bodies, tips, force, gradient)
+            sight *= pull[:, :, None, :]
+            for group, total in zip(station.tolist(), sight.sum(axis=3).sum(axis=1), strict=True):
+                gradient[first + 3 * group : first + 3 * group + 3] -= total
+            force += sight.sum(axis=0)
+        _pull_back(self, bodies, tips, force, gradient)
         return cost
 
     def predicted(self, state: State) -> list[FloatArray]:
@@ -226,8 +234,7 @@ class GridProblem:
         for data in self.tools:
             tip = _tips(bodies, data.tool_mm)[-1]
             sight = tip[None] - state.stations_mm[self.station_of][:, None, :, None]
-            distance = np.sqrt(np.einsum("glkm,glkm->glm", sight, sight))
-            found.append(distance - state.dead_length_mm[:, None, None])
+            found.append(_lengths(sight) - state.dead_length_mm[:, None, None])
         return found
 
     def residuals(self, state: State) -> FloatArray:
@@ -249,7 +256,7 @@ class GridProblem:
 
 @dataclass(frozen=True)
 class _Body:
-    """One carriage at its levels: rotation R (n, 3, 3), J_l (n, 3, 3), travel plus delta (n, 3)."""
+    """One carriage at its levels: rotation R (n, 3, 3), J_l (n, 3, 3), travel plus delta (n, 3), rows of its levels."""
 
     axis: int
     tool_side: bool
@@ -258,7 +265,7 @@ class _Body:
     shift: FloatArray
     position_mm: FloatArray
     direction_derivative: FloatArray
-    basis: FloatArray
+    rows: slice
 
 
 def _squareness(parameters: ErrorParameters, state: State) -> FloatArray:
@@ -273,30 +280,37 @@ def _bodies(problem: GridProblem, state: State) -> list[_Body]:
     """Bodies in the order in which the tool point passes them (innermost first)."""
     parameters = problem.parameters
     directions, derivatives = travel_directions(parameters.machine, _squareness(parameters, state))
-    counts = [len(levels) for levels in problem.levels_mm]
-    starts = [0, counts[0], counts[0] + counts[1]]
-    motion = np.zeros((sum(counts), 6))
-    for curve in parameters.curves:
-        axis, column = curve.error.axis, curve.error.direction + (3 if curve.error.kind == "angular" else 0)
-        value = problem.bases[axis] @ (curve.free @ state.errors[curve.columns])
-        motion[starts[axis] : starts[axis] + counts[axis], column] = value
+    motion = (problem.motion @ state.errors).reshape(-1, 6)
     rotation, jacobian = level_rotations(motion[:, 3:])
-    bodies = []
-    for axis, tool_side in passing_order(parameters.machine):
-        levels, own = problem.levels_mm[axis], slice(starts[axis], starts[axis] + counts[axis])
-        bodies.append(
-            _Body(
-                axis,
-                tool_side,
-                rotation[own],
-                jacobian[own],
-                levels[:, None] * directions[axis] + motion[own, :3],
-                levels,
-                derivatives[axis],
-                problem.bases[axis],
-            )
+    own = _level_slices(problem.levels_mm)
+    return [
+        _Body(
+            axis,
+            tool_side,
+            rotation[own[axis]],
+            jacobian[own[axis]],
+            problem.levels_mm[axis][:, None] * directions[axis] + motion[own[axis], :3],
+            problem.levels_mm[axis],
+            derivatives[axis],
+            own[axis],
         )
-    return bodies
+        for axis, tool_side in passing_order(parameters.machine)
+    ]
+
+
+def _level_slices(levels_mm: Sequence[FloatArray]) -> list[slice]:
+    """Rows of the levels of X, Y and Z where they stand one after another."""
+    bounds = np.cumsum([0, *(len(levels) for levels in levels_mm)]).tolist()
+    return [slice(bounds[axis], bounds[axis + 1]) for axis in range(3)]
+
+
+def _motion_map(parameters: ErrorParameters, levels_mm: Sequence[FloatArray], reduced: Sequence[Entries]) -> FloatArray:
+    own = _level_slices(levels_mm)
+    matrix = np.zeros((own[2].stop, 6, parameters.size))
+    for curve, entries in zip(parameters.curves, reduced, strict=True):
+        column = curve.error.direction + (3 if curve.error.kind == "angular" else 0)
+        matrix[own[curve.error.axis].start + entries.level, column, entries.column] = entries.value
+    return matrix.reshape(-1, parameters.size)
 
 
 def _tips(bodies: Sequence[_Body], tool_mm: FloatArray) -> list[FloatArray]:
@@ -310,11 +324,11 @@ def _tips(bodies: Sequence[_Body], tool_mm: FloatArray) -> list[FloatArray]:
 
 
 def _lengths(vectors: FloatArray) -> FloatArray:
-    """Lengths of vectors (n, 3, m): shape (n, m)."""
+    """Lengths of vectors (..., 3, m): shape (..., m)."""
     squares = vectors * vectors
-    total = squares[:, 0] + squares[:, 1]
-    total += squares[:, 2]
-    return np.sqrt(total, out=total)
+    total = squares[..., 0, :] + squares[..., 1, :]
+    total += squares[..., 2, :]
+    return np.asarray(np.sqrt(total, out=total))
 
 
 def _flat(points: FloatArray) -> FloatArray:
@@ -323,22 +337,19 @@ def _flat(points: FloatArray) -> FloatArray:
 
 
 def _pull_back(
-    parameters: ErrorParameters,
+    problem: GridProblem,
     bodies: Sequence[_Body],
     tips: Sequence[FloatArray],
     force: FloatArray,
     gradient: FloatArray,
 ) -> None:
     """Add the gradient by the errors for forces on the tips (n_out, 3, m): back along the chain, body by body."""
+    parameters = problem.parameters
     first = parameters.size - len(parameters.squareness)
-    slots = {
-        (curve.error.axis, curve.error.direction + 3 * (curve.error.kind == "angular")): curve
-        for curve in parameters.curves
-    }
+    by_motion = np.empty((len(problem.motion) // 6, 6))
     for body, before in zip(reversed(bodies), reversed(tips[:-1]), strict=True):
-        flat = _flat(before)
         turned = body.rotation.transpose(0, 2, 1) @ force
-        arm = turned @ flat.T  # [level, force component, arm component]
+        arm = turned @ _flat(before).T  # [level, force component, arm component]
         moment = arm[:, (2, 0, 1), (1, 2, 0)] - arm[:, (1, 2, 0), (2, 0, 1)]
         total = turned.sum(axis=2)
         if body.tool_side:
@@ -346,17 +357,15 @@ def _pull_back(
         else:
             by_delta = total
             moment += np.cross(body.shift, total)
-        by_eps = (body.jacobian.transpose(0, 2, 1) @ (body.rotation @ moment[:, :, None]))[:, :, 0]
-        nodal = body.basis.T @ np.hstack([by_delta, by_eps])
-        for column in range(6):
-            curve = slots.get((body.axis, column))
-            if curve is not None:
-                gradient[curve.columns] += nodal[:, column] @ curve.free
-        by_direction = body.position_mm @ by_delta
-        for k, name in enumerate(parameters.squareness):
-            derivative = body.direction_derivative[:, SQUARENESS_NAMES.index(name)]
-            gradient[first + k] += float(by_direction @ derivative)
+        by_motion[body.rows, :3] = by_delta
+        by_eps = body.jacobian.transpose(0, 2, 1) @ (body.rotation @ moment[:, :, None])
+        by_motion[body.rows, 3:] = by_eps[:, :, 0]
+        if parameters.squareness:
+            by_squareness = (body.position_mm @ by_delta) @ body.direction_derivative
+            for k, name in enumerate(parameters.squareness):
+                gradient[first + k] += by_squareness[SQUARENESS_NAMES.index(name)]
         force = turned.sum(axis=0).reshape(3, before.shape[0], before.shape[2]).transpose(1, 0, 2)
+    gradient[: parameters.size] += by_motion.ravel() @ problem.motion
 
 
 def _add_normal(problem: GridProblem, data: ToolData, tip: FloatArray, state: State, matrix: FloatArray) -> None:
@@ -598,6 +607,7 @@ def grid_problem(
     station_of[group] = station
     shape = (groups, len(levels[out]), size_mid * size_in)
     bases = tuple(parameters.basis(axis, levels[axis]) for axis in range(3))
+    reduced = reduced_entries(parameters, bases)
     nothing = np.zeros((0, 0, 0))
     empty = [ToolData(offset, nothing, nothing) for offset in tools]
     cell = (tool.astype(np.int64), index.astype(np.int64))
@@ -608,7 +618,8 @@ def grid_problem(
         order=order,  # type: ignore[arg-type]
         levels_mm=tuple(levels),  # type: ignore[arg-type]
         bases=bases,  # type: ignore[arg-type]
-        reduced=reduced_entries(parameters, bases),
+        reduced=reduced,
+        motion=_motion_map(parameters, levels, reduced),
         tools=merged,
         station_of=station_of,
         cell=cell,
