@@ -12,24 +12,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
-from scipy.linalg.lapack import dpotri
 
 from compgen.core.csvio import FloatArray
-from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
-from compgen.core.names import AXES, ERROR_NAMES, MM_PER_UM
+from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
+from compgen.identify.adjustment import Adjustment
 from compgen.identify.grid_problem import GridProblem, grid_problem, start_moments
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
 from compgen.identify.outliers import accepted_readings, explain_rejected
-from compgen.identify.parameters import ErrorParameters, error_parameters
+from compgen.identify.parameters import error_parameters
 from compgen.identify.problem import LengthProblem, length_problem
 from compgen.identify.rank import Rank, analyse_rank
-from compgen.identify.result import Identification, StationResult
+from compgen.identify.result import Identification, StationResult, worst_uncertainty
 from compgen.identify.solver import Factor, Solution, factorise, solve
 from compgen.identify.start import StationStart, station_start, station_start_from_moments
 from compgen.identify.state import IntArray, State
+from compgen.identify.tables import error_table, inverse, metadata_of, unobservable
 from compgen.identify.threads import one_thread
 from compgen.model.observability import modelled_errors
 from compgen.model.volumetric import tool_of
@@ -261,9 +261,9 @@ def _result(
     used = residual if accepted.all() else residual[accepted]
     chi_square = float(np.sum((used / (sigma_mm if accepted.all() else sigma_mm[accepted])) ** 2)) / freedom
     u_scale = float(np.sqrt(chi_square)) if noise.source == "assumed" else max(1.0, float(np.sqrt(chi_square)))
-    covariance = _inverse(solution.factor) * (float(sigma_mm.min()) * u_scale) ** 2
-    errors = _error_table(layout, solution.state.errors, covariance[: layout.size, : layout.size])
-    errors = errors.replace(metadata=_metadata(task.machine, task.lengths))
+    covariance = inverse(solution.factor) * (float(sigma_mm.min()) * u_scale) ** 2
+    errors = error_table(layout, solution.state.errors, covariance[: layout.size, : layout.size])
+    errors = errors.replace(metadata=metadata_of(task.machine, task.lengths.metadata))
     rejected = np.flatnonzero(~accepted)
     return Identification(
         errors=errors,
@@ -277,48 +277,23 @@ def _result(
         u_length_um=noise.constant_um,
         u_length_um_per_m=noise.proportional_um_per_m,
         u_scale=u_scale,
-        unobservable=_unobservable(layout),
+        unobservable=unobservable(layout),
         rejected=explain_rejected(task.lengths, layout, solution.state, task.group, rejected, residual, sigma_mm),
         rank=problem.size if rank is None else rank.rank,
         unknowns=problem.size,
         condition=1.0 / solution.factor.rcond,
         iterations=solution.iterations,
-        worst_u=_worst_u(errors),
+        worst_u=worst_uncertainty(errors),
         covariance=covariance[: layout.size, : layout.size],
         layout=layout,
+        adjustment=Adjustment(
+            state=solution.state,
+            factor=solution.factor,
+            weight=(float(sigma_mm.min()) / sigma_mm) ** 2 * accepted,
+            group=task.group,
+            sigma_mm=float(sigma_mm.min()) * u_scale,
+        ),
     )
-
-
-def _inverse(factor: Factor) -> FloatArray:
-    lower, _ = dpotri(factor.lower, lower=1)
-    full: FloatArray = np.tril(lower)
-    full += np.tril(lower, -1).T
-    full *= factor.scale
-    full *= factor.scale[:, None]
-    return full
-
-
-def _error_table(layout: ErrorParameters, unknowns: FloatArray, covariance: FloatArray) -> ErrorTable:
-    positions = [layout.output_positions_mm(axis) for axis in range(3)]
-    bases = [layout.basis(axis, positions[axis]) for axis in range(3)]
-    curves = {}
-    for curve in layout.curves:
-        reduced = bases[curve.error.axis] @ curve.free
-        block = covariance[curve.columns, curve.columns]
-        u = np.sqrt(np.maximum(np.sum((reduced @ block) * reduced, axis=1), 0.0))
-        curves[curve.error.name] = Curve(positions[curve.error.axis], reduced @ unknowns[curve.columns], u)
-    first = layout.size - len(layout.squareness)
-    squareness = {
-        name: (float(unknowns[first + k]), float(np.sqrt(covariance[first + k, first + k])))
-        for k, name in enumerate(layout.squareness)
-    }
-    return ErrorTable(curves, squareness)
-
-
-def _metadata(machine: Machine, lengths: Lengths) -> dict[str, str]:
-    reference = " ".join(f"{value:g}" for value in machine.reference_point_mm)
-    kept = {key: lengths.metadata[key] for key in ("date",) if key in lengths.metadata}
-    return {"machine": machine.name, **kept, "source": "compgen identify", "reference_point_mm": reference}
 
 
 def _stations(
@@ -351,25 +326,3 @@ def _stations(
             )
         )
     return tuple(results)
-
-
-def _unobservable(layout: ErrorParameters) -> tuple[str, ...]:
-    identified = {curve.error.name for curve in layout.curves} | set(layout.squareness)
-    missing = [name for name in ERROR_NAMES if name not in identified]
-    return tuple(
-        f"{name}: no lever arm but its own axis' travel or one tool offset on chain {layout.machine.chain.name}"
-        for name in missing
-    )
-
-
-def _worst_u(errors: ErrorTable) -> dict[str, tuple[float, str]]:
-    worst: dict[str, tuple[float, str]] = {"um": (0.0, ""), "urad": (0.0, "")}
-    for name, curve in errors.curves.items():
-        unit = "um" if name[1] in "XYZ" else "urad"
-        value = float(curve.u.max()) * (1e3 if unit == "um" else 1e6)
-        if value > worst[unit][0]:
-            worst[unit] = (value, name)
-    for name, (_, u) in errors.squareness.items():
-        if u * 1e6 > worst["urad"][0]:
-            worst["urad"] = (u * 1e6, name)
-    return worst

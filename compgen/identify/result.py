@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.names import MM_PER_UM
+from compgen.identify.adjustment import Adjustment
 from compgen.identify.outliers import Rejected
 from compgen.identify.parameters import ErrorParameters
+from compgen.identify.systematic import Systematic
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,8 @@ class Identification:
     worst_u : largest standard uncertainty by unit ("um", "urad") with its error.
     covariance : of the unknown errors in the order of ``unknowns`` of the layout, mm and rad.
     layout : the unknown errors and their bases.
+    adjustment : the optimum with its factor, for the joint covariance and for systematic inputs; None if there is none.
+    systematic : what systematic inputs contribute, and is part of the standard uncertainties then; None if none is.
     """
 
     errors: ErrorTable
@@ -70,6 +74,8 @@ class Identification:
     worst_u: dict[str, tuple[float, str]]
     covariance: FloatArray
     layout: ErrorParameters
+    adjustment: Adjustment | None = None
+    systematic: Systematic | None = None
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``identify.json``."""
@@ -100,4 +106,19 @@ class Identification:
                 name: {"value": value * 1e6, "u": u * 1e6} for name, (value, u) in self.errors.squareness.items()
             },
             "stations": [asdict(station) for station in self.stations],
+            "systematic": None if self.systematic is None else self.systematic.summary(),
         }
+
+
+def worst_uncertainty(errors: ErrorTable) -> dict[str, tuple[float, str]]:
+    """Return the largest standard uncertainty by unit ("um", "urad") with its error."""
+    worst: dict[str, tuple[float, str]] = {"um": (0.0, ""), "urad": (0.0, "")}
+    for name, curve in errors.curves.items():
+        unit = "um" if name[1] in "XYZ" else "urad"
+        value = float(curve.u.max()) * (1e3 if unit == "um" else 1e6)
+        if value > worst[unit][0]:
+            worst[unit] = (value, name)
+    for name, (_, u) in errors.squareness.items():
+        if u * 1e6 > worst["urad"][0]:
+            worst["urad"] = (u * 1e6, name)
+    return worst
