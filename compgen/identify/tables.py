@@ -1,0 +1,60 @@
+"""What every method of identification hands on: error curves with uncertainties, and what is said about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.linalg.lapack import dpotri
+
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.names import ERROR_NAMES
+from compgen.identify.parameters import ErrorParameters
+from compgen.identify.solver import Factor
+
+
+def inverse(factor: Factor) -> FloatArray:
+    """Return the inverse of the normal matrix that a factor belongs to, (size, size)."""
+    lower, _ = dpotri(factor.lower, lower=1)
+    full: FloatArray = np.tril(lower)
+    full += np.tril(lower, -1).T
+    full *= factor.scale
+    full *= factor.scale[:, None]
+    return full
+
+
+def error_table(layout: ErrorParameters, unknowns: FloatArray, covariance: FloatArray) -> ErrorTable:
+    """Return curves and squareness for the unknown errors (size,) and their covariance (size, size), mm and rad."""
+    positions = [layout.output_positions_mm(axis) for axis in range(3)]
+    bases = [layout.basis(axis, positions[axis]) for axis in range(3)]
+    curves = {}
+    for curve in layout.curves:
+        reduced = bases[curve.error.axis] @ curve.free
+        block = covariance[curve.columns, curve.columns]
+        u = np.sqrt(np.maximum(np.sum((reduced @ block) * reduced, axis=1), 0.0))
+        curves[curve.error.name] = Curve(positions[curve.error.axis], reduced @ unknowns[curve.columns], u)
+    first = layout.size - len(layout.squareness)
+    squareness = {
+        name: (float(unknowns[first + k]), float(np.sqrt(covariance[first + k, first + k])))
+        for k, name in enumerate(layout.squareness)
+    }
+    return ErrorTable(curves, squareness)
+
+
+def metadata_of(machine: Machine, metadata: Mapping[str, str]) -> dict[str, str]:
+    """Return the comments of the errors file; ``metadata`` is that of the measurement."""
+    reference = " ".join(f"{value:g}" for value in machine.reference_point_mm)
+    kept = {key: metadata[key] for key in ("date",) if key in metadata}
+    return {"machine": machine.name, **kept, "source": "compgen identify", "reference_point_mm": reference}
+
+
+def unobservable(layout: ErrorParameters) -> tuple[str, ...]:
+    """Say in words which of the 21 errors the model leaves out, and why."""
+    identified = {curve.error.name for curve in layout.curves} | set(layout.squareness)
+    missing = [name for name in ERROR_NAMES if name not in identified]
+    return tuple(
+        f"{name}: no lever arm but its own axis' travel or one tool offset on chain {layout.machine.chain.name}"
+        for name in missing
+    )
