@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.export import REJECTED_PREFIX, Export, Provenance, export, usable_format
 from compgen.fit import FitOptions, FitResult, fit
-from compgen.identify import Identification, IdentifyOptions, identify
+from compgen.identify import Identification, IdentifyOptions, covariance, identify
 from compgen.verify import Verification, read_tables, verify
 
 Progress = Callable[[str], None]
@@ -55,8 +55,8 @@ def provenance_of(*paths: str | Path | None) -> Provenance:
     return Provenance(tuple((path.name, sha256_of(read_bytes(path))) for path in files))
 
 
-def identification_files(result: Identification, provenance: Provenance) -> dict[str, str]:
-    """Return the texts of ``identified.errors.csv``, ``stations.csv`` and ``identify.json``."""
+def identification_files(result: Identification, provenance: Provenance) -> dict[str, str | bytes]:
+    """Return the contents of ``identified.errors.csv`` and its covariance, ``stations.csv`` and ``identify.json``."""
     stations = result.stations
     columns: dict[str, Sequence[str] | FloatArray] = {
         "station": [item.station for item in stations],
@@ -72,10 +72,18 @@ def identification_files(result: Identification, provenance: Provenance) -> dict
     }
     summary = {**result.summary(), "inputs": [{"name": name, "sha256": digest} for name, digest in provenance.inputs]}
     return {
-        "identified.errors.csv": format_errors(result.errors),
+        **_errors_files(result),
         "stations.csv": format_csv(columns, {"machine": result.errors.metadata.get("machine", "")}),
         "identify.json": json.dumps(summary, indent=2) + "\n",
     }
+
+
+def _errors_files(result: Identification) -> dict[str, str | bytes]:
+    if result.adjustment is None:
+        return {"identified.errors.csv": format_errors(result.errors)}
+    text = format_errors(result.errors, {"covariance": covariance.FILE_NAME})
+    content = covariance.format_covariance(covariance.joint_covariance(result), text)
+    return {"identified.errors.csv": text, covariance.FILE_NAME: content}
 
 
 def fit_files(result: FitResult) -> dict[str, str]:
@@ -86,8 +94,8 @@ def fit_files(result: FitResult) -> dict[str, str]:
     }
 
 
-def write_all(folder: str | Path, files: dict[str, str]) -> dict[str, Path]:
-    """Write a set of texts together, all or none."""
+def write_all(folder: str | Path, files: Mapping[str, str | bytes]) -> dict[str, Path]:
+    """Write a set of files together, all or none."""
     output = OutputFolder(folder)
     for name, text in files.items():
         output.add(name, text)

@@ -110,6 +110,7 @@ def test_run_writes_everything_and_exits_with_0(call, small_machine_file, small_
     assert sorted(path.name for path in out.iterdir()) == [
         "fit.json",
         "fitted.errors.csv",
+        "identified.covariance.npz",
         "identified.errors.csv",
         "identify.json",
         "manifest.json",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -13,9 +15,25 @@ from compgen.core.lengths import read_lengths
 from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.fit import FitOptions, fit
-from compgen.identify import IdentifyOptions, identify
+from compgen.identify import IdentifyOptions, SystematicInputs, identify
 from compgen.pipeline import fit_files, identification_files, provenance_of, write_all
 from compgen.report.text import fit_table, identification_table
+
+#: Options --u-... and the fields of SystematicInputs that they fill.
+SYSTEMATIC_OPTIONS = (
+    ("wavelength_ppm", "wavelength_ppm"),
+    ("temperature_k", "temperature_k"),
+    ("target_um", "target_um"),
+    ("target_station_um", "target_station_um"),
+    ("drift_um", "drift_um"),
+)
+SYSTEMATIC_HELP = {
+    "wavelength_ppm": "Standard uncertainty of the length scale of all stations together, 1e-6 (default 0).",
+    "temperature_k": "Standard uncertainty of each axis' temperature, K; acts with expansion_um_per_m_k (default 0).",
+    "target_um": "Standard uncertainty of the target's position on the tool, um, for every tool and set-up (default 0).",
+    "target_station_um": "The same, for every tool, set-up and station by itself, um (default 0).",
+    "drift_um": "Standard uncertainty of each station's drift from its first to its last reading, um (default 0).",
+}
 
 
 def instrument_options(command: Command) -> Command:
@@ -30,15 +48,32 @@ def instrument_options(command: Command) -> Command:
     return constant(proportional(keep(command)))
 
 
+def systematic_options(command: Command) -> Command:
+    """Add the uncertainties of inputs that all readings share; the command receives ``systematic``."""
+
+    @functools.wraps(command)
+    def wrapper(*args: Any, **options: Any) -> Any:
+        values = {key: options.pop(f"u_{name}") for name, key in SYSTEMATIC_OPTIONS}
+        return command(*args, systematic=SystematicInputs(**values), **options)
+
+    decorated: Any = wrapper
+    for name, key in reversed(SYSTEMATIC_OPTIONS):
+        option = f"--u-{name.replace('_', '-')}"
+        decorated = click.option(option, type=float, default=0.0, help=SYSTEMATIC_HELP[key])(decorated)
+    return decorated  # type: ignore[no-any-return]
+
+
 def smoothness_option(command: Command) -> Command:
     """Add --smoothness."""
     text = "Dimensionless weight of the second differences (0 keeps the data); default: chosen from the data."
     return click.option("--smoothness", type=float, help=text)(command)
 
 
-def identify_options(u_length_um: float | None, u_length_um_per_m: float | None, keep_all: bool) -> IdentifyOptions:
+def identify_options(
+    u_length_um: float | None, u_length_um_per_m: float | None, keep_all: bool, systematic: SystematicInputs
+) -> IdentifyOptions:
     """Return the options of the stage."""
-    return IdentifyOptions(u_length_um, u_length_um_per_m, reject=not keep_all)
+    return IdentifyOptions(u_length_um, u_length_um_per_m, reject=not keep_all, systematic=systematic)
 
 
 def fit_options(smoothness: float | None) -> FitOptions:
@@ -52,6 +87,7 @@ def fit_options(smoothness: float | None) -> FitOptions:
 @click.option("--instrument", type=click.Path(path_type=Path), help="Constants of a six-DOF instrument (TOML).")
 @out_option
 @instrument_options
+@systematic_options
 @json_option
 def identify_command(
     machine: Machine,
@@ -61,11 +97,13 @@ def identify_command(
     u_length_um: float | None,
     u_length_um_per_m: float | None,
     keep_all: bool,
+    systematic: SystematicInputs,
     as_json: bool,
 ) -> int:
     """Identify error curves, squareness and stations from tracer lengths.
 
-    Writes identified.errors.csv (um, urad, standard uncertainties), stations.csv and identify.json to DIR. Without
+    Writes identified.errors.csv (um, urad, standard uncertainties) with identified.covariance.npz, stations.csv and
+    identify.json to DIR. The uncertainties hold the readings' noise and the inputs given by --u-.... Without
     --u-length-um the comments u_length_um and u_length_um_per_m of the file count, else 0.1 um + 0.15 um/m.
 
     \b
@@ -81,7 +119,7 @@ def identify_command(
         show("reading the measurement")
         lengths = read_lengths(measurements)
         show(f"identifying: {len(lengths)} lengths of {len(lengths.stations)} stations")
-        result = identify(machine, lengths, identify_options(u_length_um, u_length_um_per_m, keep_all))
+        result = identify(machine, lengths, identify_options(u_length_um, u_length_um_per_m, keep_all, systematic))
     write_all(out, identification_files(result, provenance_of(machine.source, *measurements)))
     if as_json:
         print_json(result.summary())

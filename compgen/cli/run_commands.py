@@ -15,8 +15,15 @@ from compgen.cli.common import (
     progress,
     stdout,
 )
-from compgen.cli.identify_commands import fit_options, identify_options, instrument_options, smoothness_option
+from compgen.cli.identify_commands import (
+    fit_options,
+    identify_options,
+    instrument_options,
+    smoothness_option,
+    systematic_options,
+)
 from compgen.core.machine import Machine
+from compgen.identify import SystematicInputs
 from compgen.pipeline import run
 from compgen.report.text import identification_table, run_json, verification_table
 
@@ -27,6 +34,7 @@ from compgen.report.text import identification_table, run_json, verification_tab
 @controller_option(multiple=True)
 @out_option
 @instrument_options
+@systematic_options
 @smoothness_option
 @click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
@@ -39,6 +47,7 @@ def run_command(
     u_length_um: float | None,
     u_length_um_per_m: float | None,
     keep_all: bool,
+    systematic: SystematicInputs,
     smoothness: float | None,
     templates: Path | None,
     allow_unverified: bool,
@@ -59,7 +68,7 @@ def run_command(
             measurements,
             tuple(dict.fromkeys(controller)),
             out,
-            identify_options=identify_options(u_length_um, u_length_um_per_m, keep_all),
+            identify_options=identify_options(u_length_um, u_length_um_per_m, keep_all, systematic),
             fit_options=fit_options(smoothness),
             templates=templates,
             allow_unverified=allow_unverified,

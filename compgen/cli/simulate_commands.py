@@ -7,10 +7,12 @@ from pathlib import Path
 import click
 
 from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
-from compgen.core.error_table import read_errors
+from compgen.core.error_table import ErrorTable, read_errors
 from compgen.core.files import write_file
 from compgen.core.machine import Machine
 from compgen.core.points import format_points, read_points
+from compgen.errors import InputError
+from compgen.identify import Covariance, predict_uncertainty, read_covariance
 from compgen.model import predict
 from compgen.simulate import read_scenario, simulate, write_simulation
 from compgen.verify import residuals
@@ -48,28 +50,62 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
 @click.option("--points", required=True, type=click.Path(path_type=Path), help="*.points.csv (mm).")
 @click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="CSV file for the result.")
 @click.option("--exact", is_flag=True, help="Finite rotations along the chain in place of E = C P.")
+@click.option(
+    "--uncertainty",
+    is_flag=False,
+    flag_value="",
+    metavar="[FILE]",
+    help="Add standard uncertainties; FILE is the covariance (default: the file that ERRORS names).",
+)
 @json_option
-def predict_command(machine: Machine, errors: Path, points: Path, out: Path, exact: bool, as_json: bool) -> int:
+def predict_command(
+    machine: Machine, errors: Path, points: Path, out: Path, exact: bool, uncertainty: str | None, as_json: bool
+) -> int:
     """Predict the error of the tool tip at given points: E = C P, or the exact model.
 
-    ERRORS is an *.errors.csv file (um, urad). FILE gets the points plus ex_um, ey_um, ez_um.
+    ERRORS is an *.errors.csv file (um, urad). FILE gets the points plus ex_um, ey_um, ez_um, and with --uncertainty
+    u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that compgen identify wrote.
 
     \b
-    Example:
+    Examples:
       compgen predict zha-gantry fitted/fitted.errors.csv --points p.points.csv --out predicted.csv
+      compgen predict zha-gantry i/identified.errors.csv --points p.points.csv --out predicted.csv --uncertainty
     """
     where = read_points(points)
-    error_mm = predict(machine, read_errors(errors), where, exact=exact)
+    table = read_errors(errors)
+    covariance = None if uncertainty is None else _covariance(errors, table, uncertainty)
+    error_mm = predict(machine, table, where, exact=exact)
     columns = {f"e{axis}_um": error_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
+    extra: dict[str, float] = {}
+    if covariance is not None:
+        u_um = predict_uncertainty(machine, covariance, where) * 1e3
+        columns |= {f"u_{axis}_um": u_um[:, k] for k, axis in enumerate("xyz")}
+        extra = {f"u_{axis}_max_um": float(u_um[:, k].max()) for k, axis in enumerate("xyz")}
     model = "exact" if exact else "E = C P"
     write_file(out, format_points(where, columns, {"machine": machine.name, "model": model}))
     figures = residuals(error_mm)
     if as_json:
-        print_json({"points": len(where), "model": model, **figures.as_dict(), "file": str(out)})
+        print_json({"points": len(where), "model": model, **figures.as_dict(), **extra, "file": str(out)})
     else:
         text = f"{len(where)} points, {model}: max {figures.max_um:.2f} um, rms {figures.rms_um:.2f} um -> {out}"
         stdout.print(text, markup=False, soft_wrap=True)
+        if extra:
+            stdout.print(f"largest standard uncertainty: x, y, z {', '.join(f'{u:.3f}' for u in extra.values())} um")
     return 0
+
+
+def _covariance(errors: Path, table: ErrorTable, file: str) -> Covariance:
+    """Return the covariance of an errors file: the one given, else the one that the errors file names."""
+    if file:
+        return read_covariance(file, errors)
+    name = table.metadata.get("covariance")
+    if name is None:
+        raise InputError(
+            "names no covariance file (# covariance = ...), so --uncertainty knows none; only the files of compgen "
+            "identify and run have one: give it by --uncertainty FILE",
+            file=errors,
+        )
+    return read_covariance(errors.parent / name, errors)
 
 
 COMMANDS = (simulate_command, predict_command)

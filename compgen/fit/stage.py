@@ -36,10 +36,11 @@ def fit(machine: Machine, errors: ErrorTable, options: FitOptions = _DEFAULT) ->
     zeroed = zero_ends(machine, _as_independent(machine, errors))
     fitted = {name: fit_curve(name, held, options) for name, held in zeroed.curves.items()}
     reference = ", ".join(f"{value:g}" for value in machine.reference_point_mm)
+    kept = {key: value for key, value in errors.metadata.items() if key != "covariance"}  # that of the unfitted values
     table = ErrorTable(
         curves={name: curve for name, (curve, _) in fitted.items()},
         squareness=zeroed.squareness,
-        metadata={**errors.metadata, "reference_point_mm": reference},
+        metadata={**kept, "reference_point_mm": reference},
     )
     return FitResult(table, {name: report for name, (_, report) in fitted.items()}, zeroed.change)
 

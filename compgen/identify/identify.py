@@ -19,6 +19,7 @@ from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjustment import Adjustment
+from compgen.identify.covariance import with_systematic
 from compgen.identify.grid_problem import GridProblem, grid_problem, start_moments
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
 from compgen.identify.outliers import accepted_readings, explain_rejected
@@ -58,7 +59,7 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
     ----------
     machine : chain, nodes, reference point and which errors its model contains.
     lengths : readings of three or more stations (one tracer at three or more places counts as so many).
-    options : uncertainty of the readings, rejection.
+    options : uncertainty of the readings and of inputs that they share, rejection.
 
     Raises
     ------
@@ -69,8 +70,9 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
     ConvergenceError
         if no optimum is reached.
     """
+    chosen = options or IdentifyOptions()
     with one_thread():
-        return _identify(machine, lengths, options or IdentifyOptions())
+        return with_systematic(machine, lengths, _identify(machine, lengths, chosen), chosen.systematic)
 
 
 def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification:

@@ -10,6 +10,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.names import MM_PER_UM
 from compgen.errors import InputError
+from compgen.identify.systematic import SystematicInputs
 
 #: Standard uncertainty of a laser tracer's length when neither the file nor the user states one: half of the usual
 #: statement 0.2 um + 0.3 um/m at k = 2.
@@ -23,12 +24,13 @@ class IdentifyOptions:
 
     ``u_length_um`` and ``u_length_um_per_m`` are the standard uncertainty a + b L of a reading; without them the
     comments of that name in the file count, else the usual statement of a laser tracer. ``reject`` False keeps all
-    readings.
+    readings. ``systematic`` are the uncertainties of inputs that all readings share.
     """
 
     u_length_um: float | None = None
     u_length_um_per_m: float | None = None
     reject: bool = True
+    systematic: SystematicInputs = SystematicInputs()
 
 
 @dataclass(frozen=True)

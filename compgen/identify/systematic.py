@@ -154,7 +154,7 @@ def _temperature(machine: Machine, lengths: Lengths, sight: Sight) -> FloatArray
             )
         expansion.append(1e-6 * axis.expansion_um_per_m_k)
     lever_mm = lengths.position_mm - np.array(machine.reference_point_mm)
-    return sight.unit * lever_mm * np.array(expansion)
+    return np.asarray(sight.unit * lever_mm * np.array(expansion))
 
 
 def _target(machine: Machine, lengths: Lengths, sight: Sight) -> FloatArray:

@@ -1,0 +1,334 @@
+"""The joint covariance of identified errors and stations, in memory and as ``identified.covariance.npz``.
+
+It is kept as a factor F with F F^T the covariance, one row for every value of the errors file and for every station
+coordinate and dead length. The uncertainty of E = C P at a point is then the length of a row of (C B) F: the
+covariance of E itself is never formed.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.files import read_bytes, sha256_of
+from compgen.core.lengths import Lengths
+from compgen.core.machine import Machine
+from compgen.core.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
+from compgen.core.points import Points
+from compgen.errors import InputError
+from compgen.identify.parameters import ErrorParameters
+from compgen.identify.result import Identification, worst_uncertainty
+from compgen.identify.systematic import Contribution, Systematic, SystematicInputs, responses
+from compgen.model.basis import hat_matrix
+from compgen.model.volumetric import c_matrix
+
+FILE_NAME = "identified.covariance.npz"
+FORMAT = "compgen covariance 1"
+#: Points whose rows of C B are made together.
+CHUNK = 1024
+_MEMBERS = ("format", "machine", "errors_sha256", "error", "position_mm", "unit", "station", "setup", "factor")
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Covariance of k error values, S stations and g dead lengths, all in mm and rad.
+
+    Parameters
+    ----------
+    error, position_mm : name and position (k,) of each error value, in the order of the errors file; the position of a
+        squareness error is nan.
+    station, setup : name and set-up of each dead length (g,); the stations stand in the order of first mention.
+    factor : shape (k + 3 S + g, r); ``factor @ factor.T`` is the covariance: error values, then x, y, z of every
+        station, then dead lengths.
+    machine, errors_sha256 : name of the machine, and SHA-256 of the errors file that it belongs to ("" for none).
+    """
+
+    error: tuple[str, ...]
+    position_mm: FloatArray
+    station: tuple[str, ...]
+    setup: NDArray[np.int64]
+    factor: FloatArray
+    machine: str = ""
+    errors_sha256: str = ""
+
+    @property
+    def stations(self) -> tuple[str, ...]:
+        """Names of the stations, S of them."""
+        return tuple(dict.fromkeys(self.station))
+
+    @property
+    def errors_factor(self) -> FloatArray:
+        """Rows of the factor that belong to the error values, (k, r)."""
+        return self.factor[: len(self.error)]
+
+    @property
+    def errors_covariance(self) -> FloatArray:
+        """Covariance of the error values, (k, k), mm and rad."""
+        return self.errors_factor @ self.errors_factor.T
+
+    @property
+    def stations_covariance(self) -> FloatArray:
+        """Covariance of the station coordinates, (3 S, 3 S), mm^2."""
+        first = len(self.error)
+        rows = self.factor[first : first + 3 * len(self.stations)]
+        return rows @ rows.T
+
+
+def error_values(layout: ErrorParameters) -> Iterator[tuple[str, FloatArray, slice, FloatArray]]:
+    """Yield name, positions (m,), columns and matrix (m, columns) that make the values in the errors file."""
+    positions = [layout.output_positions_mm(axis) for axis in range(3)]
+    bases = [layout.basis(axis, positions[axis]) for axis in range(3)]
+    for curve in layout.curves:
+        axis = curve.error.axis
+        yield curve.error.name, positions[axis], curve.columns, bases[axis] @ curve.free
+    first = layout.size - len(layout.squareness)
+    for k, name in enumerate(layout.squareness):
+        yield name, np.array([np.nan]), slice(first + k, first + k + 1), np.eye(1)
+
+
+def covariance_from_factor(
+    layout: ErrorParameters, factor: FloatArray, stations: Sequence[tuple[str, int]]
+) -> Covariance:
+    """Build a :class:`Covariance` from a factor (unknowns, r) of the covariance of all unknowns.
+
+    ``stations`` holds name and set-up of each dead length; the unknowns are errors, stations, dead lengths.
+    """
+    names: list[str] = []
+    positions, rows = [], []
+    for name, position_mm, columns, matrix in error_values(layout):
+        names += [name] * len(position_mm)
+        positions.append(position_mm)
+        rows.append(matrix @ factor[columns])
+    return Covariance(
+        error=tuple(names),
+        position_mm=np.concatenate(positions),
+        station=tuple(name for name, _ in stations),
+        setup=np.array([setup for _, setup in stations], dtype=np.int64),
+        factor=np.vstack([*rows, factor[layout.size :]]),
+        machine=layout.machine.name,
+    )
+
+
+def joint_covariance(result: Identification) -> Covariance:
+    """Return the covariance of everything that was identified, systematic inputs included."""
+    if result.adjustment is None:
+        raise ValueError("this identification keeps no joint covariance")
+    factor = result.adjustment.covariance_factor()
+    if result.systematic is not None:
+        factor = np.hstack([factor, result.systematic.response])
+    return covariance_from_factor(result.layout, factor, [(item.station, item.setup) for item in result.stations])
+
+
+# --- systematic inputs on top of the random part -------------------------------------------------------------------
+
+
+def with_systematic(
+    machine: Machine, lengths: Lengths, result: Identification, inputs: SystematicInputs
+) -> Identification:
+    """Return the identification with the contributions of systematic inputs added to all standard uncertainties."""
+    if result.adjustment is None or not inputs:
+        return result
+    found = responses(machine, lengths, result.layout, result.adjustment, inputs)
+    given = dict(inputs.items())
+    contributions = tuple(
+        Contribution(name, given[name], response, _worst_of(result, response)) for name, response in found.items()
+    )
+    systematic = Systematic(contributions, result.worst_u)
+    joint = joint_covariance(replace(result, systematic=systematic))
+    errors = _with_u(result.errors, joint.errors_factor)
+    u = np.sqrt(np.einsum("ij,ij->i", joint.factor, joint.factor))[len(joint.error) :]
+    order, first = {name: k for k, name in enumerate(joint.stations)}, 3 * len(joint.stations)
+    stations = tuple(
+        replace(
+            item,
+            u_position_mm=tuple(u[3 * order[item.station] : 3 * order[item.station] + 3].tolist()),
+            u_dead_length_mm=float(u[first + k]),
+        )
+        for k, item in enumerate(result.stations)
+    )
+    response = systematic.response[: result.layout.size]
+    return replace(
+        result,
+        errors=errors,
+        stations=stations,
+        covariance=result.covariance + response @ response.T,
+        worst_u=worst_uncertainty(errors),
+        systematic=systematic,
+    )
+
+
+def _worst_of(result: Identification, response: FloatArray) -> dict[str, tuple[float, str]]:
+    rows = [matrix @ response[columns] for _, _, columns, matrix in error_values(result.layout)]
+    return worst_uncertainty(_with_u(result.errors, np.vstack(rows)))
+
+
+def _with_u(errors: ErrorTable, factor: FloatArray) -> ErrorTable:
+    """Return the table with the uncertainties of a factor (values, r) whose rows stand in the order of the table."""
+    u = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    curves, squareness, first = {}, {}, 0
+    for name in errors.names:
+        if name in errors.squareness:
+            squareness[name] = (errors.squareness[name][0], float(u[first]))
+            first += 1
+        else:
+            curve = errors.curves[name]
+            curves[name] = Curve(curve.position_mm, curve.value, u[first : first + len(curve.value)])
+            first += len(curve.value)
+    return errors.replace(curves=curves, squareness=squareness)
+
+
+# --- uncertainty of E ----------------------------------------------------------------------------------------------
+
+
+def predict_uncertainty(machine: Machine, covariance: Covariance, points: Points) -> FloatArray:
+    """Return the standard uncertainty of E = C P at commanded points, shape (n, 3), mm (``docs/method.md``).
+
+    Parameters
+    ----------
+    machine : chain, tool offset and squareness reference are taken from it.
+    covariance : of the identified errors.
+    points : the points; their tool offsets count, if they have any.
+    """
+    factor = covariance.errors_factor
+    u = np.empty((len(points), 3))
+    for first in range(0, len(points), CHUNK):
+        rows = slice(first, first + CHUNK)
+        tool_mm = None if points.tool_mm is None else points.tool_mm[rows]
+        spread = error_design(machine, covariance, points.position_mm[rows], tool_mm) @ factor
+        u[rows] = np.sqrt(np.einsum("nij,nij->ni", spread, spread))
+    return u
+
+
+def error_design(
+    machine: Machine, covariance: Covariance, position_mm: FloatArray, tool_mm: FloatArray | None = None
+) -> FloatArray:
+    """Return C B at points (n, 3): derivative of E by the error values of the file, shape (n, 3, k)."""
+    matrix = c_matrix(machine, position_mm, tool_mm)
+    names = np.array(covariance.error)
+    design = np.zeros((len(position_mm), 3, len(names)))
+    for name in dict.fromkeys(covariance.error):
+        columns = np.flatnonzero(names == name)
+        column = matrix[:, :, ERROR_INDEX[name]]
+        if name in SQUARENESS_NAMES:
+            design[:, :, columns] = column[:, :, None]
+        else:
+            basis = hat_matrix(covariance.position_mm[columns], position_mm[:, error_named(name).axis])
+            design[:, :, columns] = column[:, :, None] * basis[:, None, :]
+    return design
+
+
+# --- file ----------------------------------------------------------------------------------------------------------
+
+
+def format_covariance(covariance: Covariance, errors_text: str) -> bytes:
+    """Return the contents of a ``*.covariance.npz`` file that belongs to the errors file ``errors_text``."""
+    units = ["mm" if error_named(name).kind == "linear" else "rad" for name in covariance.error]
+    members: dict[str, NDArray[np.generic]] = {
+        "format": np.array(FORMAT),
+        "machine": np.array(covariance.machine),
+        "errors_sha256": np.array(sha256_of(errors_text.encode("utf-8"))),
+        "error": np.array(covariance.error),
+        "position_mm": covariance.position_mm,
+        "unit": np.array(units),
+        "station": np.array(covariance.station),
+        "setup": covariance.setup,
+        "factor": covariance.factor,
+    }
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, array in members.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.ascontiguousarray(array).reshape(array.shape), allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))  # a fixed date: same input, same bytes
+            archive.writestr(entry, member.getvalue(), zipfile.ZIP_DEFLATED)
+    return stream.getvalue()
+
+
+def read_covariance(path: str | Path, errors: str | Path | None = None) -> Covariance:
+    """Read a ``*.covariance.npz`` file strictly.
+
+    Parameters
+    ----------
+    path : the file.
+    errors : the errors file that it has to belong to; None takes any.
+
+    Raises
+    ------
+    InputError
+        if it is another kind of file, cut, damaged, inconsistent, or belongs to another errors file.
+    """
+    source = Path(path)
+    members = _members(source, read_bytes(source))
+    covariance = _checked(source, members)
+    if errors is not None:
+        digest = sha256_of(read_bytes(errors))
+        if digest != covariance.errors_sha256:
+            raise InputError(
+                f"belongs to another errors file (SHA-256 {covariance.errors_sha256[:12]}...) than {errors} "
+                f"({digest[:12]}...); give the errors file that was written beside it, unchanged",
+                file=source,
+            )
+    return covariance
+
+
+def _members(source: Path, content: bytes) -> dict[str, NDArray[np.generic]]:
+    if not content.startswith(b"PK"):
+        raise InputError("is not a covariance file (*.covariance.npz, written by compgen identify)", file=source)
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            members = {name: archive[name] for name in archive.files}
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, OSError, KeyError, NotImplementedError) as error:
+        raise InputError(f"cannot be read: is it truncated or damaged? ({error})", file=source) from error
+    if str(members.get("format", "")) != FORMAT:
+        raise InputError(f"is not a covariance file of this version (format {FORMAT!r})", file=source)
+    missing = [name for name in _MEMBERS if name not in members]
+    if missing:
+        raise InputError(f"lacks {', '.join(missing)}; write it anew with compgen identify", file=source)
+    return members
+
+
+def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covariance:
+    try:
+        covariance = Covariance(
+            error=tuple(str(name) for name in members["error"].ravel()),
+            position_mm=np.asarray(members["position_mm"], dtype=np.float64).ravel(),
+            station=tuple(str(name) for name in members["station"].ravel()),
+            setup=np.asarray(members["setup"], dtype=np.int64).ravel(),
+            factor=np.asarray(members["factor"], dtype=np.float64),
+            machine=str(members["machine"]),
+            errors_sha256=str(members["errors_sha256"]),
+        )
+    except (ValueError, TypeError) as error:
+        raise InputError(f"holds something else than numbers where they are due: {error}", file=source) from error
+    unknown = [name for name in covariance.error if name not in ERROR_INDEX]
+    if unknown:
+        raise InputError(f"names {unknown[0]!r}, which is not one of the 21 errors", file=source)
+    count = len(covariance.error)
+    rows = count + 3 * len(covariance.stations) + len(covariance.station)
+    shapes = (covariance.position_mm.shape, covariance.setup.shape, covariance.factor.shape[:1], covariance.factor.ndim)
+    if shapes != ((count,), (len(covariance.station),), (rows,), 2):
+        raise InputError(f"its parts do not fit together: {count} error values, shapes {shapes}", file=source)
+    _check_numbers(source, covariance)
+    return covariance
+
+
+def _check_numbers(source: Path, covariance: Covariance) -> None:
+    if not np.isfinite(covariance.factor).all():
+        raise InputError("the factor holds numbers that are not finite", file=source)
+    for name in dict.fromkeys(covariance.error):
+        position = covariance.position_mm[np.array(covariance.error) == name]
+        if name in SQUARENESS_NAMES:
+            right = len(position) == 1 and bool(np.isnan(position).all())
+        else:
+            right = bool(np.isfinite(position).all() and np.all(np.diff(position) > 0))
+        if not right:
+            raise InputError(f"the positions of {name} are not those of one error in ascending order", file=source)
