@@ -249,8 +249,9 @@ class GridProblem:
         bodies = _bodies(self, state)
         for data in self.tools:
             _add_normal(self, data, _tips(bodies, data.tool_mm)[-1], state, matrix)
-        lower = np.tril_indices(self.size, -1)
-        matrix[lower] = matrix.T[lower]
+        first, second = self.parameters.size, self.parameters.size + 3 * self.stations
+        matrix[first:, :first] = matrix[:first, first:].T
+        matrix[second:, first:second] = matrix[first:second, second:].T
         return matrix
 
 
@@ -369,57 +370,67 @@ def _pull_back(
 
 
 def _add_normal(problem: GridProblem, data: ToolData, tip: FloatArray, state: State, matrix: FloatArray) -> None:
-    """Add the part of one tool to the upper triangle of the normal matrix."""
+    """Add the part of one tool to the upper blocks of the normal matrix."""
     shape = tuple(len(problem.levels_mm[axis]) for axis in problem.order)
     level = level_map(
         problem.parameters, problem.levels_mm, problem.reduced, data.tool_mm, _squareness(problem.parameters, state)
     )
-    levels = level.transposed
     first, second = problem.parameters.size, problem.parameters.size + 3 * problem.stations
     weighted = np.zeros((6, *shape))
-    for group, station in enumerate(problem.station_of.tolist()):
-        sight = tip - state.stations_mm[station][:, None]
-        unit = sight / _lengths(sight)[:, None, :]
-        moments = _outer_products(unit, data.weight[group], shape)  # 6 of w u u^T, 3 of w u, 1 of w
-        weighted += moments[:6]
-        station_part, dead_part = _station_moments(problem, level, moments)
-        columns = slice(first + 3 * station, first + 3 * station + 3)
-        matrix[:first, columns] -= levels @ station_part
-        matrix[:first, second + group] -= levels @ dead_part
-        sums = moments.sum(axis=(1, 2, 3))
-        matrix[columns, columns] += sums[_SYMMETRIC]
-        matrix[columns, second + group] += sums[6:9]
-        matrix[second + group, second + group] += sums[9]
-    matrix[:first, :first] += levels @ (levels @ _level_matrix(problem, level, weighted)).T
+    step = max(1, BATCH // tip.size)
+    for start in range(0, problem.groups, step):
+        batch = slice(start, min(start + step, problem.groups))
+        stations = problem.station_of[batch]
+        sight = tip - state.stations_mm[stations][:, None, :, None]
+        sight /= _lengths(sight)[:, :, None, :]
+        moments = _outer_products(sight, data.weight[batch], shape)  # 6 of w u u^T, 3 of w u, 1 of w
+        weighted += moments[:, :6].sum(axis=0) if len(stations) > 1 else moments[0, :6]
+        by_station, by_group = _station_moments(problem, level, moments)
+        by_station = level.transposed @ by_station  # (size, batch * 3)
+        sums = moments.reshape(len(stations), 10, -1).sum(axis=2)
+        for k, station in enumerate(stations.tolist()):
+            columns = slice(first + 3 * station, first + 3 * station + 3)
+            matrix[:first, columns] -= by_station[:, 3 * k : 3 * k + 3]
+            matrix[columns, columns] += sums[k, _SYMMETRIC]
+            matrix[columns, second + start + k] += sums[k, 6:9]
+            matrix[second + start + k, second + start + k] += sums[k, 9]
+        matrix[:first, second + batch.start : second + batch.stop] -= level.transposed @ by_group
+    levels = _level_matrix(problem, level, weighted)
+    matrix[:first, :first] += level.transposed @ (level.transposed @ levels).T
 
 
 def _outer_products(unit: FloatArray, weight: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """W u u^T (xx, yy, zz, xy, xz, yz), w u (x, y, z) and w on the grid, shape (10, n_out, n_mid, n_in)."""
-    x, y, z = unit[:, 0], unit[:, 1], unit[:, 2]
-    moments = np.empty((10, *weight.shape))
-    moments[9] = weight
-    for k, component in enumerate((x, y, z)):
-        np.multiply(weight, component, out=moments[6 + k])
-        np.multiply(moments[6 + k], component, out=moments[k])
-    np.multiply(moments[6], y, out=moments[3])
-    np.multiply(moments[6], z, out=moments[4])
-    np.multiply(moments[7], z, out=moments[5])
-    return moments.reshape(10, *shape)
+    """Moments w u u^T (xx, yy, zz, xy, xz, yz), w u (x, y, z) and w on the grid: shape (groups, 10, n_out, n_mid, n_in)."""
+    moments = np.empty((len(weight), 10, *weight.shape[1:]))
+    moments[:, 9] = weight
+    for k in range(3):
+        np.multiply(weight, unit[:, :, k], out=moments[:, 6 + k])
+        np.multiply(moments[:, 6 + k], unit[:, :, k], out=moments[:, k])
+    np.multiply(moments[:, 6], unit[:, :, 1], out=moments[:, 3])
+    np.multiply(moments[:, 6], unit[:, :, 2], out=moments[:, 4])
+    np.multiply(moments[:, 7], unit[:, :, 2], out=moments[:, 5])
+    return moments.reshape(len(weight), 10, *shape)
 
 
 def _powers(levels_mm: FloatArray, count: int) -> FloatArray:
-    return np.vander(levels_mm, count, increasing=True)
+    powers = np.ones((len(levels_mm), count))
+    powers[:, 1] = levels_mm
+    if count > 2:
+        powers[:, 2] = levels_mm * levels_mm
+    return powers
 
 
 def _station_moments(problem: GridProblem, level: LevelMap, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Per kind and level: sum of w q u_o u^T (levels, 3) and of w q u_o (levels,), q the kind's lever."""
+    """Per kind and level: sums of w q u_o u^T (levels, groups * 3) and of w q u_o (levels, groups), q the kind's lever."""
     out, mid, inner = (_powers(problem.levels_mm[axis], 2) for axis in problem.order)
-    nine = moments[:9]
-    over_inner = nine @ inner  # [9, out, mid, q_in]
-    by_out = over_inner.transpose(0, 1, 3, 2) @ mid  # [9, out, q_in, q_mid]
-    by_mid = over_inner.transpose(0, 2, 3, 1) @ out  # [9, mid, q_in, q_out]
-    over_out = _contract_first(nine, out)  # [9, q_out, mid, in]
-    by_inner = (over_out.transpose(0, 1, 3, 2) @ mid).transpose(0, 2, 3, 1)  # [9, in, q_mid, q_out]
+    groups = len(moments)
+    over_inner = moments @ inner  # [group, 10, out, mid, q_in]
+    by_out = over_inner.swapaxes(3, 4) @ mid  # [group, 10, out, q_in, q_mid]
+    by_mid = over_inner.transpose(0, 1, 3, 4, 2) @ out  # [group, 10, mid, q_in, q_out]
+    flat = moments.reshape(groups * 10, *moments.shape[2:])
+    over_out = _contract_first(flat, out)  # [group * 10, q_out, mid, in]
+    by_inner = (over_out.swapaxes(2, 3) @ mid).transpose(0, 2, 3, 1)  # [group * 10, in, q_mid, q_out]
+    by_inner = by_inner.reshape(groups, 10, *by_inner.shape[1:])
     axis_out, axis_mid, axis_in = problem.order
     tables = {
         axis_out: (by_out, axis_in, axis_mid),
@@ -430,9 +441,9 @@ def _station_moments(problem: GridProblem, level: LevelMap, moments: FloatArray)
     for axis, kinds in enumerate(level.kinds):
         table, first_lever, second_lever = tables[axis]
         for kind in kinds:
-            part = table[:, :, int(kind.lever == first_lever), int(kind.lever == second_lever)]
-            stations.append(part[_SYMMETRIC[kind.output]].T)
-            dead.append(part[6 + kind.output])
+            part = table[:, :, :, int(kind.lever == first_lever), int(kind.lever == second_lever)]
+            stations.append(part[:, _SYMMETRIC[kind.output]].reshape(groups * 3, -1).T)
+            dead.append(part[:, 6 + kind.output].T)
     return np.concatenate(stations), np.concatenate(dead)
 
 
@@ -532,6 +543,17 @@ def _levels(position_mm: FloatArray) -> tuple[FloatArray, IntArray]:
     return levels, np.searchsorted(levels, position_mm)
 
 
+def nominal_targets(problem: GridProblem) -> list[FloatArray]:
+    """Nominal targets (commanded position plus tool offset) by tool, each (3, cells of one group)."""
+    out, mid, inner = problem.order
+    shape = tuple(len(problem.levels_mm[axis]) for axis in problem.order)
+    target = np.empty((3, *shape))
+    target[out] = problem.levels_mm[out][:, None, None]
+    target[mid] = problem.levels_mm[mid][:, None]
+    target[inner] = problem.levels_mm[inner]
+    return [target.reshape(3, -1) + data.tool_mm[:, None] for data in problem.tools]
+
+
 def start_moments(problem: GridProblem) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return what the closed-form start needs of the readings, in centred and scaled coordinates.
 
@@ -542,9 +564,7 @@ def start_moments(problem: GridProblem) -> tuple[FloatArray, FloatArray, FloatAr
     -------
     moments (groups, 6, 6), offset (groups,), centre in mm (3,), scale in mm.
     """
-    zero = State(np.zeros(problem.parameters.size), np.zeros((problem.stations, 3)), np.zeros(problem.groups))
-    bodies = _bodies(problem, zero)
-    targets = [_tips(bodies, data.tool_mm)[-1].transpose(1, 0, 2).reshape(3, -1) for data in problem.tools]
+    targets = nominal_targets(problem)
     centre = targets[0].mean(axis=1)
     scale = max(float(np.ptp(targets[0], axis=1).max()), 1.0)
     readings = np.sum([np.sum(data.length_mm * (data.weight > 0), axis=(1, 2)) for data in problem.tools], axis=0)

@@ -19,6 +19,7 @@ from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjustment import Adjustment
+from compgen.identify.affine_start import affine_start
 from compgen.identify.covariance import with_systematic
 from compgen.identify.grid_problem import GridProblem, grid_problem, start_moments
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
@@ -79,6 +80,8 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     _check_readings(machine, lengths)
     task = _task(machine, lengths)
     start, searched = _start(task)
+    if isinstance(task.problem, GridProblem) and not searched:
+        start = affine_start(task.problem, start)
     noise = reading_noise(lengths, options)
     distance = task.target_mm - start.stations_mm[task.station]
     sigma_mm = noise.sigma_mm(np.sqrt(np.einsum("ij,ij->i", distance, distance)))
