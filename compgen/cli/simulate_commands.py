@@ -67,9 +67,8 @@ def predict_command(
     u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that compgen identify wrote.
 
     \b
-    Examples:
+    Example:
       compgen predict zha-gantry fitted/fitted.errors.csv --points p.points.csv --out predicted.csv
-      compgen predict zha-gantry i/identified.errors.csv --points p.points.csv --out predicted.csv --uncertainty
     """
     where = read_points(points)
     table = read_errors(errors)
