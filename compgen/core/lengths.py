@@ -64,23 +64,23 @@ def read_lengths(paths: str | Path | Sequence[str | Path]) -> Lengths:
     if not files:
         raise InputError("no measurement file was given")
     tables = [_read_table(path) for path in files]
-    _check_distinct(tables)
+    check_distinct(tables)
     names = tuple(dict.fromkeys(name for table in tables for name in table.text("station")))
     index = {name: k for k, name in enumerate(names)}
     return Lengths(
         stations=names,
         station=np.concatenate([[index[name] for name in table.text("station")] for table in tables]).astype(np.int64),
         point=[point for table in tables for point in table.text("point")],
-        position_mm=np.concatenate([_vectors(table, POSITION_COLUMNS) for table in tables]),
+        position_mm=np.concatenate([vectors_of(table, POSITION_COLUMNS) for table in tables]),
         length_mm=np.concatenate([table.numbers("length_mm") for table in tables]),
-        tool_mm=_common_tool(tables),
-        approach=_common_approach(tables),
+        tool_mm=common_tool(tables),
+        approach=common_approach(tables),
         labels={
-            name: np.concatenate([_labels(table, name) for table in tables])
+            name: np.concatenate([labels_of(table, name) for table in tables])
             for name in LABEL_COLUMNS
             if any(name in table.columns for table in tables)
         },
-        covariates=_common_covariates(tables),
+        covariates=common_covariates(tables),
         metadata={key: value for table in reversed(tables) for key, value in table.metadata.items() if key != "rows"},
         origin=[(str(table.path), line) for table in tables for line in table.lines],
     )
@@ -93,27 +93,27 @@ def _read_table(path: str | Path) -> CsvTable:
         optional=("approach", *TOOL_COLUMNS, *APPROACH_COLUMNS, *LABEL_COLUMNS, *COVARIATE_COLUMNS),
         prefixes=("temp_*_c",),
     )
-    key_columns = [
-        name
-        for name in ("station", "point", "approach", *APPROACH_COLUMNS, *TOOL_COLUMNS, *LABEL_COLUMNS, "time_s")
-        if name in table.columns
-    ]
-    seen: dict[tuple[str, ...], int] = {}
-    for row, key in enumerate(zip(*(table.columns[name] for name in key_columns), strict=True)):
-        first = seen.setdefault(key, row)
-        if first != row:
-            message = (
-                f"station {key[0]!r} and point {key[1]!r} stand already in line {table.lines[first]}; "
-                f"give repeats a run or repeat column"
-            )
-            raise table.fail(row, "point", message)
+    check_repeats(table, ("station", "point"))
     lengths = table.numbers("length_mm")
     for row in np.flatnonzero(np.abs(lengths) > 1e6)[:1]:
         raise table.fail(int(row), "length_mm", f"{lengths[row]:g} mm is more than a kilometre; is the unit mm?")
     return table
 
 
-def _check_distinct(tables: list[CsvTable]) -> None:
+def check_repeats(table: CsvTable, keys: Sequence[str]) -> None:
+    """Two rows that agree in ``keys`` must differ in a label, a direction, the tool or the time."""
+    names = (*keys, "approach", *APPROACH_COLUMNS, *TOOL_COLUMNS, *LABEL_COLUMNS, "time_s")
+    key_columns = [name for name in names if name in table.columns]
+    seen: dict[tuple[str, ...], int] = {}
+    for row, key in enumerate(zip(*(table.columns[name] for name in key_columns), strict=True)):
+        first = seen.setdefault(key, row)
+        if first != row:
+            what = " and ".join(f"{name} {value!r}" for name, value in zip(keys, key, strict=False))
+            message = f"{what} stand already in line {table.lines[first]}; give repeats a run or repeat column"
+            raise table.fail(row, keys[-1], message)
+
+
+def check_distinct(tables: list[CsvTable]) -> None:
     """The same readings may not come in twice, as one file given twice or as a copy of it."""
     for k, table in enumerate(tables):
         for earlier in tables[:k]:
@@ -121,15 +121,18 @@ def _check_distinct(tables: list[CsvTable]) -> None:
                 raise InputError(f"holds the same rows as {earlier.path}; give each measurement once", file=table.path)
 
 
-def _vectors(table: CsvTable, names: Sequence[str]) -> FloatArray:
+def vectors_of(table: CsvTable, names: Sequence[str]) -> FloatArray:
+    """Return the columns ``names`` side by side, shape (rows, columns)."""
     return np.column_stack([table.numbers(name) for name in names])
 
 
-def _labels(table: CsvTable, name: str) -> NDArray[np.int64]:
+def labels_of(table: CsvTable, name: str) -> NDArray[np.int64]:
+    """Return a column of labels (rows,); zeros if the file lacks it."""
     return table.labels(name) if name in table.columns else np.zeros(len(table), dtype=np.int64)
 
 
-def _common_tool(tables: list[CsvTable]) -> FloatArray | None:
+def common_tool(tables: list[CsvTable]) -> FloatArray | None:
+    """Return the tool offsets of all rows (n, 3), or None if no file has them."""
     having = [all(name in table.columns for name in TOOL_COLUMNS) for table in tables]
     for table in tables:
         present = [name for name in TOOL_COLUMNS if name in table.columns]
@@ -142,10 +145,11 @@ def _common_tool(tables: list[CsvTable]) -> FloatArray | None:
         raise InputError(
             f"lacks {', '.join(TOOL_COLUMNS)}, which another file has; give them in every file", file=table.path
         )
-    return np.concatenate([_vectors(table, TOOL_COLUMNS) for table in tables])
+    return np.concatenate([vectors_of(table, TOOL_COLUMNS) for table in tables])
 
 
-def _common_approach(tables: list[CsvTable]) -> FloatArray | None:
+def common_approach(tables: list[CsvTable]) -> FloatArray | None:
+    """Return the last directions of travel (n, 3), 0 where unknown, or None if no file has them."""
     if not any(name in table.columns for table in tables for name in APPROACH_COLUMNS):
         return None
     blocks = []
@@ -155,7 +159,8 @@ def _common_approach(tables: list[CsvTable]) -> FloatArray | None:
     return np.concatenate(blocks)
 
 
-def _common_covariates(tables: list[CsvTable]) -> dict[str, FloatArray]:
+def common_covariates(tables: list[CsvTable]) -> dict[str, FloatArray]:
+    """Return times, temperatures and the like by name, each (n,), nan where a file lacks the column."""
     names = [
         name
         for name in dict.fromkeys(name for table in tables for name in table.columns)
