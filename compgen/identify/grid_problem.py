@@ -239,9 +239,18 @@ class GridProblem:
 
     def residuals(self, state: State) -> FloatArray:
         """Model minus reading of every reading, shape (n,), mm."""
+        return self._at_readings(self.predicted(state)) - self.reading_mm
+
+    def distances(self, state: State) -> FloatArray:
+        """Distance from the station of every reading, shape (n,), mm."""
+        still = State(state.errors, state.stations_mm, np.zeros(self.groups))
+        return self._at_readings(self.predicted(still))
+
+    def _at_readings(self, parts: Sequence[FloatArray]) -> FloatArray:
         tool, cell = self.cell
-        predicted = np.stack([part.ravel() for part in self.predicted(state)])
-        return np.asarray(predicted[tool, cell] - self.reading_mm)
+        if len(parts) == 1:
+            return np.asarray(parts[0].ravel()[cell])
+        return np.asarray(np.stack([part.ravel() for part in parts])[tool, cell])
 
     def normal_matrix(self, state: State) -> FloatArray:
         """J^T W J (size, size) with C in place of the exact derivative."""

@@ -83,14 +83,15 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     if isinstance(task.problem, GridProblem) and not searched:
         start = affine_start(task.problem, start)
     noise = reading_noise(lengths, options)
-    distance = task.target_mm - start.stations_mm[task.station]
-    sigma_mm = noise.sigma_mm(np.sqrt(np.einsum("ij,ij->i", distance, distance)))
+    sigma_mm = noise.sigma_mm(task.problem.distances(start))
     weights = (sigma_mm.min() / sigma_mm) ** 2
     task = replace(task, problem=task.problem.weighted(weights))
     factor, rank = _determined(task, start)
     start = _unmirrored(task, start, searched)
-    solution, accepted = _solve_robustly(task.problem, start, weights, factor, sigma_mm, reject=options.reject)
-    return _result(task, solution, accepted, sigma_mm, noise, rank)
+    solution, accepted, residual = _solve_robustly(
+        task.problem, start, weights, factor, sigma_mm, reject=options.reject
+    )
+    return _result(task, solution, accepted, residual, sigma_mm, noise, rank)
 
 
 def _check_readings(machine: Machine, lengths: Lengths) -> None:
@@ -101,7 +102,8 @@ def _check_readings(machine: Machine, lengths: Lengths) -> None:
             "missing station, or measure with the same tracer from further places",
             file=lengths.origin[0][0] if lengths.origin else None,
         )
-    low, high = lengths.position_mm.min(axis=0), lengths.position_mm.max(axis=0)
+    columns = [np.ascontiguousarray(column) for column in lengths.position_mm.T]
+    low, high = np.array([column.min() for column in columns]), np.array([column.max() for column in columns])
     outside = (low < machine.lower_mm - 1e-3) | (high > machine.upper_mm + 1e-3)
     if outside.any():
         axis = int(np.flatnonzero(outside)[0])
@@ -231,12 +233,16 @@ def _solve_robustly(
     sigma_mm: FloatArray,
     *,
     reject: bool,
-) -> tuple[Solution, NDArray[np.bool_]]:
-    """Solve, reject what lies beyond the robust limit, and repeat until the same readings are kept."""
+) -> tuple[Solution, NDArray[np.bool_], FloatArray]:
+    """Solve, reject what lies beyond the robust limit, and repeat until the same readings are kept.
+
+    Returns the solution, which readings were kept, and the residuals of all of them.
+    """
     accepted = np.ones(len(weights), dtype=bool)
     solution = solve(problem, start, factor)
+    residual = problem.residuals(solution.state)
     for _ in range(20 if reject else 0):
-        keep = accepted_readings(problem.residuals(solution.state) / sigma_mm)
+        keep = accepted_readings(residual / sigma_mm)
         if np.count_nonzero(keep) < 0.7 * len(keep):
             raise ConvergenceError(
                 f"{np.count_nonzero(~keep)} of {len(keep)} readings do not fit the model; check the machine file's chain, "
@@ -247,19 +253,20 @@ def _solve_robustly(
         accepted = keep
         problem = problem.weighted(weights * accepted)
         solution = solve(problem, solution.state)
-    return solution, accepted
+        residual = problem.residuals(solution.state)
+    return solution, accepted, residual
 
 
 def _result(
     task: _Task,
     solution: Solution,
     accepted: NDArray[np.bool_],
+    residual: FloatArray,
     sigma_mm: FloatArray,
     noise: ReadingNoise,
     rank: Rank | None,
 ) -> Identification:
     problem, layout = task.problem, task.problem.parameters
-    residual = problem.residuals(solution.state)
     freedom = int(np.count_nonzero(accepted)) - problem.size
     if freedom < 1:
         raise UndeterminedError(f"{np.count_nonzero(accepted)} readings for {problem.size} unknowns", [])

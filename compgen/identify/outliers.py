@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +12,17 @@ from numpy.typing import NDArray
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.identify.parameters import ErrorParameters
+from compgen.identify.segments import Segment
 from compgen.identify.state import IntArray, State
 from compgen.model.exact import tip_position
 from compgen.model.volumetric import tool_of
 
 #: A reading is rejected when its residual exceeds this many robust standard deviations (1.4826 MAD).
 LIMIT = 6.0
+#: A reading fits another point or station when it agrees within so many standard deviations.
+CLOSE = 10.0
+#: Below this size a residual is no exchange of points: neighbours in the volume are further apart.
+SMALLEST_EXCHANGE_MM = 0.05
 
 
 @dataclass(frozen=True)
@@ -31,16 +38,32 @@ class Rejected:
     line: int = 0
 
 
-def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
-    """Mark the readings whose residual over its standard uncertainty (n,) lies within the robust limit.
+def standardised_spread(standardised: FloatArray) -> float:
+    """Robust standard deviation (1.4826 MAD) of residuals over their standard uncertainties (n,).
 
-    The scale is not let below a thousandth of the uncertainty, so that rounding in noise-free data rejects nothing.
+    Not let below a thousandth, so that rounding in noise-free data rejects nothing.
     """
+    return max(1.4826 * float(np.median(np.abs(standardised - np.median(standardised)))), 1e-3)
+
+
+def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
+    """Mark the readings whose residual over its standard uncertainty (n,) lies within the robust limit."""
     size = np.abs(standardised)
     if float(size.max()) <= LIMIT * 1e-3:
         return np.ones(len(size), dtype=bool)
-    spread = 1.4826 * float(np.median(np.abs(standardised - np.median(standardised))))
-    return np.asarray(size <= LIMIT * max(spread, 1e-3))
+    return np.asarray(size <= LIMIT * standardised_spread(standardised))
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """What the model expects: distances of poses and stations (m, S), dead lengths and their stations (g,)."""
+
+    distance_mm: FloatArray
+    dead_mm: FloatArray
+    station_of: IntArray
+    pose: IntArray
+    group: IntArray
+    close_mm: FloatArray
 
 
 def explain_rejected(
@@ -51,26 +74,28 @@ def explain_rejected(
     rejected: IntArray,
     residual_mm: FloatArray,
     sigma_mm: FloatArray,
+    segments: Sequence[Segment] = (),
 ) -> tuple[Rejected, ...]:
-    """Give every rejected reading a reason: another station's or another point's length, or just its size.
+    """Give every rejected reading a reason: another station's or another point's length, a beam break, or its size.
 
     Parameters
     ----------
     lengths, layout, state, group : readings, unknowns, their values, and the dead length of each reading.
     rejected : rows of the rejected readings.
     residual_mm, sigma_mm : model minus reading and standard uncertainty of every reading, (n,).
+    segments : runs of readings with a common offset.
     """
     if not len(rejected):
         return ()
-    tool = np.broadcast_to(tool_of(layout.machine, lengths.tool_mm), lengths.position_mm.shape)
-    poses, pose = np.unique(np.column_stack([lengths.position_mm, tool]), axis=0, return_inverse=True)
-    bases = [layout.basis(axis, poses[:, axis]) for axis in range(3)]
-    tip = tip_position(layout.machine, layout.values(state.errors, bases), poses[:, :3], poses[:, 3:])
-    dead = np.zeros(len(state.stations_mm))
-    dead[lengths.station] = state.dead_length_mm[group]
-    predicted = np.linalg.norm(tip[:, None, :] - state.stations_mm[None], axis=2) - dead
+    expected = _expected(lengths, layout, state, group, residual_mm, sigma_mm)
+    rows = rejected.tolist()
+    broken = _rows_of(lengths, segments, set(rows))
+    exchanged = _exchanges(lengths, expected, [row for row in rows if row not in broken], residual_mm)
     found = []
-    for row in rejected.tolist():
+    for row in rows:
+        size = f"differs from the model by {-residual_mm[row] * 1000.0:+.1f} um, "
+        size += f"{abs(residual_mm[row]) / sigma_mm[row]:.0f} standard deviations"
+        why = broken.get(row) or _other_station(lengths, expected, row) or exchanged.get(row)
         file, line = lengths.origin[row] if lengths.origin else ("", 0)
         found.append(
             Rejected(
@@ -78,43 +103,96 @@ def explain_rejected(
                 station=lengths.stations[lengths.station[row]],
                 point=str(lengths.point[row]),
                 residual_um=float(-residual_mm[row] * 1000.0),
-                reason=_reason(
-                    lengths,
-                    predicted,
-                    poses,
-                    int(pose.ravel()[row]),
-                    row,
-                    float(residual_mm[row]),
-                    float(sigma_mm[row]),
-                ),
-                file=file,
+                reason=f"{size}; {why or 'beam break or disturbed reading?'}",
+                file=str(file),
                 line=line,
             )
         )
     return tuple(found)
 
 
-def _reason(
+def _expected(
     lengths: Lengths,
-    predicted: FloatArray,
-    poses: FloatArray,
-    pose: int,
-    row: int,
-    residual: float,
-    sigma_mm: float,
-) -> str:
-    size = f"differs from the model by {-residual * 1000.0:+.1f} um, {abs(residual) / sigma_mm:.0f} standard deviations"
-    station, reading = lengths.station[row], lengths.length_mm[row]
-    close = 10.0 * sigma_mm
-    others = np.abs(predicted[pose] - reading)
-    others[station] = np.inf
-    if others.min() < close:
-        return (
-            f"{size}; it fits station {lengths.stations[int(np.argmin(others))]!r} at this point: wrong station label?"
-        )
-    points = np.abs(predicted[:, station] - reading)
-    points[pose] = np.inf
-    if abs(residual) > 0.05 and points.min() < min(close, 0.002):
-        where = ", ".join(f"{value:g}" for value in poses[int(np.argmin(points)), :3])
-        return f"{size}; it fits the position ({where}) mm: duplicated or swapped point?"
-    return f"{size}; beam break or disturbed reading?"
+    layout: ErrorParameters,
+    state: State,
+    group: IntArray,
+    residual_mm: FloatArray,
+    sigma_mm: FloatArray,
+) -> _Expected:
+    tool = np.broadcast_to(tool_of(layout.machine, lengths.tool_mm), lengths.position_mm.shape)
+    poses, pose = np.unique(np.column_stack([lengths.position_mm, tool]), axis=0, return_inverse=True)
+    bases = [layout.basis(axis, poses[:, axis]) for axis in range(3)]
+    tip = tip_position(layout.machine, layout.values(state.errors, bases), poses[:, :3], poses[:, 3:])
+    station_of = np.zeros(len(state.dead_length_mm), dtype=np.int64)
+    station_of[group] = lengths.station
+    return _Expected(
+        distance_mm=np.linalg.norm(tip[:, None, :] - state.stations_mm[None], axis=2),
+        dead_mm=state.dead_length_mm,
+        station_of=station_of,
+        pose=pose.ravel().astype(np.int64),
+        group=group,
+        close_mm=CLOSE * sigma_mm * max(standardised_spread(residual_mm / sigma_mm), 0.1),
+    )
+
+
+def _rows_of(lengths: Lengths, segments: Sequence[Segment], rejected: set[int]) -> dict[int, str]:
+    """Rejected rows that are part of a rejected segment, with the reason."""
+    found = {}
+    for segment in segments:
+        if not segment.kept:
+            where = f"lines {segment.line} to {segment.last_line}" if segment.line else "a run of readings"
+            text = f"one of {segment.readings} readings off by {segment.offset_mm:+.3f} mm ({where}): beam break"
+            found.update({row: text for row in segment.rows if row in rejected})
+    return found
+
+
+def _other_station(lengths: Lengths, expected: _Expected, row: int) -> str | None:
+    """Say which other station's length at this point the reading is, if it is one."""
+    predicted = expected.distance_mm[expected.pose[row], expected.station_of] - expected.dead_mm
+    off = np.abs(predicted - lengths.length_mm[row])
+    off[expected.station_of == lengths.station[row]] = np.inf
+    best = int(np.argmin(off))
+    if off[best] > expected.close_mm[row]:
+        return None
+    return f"it fits station {lengths.stations[expected.station_of[best]]!r} at this point: wrong station label?"
+
+
+def _exchanges(
+    lengths: Lengths, expected: _Expected, rows: Sequence[int], residual_mm: FloatArray
+) -> dict[int, str]:
+    """Find readings that belong to another point: two points exchanged, or one point's reading given twice.
+
+    All rejected readings of one stop must agree on the other point.
+    """
+    run = lengths.labels.get("run", np.zeros(len(lengths), dtype=np.int64))
+    candidates: dict[tuple[int, int], set[int]] = {}
+    members: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for row in rows:
+        fits = _fitting_poses(lengths, expected, row) if abs(residual_mm[row]) > SMALLEST_EXCHANGE_MM else set()
+        if fits:
+            stop = (int(expected.pose[row]), int(run[row]))
+            candidates[stop] = candidates.get(stop, fits) & fits
+            members[stop].append(row)
+    found = {}
+    for stop, fits in candidates.items():
+        mutual = [pose for pose in fits if stop[0] in candidates.get((pose, stop[1]), set())]
+        chosen = mutual or sorted(fits)
+        if len(chosen) != 1:
+            continue
+        what = "the two points are exchanged" if mutual else "duplicated or wrong point?"
+        text = f"it fits {_point_name(lengths, expected, chosen[0])}: {what}"
+        found.update(dict.fromkeys(members[stop], text))
+    return found
+
+
+def _fitting_poses(lengths: Lengths, expected: _Expected, row: int) -> set[int]:
+    predicted = expected.distance_mm[:, lengths.station[row]] - expected.dead_mm[expected.group[row]]
+    off = np.abs(predicted - lengths.length_mm[row])
+    off[expected.pose[row]] = np.inf
+    return set(np.flatnonzero(off <= expected.close_mm[row]).tolist())
+
+
+def _point_name(lengths: Lengths, expected: _Expected, pose: int) -> str:
+    row = int(np.flatnonzero(expected.pose == pose)[0])
+    where = ", ".join(f"{value:g}" for value in lengths.position_mm[row])
+    return f"point {lengths.point[row]} at ({where}) mm"

@@ -71,6 +71,11 @@ class LengthProblem:
         distance = np.linalg.norm(tip[self.pose] - state.stations_mm[self.station], axis=1)
         return np.asarray(distance - state.dead_length_mm[self.group] - self.length_mm)
 
+    def distances(self, state: State) -> FloatArray:
+        """Distance from the station of every reading, shape (n,), mm."""
+        still = State(state.errors, state.stations_mm, np.zeros_like(state.dead_length_mm))
+        return self.residuals(still) + self.length_mm
+
     def evaluate(self, state: State) -> tuple[float, FloatArray]:
         """Half the weighted sum of squares, and its gradient (size,)."""
         residuals = self.residuals(state)

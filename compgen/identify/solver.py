@@ -86,6 +86,7 @@ def solve(problem: Problem, start: State, factor: Factor | None = None) -> Solut
     state = start
     cost, gradient = problem.evaluate(state)
     damping, previous, factorisations = 0.0, np.inf, 0
+    levers = step_levers(problem)
     fresh = False
     for iteration in range(1, MAX_ITERATIONS + 1):
         if factor is None:
@@ -93,7 +94,7 @@ def solve(problem: Problem, start: State, factor: Factor | None = None) -> Solut
             factorisations += 1
             fresh = True
         step = -factor.solve(gradient)
-        size = step_size_mm(problem, step)
+        size = float(np.max(np.abs(step) * levers))
         candidate = state.moved(step)
         new_cost, new_gradient = problem.evaluate(candidate)
         if not new_cost <= cost * (1 + 1e-9) + 1e-18:
@@ -130,12 +131,12 @@ def _positive_factor(matrix: FloatArray, damping: float) -> tuple[Factor, float]
     raise ConvergenceError("the normal matrix is not positive definite; the data do not determine the unknowns")
 
 
-def step_size_mm(problem: Problem, step: FloatArray) -> float:
-    """Largest change of any unknown, angles at a lever of 1000 mm."""
-    size = np.abs(step)
+def step_levers(problem: Problem) -> FloatArray:
+    """Lever of every unknown in a step size: 1 for lengths, 1000 mm for rotations, shape (size,)."""
     parameters = problem.parameters
+    levers = np.ones(problem.size)
     for curve in parameters.curves:
         if curve.error.kind == "angular":
-            size[curve.columns] *= 1000.0
-    size[parameters.size - len(parameters.squareness) : parameters.size] *= 1000.0
-    return float(size.max())
+            levers[curve.columns] = 1000.0
+    levers[parameters.size - len(parameters.squareness) : parameters.size] = 1000.0
+    return levers
