@@ -37,6 +37,11 @@ def analyse_rank(
 
     ``stations`` are the names, ``station`` and ``group`` (dead length) the indices of each reading, for the messages.
     """
+    return describe_rank(matrix, unknown_names(problem, stations, station, group))
+
+
+def describe_rank(matrix: FloatArray, names: list[str]) -> Rank:
+    """Analyse a normal matrix (size, size) whose unknowns have ``names``."""
     diagonal = np.diag(matrix)
     empty = diagonal <= 1e-14 * np.median(diagonal[diagonal > 0])
     scale = 1.0 / np.sqrt(np.where(empty, 1.0, diagonal))
@@ -50,7 +55,7 @@ def analyse_rank(
         size=len(matrix),
         condition=float(kept[-1] / kept[0]) if len(kept) else np.inf,
         undetermined=undetermined,
-        combinations=_combinations(unknown_names(problem, stations, station, group), vectors[:, null], empty),
+        combinations=_combinations(names, vectors[:, null], empty),
     )
 
 
