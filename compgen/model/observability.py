@@ -33,12 +33,15 @@ def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> t
 
 def _idle_rotations(machine: Machine, axis: int, tools_mm: FloatArray) -> set[int]:
     """Directions (0, 1, 2) of the angular errors of ``axis`` that its lever arms do not show."""
-    travel = np.eye(3)[[other for other in machine.chain.lever_axes(axis) if other != axis]]
+    others = [other for other in machine.chain.lever_axes(axis) if other != axis]
+    if len(others) > 1:
+        return set()
+    travel = np.eye(3)[others]
     spread = tools_mm - tools_mm.mean(axis=0)
     longest = np.linalg.norm(spread, axis=1).max()
-    levers = np.vstack([travel, spread / longest]) if longest > _SAME_TOOL_MM else travel
-    if not len(levers):
-        return {0, 1, 2}
+    if longest <= _SAME_TOOL_MM:
+        return set(others) if others else {0, 1, 2}
+    levers = np.vstack([travel, spread / longest])
     _, lengths, directions = np.linalg.svd(levers)
     if len(lengths) > 1 and lengths[1] > _PARALLEL:
         return set()
