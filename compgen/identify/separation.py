@@ -86,7 +86,7 @@ class SeparationProblem:
 
     def _seen(self, state: State, tip_mm: FloatArray) -> FloatArray:
         """Tips as vectors from the centre in the measured frame, (m, 3)."""
-        return (tip_mm - self.centre_mm - state.stations_mm[0]) @ rotation_back(state)[0].T
+        return (tip_mm - self.centre_mm - state.stations_mm[0]) @ frame_rotation(-state.stations_mm[1])[0].T
 
     def _rest(self, state: State, seen: FloatArray) -> FloatArray:
         return seen + self.centre_mm - self.measured_mm - self.lever @ state.dead_length_mm
@@ -98,7 +98,7 @@ class SeparationProblem:
         seen = self._seen(state, tip)
         rest = self._rest(state, seen)
         force = np.einsum("mij,mj->mi", self.information, rest)
-        back, jacobian = rotation_back(state)
+        back, jacobian = frame_rotation(-state.stations_mm[1])
         held = self.station_information @ state.dead_length_mm
         cost = 0.5 * (float(np.vdot(force, rest)) + float(state.dead_length_mm @ held))
         pull = force @ back  # forces on the tips, in the machine frame
@@ -139,7 +139,7 @@ class SeparationProblem:
         """Derivative of r_j by all unknowns, (poses, 3, size)."""
         machine, bases = self.parameters.machine, [basis[rows] for basis in self.bases]
         tip, columns = exact_columns(machine, values, self.position_mm[rows], self.tool_mm[rows])
-        back, jacobian = rotation_back(state)
+        back, jacobian = frame_rotation(-state.stations_mm[1])
         turn = cross_matrices(self._seen(state, tip)) @ jacobian / LEVER_MM
         shift = np.broadcast_to(-back, turn.shape)
         return np.concatenate([back @ self.parameters.design(columns, bases), shift, turn, -self.lever[rows]], axis=2)
@@ -154,7 +154,7 @@ class SeparationProblem:
         return [*names, *self.parameters.squareness, *placement, *station_unknowns]
 
 
-def rotation_back(state: State) -> tuple[FloatArray, FloatArray]:
-    """R(-w) (3, 3) of the frame's rotation vector w, and the left Jacobian of SO(3) at -w (3, 3)."""
-    rotation, jacobian = level_rotations(-state.stations_mm[1][None] / LEVER_MM)
+def frame_rotation(vector_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation matrix and left Jacobian of SO(3), each (3, 3), of a rotation vector (3,) in mm at 1000 mm."""
+    rotation, jacobian = level_rotations(vector_mm[None] / LEVER_MM)
     return rotation[0], jacobian[0]

@@ -1,0 +1,347 @@
+"""Identification in the steps of Zha & Zhang 2024, sections 4 and 5: self-calibration, transformation, separation.
+
+The tracers locate themselves and every target point without any knowledge of the machine; the points are placed in the
+machine frame; the errors follow from the placed points. As the correlation of the points is carried along in full, the
+result is that of the joint adjustment up to terms of second order; the joint one can use more readings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError
+
+from compgen.core.csvio import FloatArray
+from compgen.core.deviations import Deviations
+from compgen.core.lengths import Lengths
+from compgen.core.names import MM_PER_UM
+from compgen.errors import ConvergenceError, InputError, UndeterminedError
+from compgen.identify.outliers import Rejected, accepted_readings
+from compgen.identify.parameters import ErrorParameters
+from compgen.identify.rank import describe_rank
+from compgen.identify.self_calibration import LOCATING_STATIONS, Frame, SelfCalibration, Sightings, self_calibrate
+from compgen.identify.separation import LEVER_MM, SeparationProblem, frame_rotation
+from compgen.identify.solver import Solution, factorise, solve
+from compgen.identify.state import IntArray, State
+from compgen.identify.transformation import Placement, place, placed_covariance
+from compgen.model.exact import cross_matrices, tip_position
+from compgen.model.volumetric import tool_of
+
+MIN_STATIONS = 4
+MOST_ROUNDS = 20
+#: With fewer readings kept than this share, model and readings do not belong together.
+LEAST_KEPT = 0.7
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Tracer readings as the joint method has prepared them; n readings.
+
+    Parameters
+    ----------
+    lengths, layout : the readings, and the unknown errors of the machine.
+    group : index of the dead length of each reading, (n,).
+    sigma_mm : standard uncertainty of each reading, (n,).
+    start : rough stations and dead lengths.
+    """
+
+    lengths: Lengths
+    layout: ErrorParameters
+    group: IntArray
+    sigma_mm: FloatArray
+    start: State
+
+
+@dataclass(frozen=True)
+class Located:
+    """Points that the tracers have located.
+
+    Parameters
+    ----------
+    rows, point : the readings that were used, and the point of each, (k,).
+    position_mm, tool_mm : poses of the points, (m, 3).
+    calibration : of the tracers in their own frame, right-handed as the machine.
+    placement : from that frame into the machine's; ``anchored`` if it was held at the reference point.
+    deviations : measured tip minus nominal one in the machine frame, with the uncertainty of each component.
+    covariance_mm2 : covariance of each point there, (m, 3, 3).
+    """
+
+    rows: IntArray
+    point: IntArray
+    position_mm: FloatArray
+    tool_mm: FloatArray
+    calibration: SelfCalibration
+    placement: Placement
+    anchored: bool
+    deviations: Deviations
+    covariance_mm2: FloatArray
+
+    @property
+    def measured_mm(self) -> FloatArray:
+        """Measured tips in the machine frame, (m, 3)."""
+        return self.placement.apply(self.calibration.frame.points_mm)
+
+
+@dataclass(frozen=True)
+class TwoSteps:
+    """Result: the optimum with the unknowns of the joint method, which readings count, the points, what to report."""
+
+    solution: Solution
+    accepted: NDArray[np.bool_]
+    rejected: tuple[Rejected, ...]
+    located: Located
+    summary: dict[str, Any]
+
+
+def solve_in_two_steps(readings: Readings, *, reject: bool) -> TwoSteps:
+    """Self-calibrate, place, separate; reject what lies beyond the robust limit, and repeat until the same are kept.
+
+    Raises
+    ------
+    InputError
+        if fewer than four stations see common points.
+    UndeterminedError
+        if tracers, or errors, are not determined.
+    ConvergenceError
+        if no optimum is reached, or too many readings do not fit.
+    """
+    count = len(readings.lengths)
+    poses, pose = _poses(readings)
+    keep = np.ones(count, dtype=bool)
+    for _ in range(MOST_ROUNDS):
+        locatable = _locatable(readings, pose, keep)
+        located = _locate(readings, poses, pose, np.flatnonzero(keep & locatable))
+        problem = _separation(readings, located)
+        solution = _solve(problem, located, readings)
+        state = _joint_state(problem, solution.state, located)
+        residual = _length_residuals(readings, poses, pose, state)
+        again = accepted_readings(residual / readings.sigma_mm) if reject else keep
+        _check_enough(again)
+        if np.array_equal(again, keep):
+            break
+        keep = again
+    used = keep & locatable
+    return TwoSteps(
+        solution=_joint_solution(problem, solution, located, state, float(readings.sigma_mm.min())),
+        accepted=used,
+        rejected=_not_located(readings.lengths, np.flatnonzero(keep & ~locatable), residual),
+        located=located,
+        summary=_summary(readings, located, solution),
+    )
+
+
+def _check_enough(keep: NDArray[np.bool_]) -> None:
+    rejected = int(np.count_nonzero(~keep))
+    if rejected > (1.0 - LEAST_KEPT) * len(keep):
+        raise ConvergenceError(
+            f"{rejected} of {len(keep)} readings do not fit the model; check the machine file's chain, the station "
+            "labels and the units before anything is rejected"
+        )
+
+
+def _poses(readings: Readings) -> tuple[FloatArray, IntArray]:
+    """Distinct positions with their tools (m, 6), and the pose of each reading (n,)."""
+    lengths = readings.lengths
+    tool = np.broadcast_to(tool_of(readings.layout.machine, lengths.tool_mm), lengths.position_mm.shape)
+    poses, pose = np.unique(np.column_stack([lengths.position_mm, tool]), axis=0, return_inverse=True)
+    return poses, pose.ravel().astype(np.int64)
+
+
+def _locatable(readings: Readings, pose: IntArray, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Readings whose pose is seen by three stations or more; InputError if they cannot locate the tracers."""
+    lengths = readings.lengths
+    names = lengths.stations
+    seen = np.zeros((int(pose.max()) + 1, len(names)), dtype=bool)
+    seen[pose[keep], lengths.station[keep]] = True
+    by_pose = seen.sum(axis=1)
+    advice = (
+        "; self-calibration leaves three unknown coordinates for each point, so at least four stations must see common "
+        "points. Use the joint method (--method joint), which needs three stations and no common point"
+    )
+    file = lengths.origin[0][0] if lengths.origin else None
+    if by_pose.max() < MIN_STATIONS:
+        raise InputError(f"no point is seen by more than {by_pose.max()} of {len(names)} stations{advice}", file=file)
+    located = by_pose >= LOCATING_STATIONS
+    lonely = [name for name, sees in zip(names, seen[located].any(axis=0), strict=True) if not sees]
+    if lonely:
+        raise InputError(f"station {lonely[0]!r} shares no point with three others{advice}", file=file)
+    rows = located[pose]
+    groups = np.setdiff1d(readings.group, readings.group[keep & rows])
+    if len(groups):
+        row = int(np.flatnonzero(readings.group == groups[0])[0])
+        name = names[lengths.station[row]]
+        raise InputError(f"a set-up of station {name!r} shares no point with three others{advice}", file=file)
+    return np.asarray(rows)
+
+
+def _locate(readings: Readings, poses: FloatArray, pose: IntArray, rows: IntArray) -> Located:
+    """Steps 1 and 2: eq. 12-19 and eq. 20."""
+    lengths = readings.lengths
+    present, point = np.unique(pose[rows], return_inverse=True)
+    point = point.ravel().astype(np.int64)
+    position_mm, tool_mm = poses[present, :3], poses[present, 3:]
+    nominal = position_mm + tool_mm
+    sightings = Sightings(
+        point, lengths.station[rows], readings.group[rows], lengths.length_mm[rows], readings.sigma_mm[rows]
+    )
+    start = Frame(readings.start.stations_mm, readings.start.dead_length_mm, nominal)
+    calibration = self_calibrate(sightings, start)
+    own = calibration.own_covariance()
+    weight = 1.0 / np.trace(own, axis1=1, axis2=2)
+    anchor = _anchor(readings, position_mm)
+    placement = place(calibration.frame.points_mm, nominal, weight, anchor)
+    if placement.mirrored:
+        calibration = calibration.mirrored()
+        own = calibration.own_covariance()
+        placement = place(calibration.frame.points_mm, nominal, weight, anchor)
+    turn = placement.rotation
+    measured = placement.apply(calibration.frame.points_mm)
+    shared = calibration.station_covariance()
+    covariance = placed_covariance(turn @ own @ turn.T, turn @ calibration.lever, shared, measured, weight, anchor)
+    variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)
+    kept = {key: lengths.metadata[key] for key in ("date",) if key in lengths.metadata}
+    deviations = Deviations(
+        position_mm=position_mm,
+        deviation_mm=measured - nominal,
+        u_mm=np.sqrt(variance),
+        tool_mm=None if lengths.tool_mm is None else tool_mm,
+        metadata={"machine": readings.layout.machine.name, **kept, "source": "compgen identify"},
+    )
+    return Located(
+        rows, point, position_mm, tool_mm, calibration, placement, anchor is not None, deviations, covariance
+    )
+
+
+def _anchor(readings: Readings, position_mm: FloatArray) -> int | None:
+    """The pose at the machine's reference point, if it was measured once."""
+    away = np.abs(position_mm - np.array(readings.layout.machine.reference_point_mm)).max(axis=1)
+    at = np.flatnonzero(away < 1e-6)
+    return int(at[0]) if len(at) == 1 else None
+
+
+def _separation(readings: Readings, located: Located) -> SeparationProblem:
+    turn, calibration = located.placement.rotation, located.calibration
+    bases = tuple(readings.layout.basis(axis, located.position_mm[:, axis]) for axis in range(3))
+    return SeparationProblem(
+        parameters=readings.layout,
+        bases=bases,  # type: ignore[arg-type]
+        position_mm=located.position_mm,
+        tool_mm=located.tool_mm,
+        measured_mm=located.measured_mm,
+        information=turn @ calibration.information @ turn.T,
+        lever=turn @ calibration.lever,
+        station_information=calibration.station_information,
+    )
+
+
+def _solve(problem: SeparationProblem, located: Located, readings: Readings) -> Solution:
+    """Step 3: eq. 21-28."""
+    matrix = problem.normal_matrix(problem.start)
+    try:
+        factor = factorise(matrix)
+    except LinAlgError:
+        stations = [f"{name} {letter}" for name in readings.lengths.stations for letter in "xyz"]
+        everything = [*stations, *(f"dead length {k + 1}" for k in range(len(readings.start.dead_length_mm)))]
+        names = problem.unknown_names(tuple(everything[k] for k in located.calibration.free))
+        rank = describe_rank(matrix, names)
+        raise UndeterminedError(
+            f"the {len(located.position_mm)} located points determine {rank.rank} of {rank.size} unknowns; "
+            + "; ".join(rank.combinations[:8]),
+            list(rank.combinations),
+        ) from None
+    return solve(problem, problem.start, factor)
+
+
+def _joint_state(problem: SeparationProblem, state: State, located: Located) -> State:
+    """Errors, stations and dead lengths in the machine frame."""
+    calibration = located.calibration
+    frame = calibration.frame
+    everything = np.concatenate([frame.stations_mm.ravel(), frame.dead_length_mm])
+    everything[calibration.free] += state.dead_length_mm
+    split = frame.stations_mm.size
+    stations = located.placement.apply(everything[:split].reshape(-1, 3)) - problem.centre_mm
+    turned = stations @ frame_rotation(-state.stations_mm[1])[0]
+    return State(state.errors, turned + problem.centre_mm + state.stations_mm[0], everything[split:])
+
+
+def _joint_solution(
+    problem: SeparationProblem, solution: Solution, located: Located, state: State, sigma_mm: float
+) -> Solution:
+    """The same optimum with the joint method's unknowns; readings of ``sigma_mm`` get weight 1."""
+    size, errors = problem.size, problem.parameters.size
+    change = np.eye(size)
+    change[errors:, errors:] = _station_derivative(problem, solution.state, located, state)
+    back = np.linalg.inv(change)
+    matrix = back.T @ problem.normal_matrix(solution.state) @ back * sigma_mm**2
+    factor = factorise(0.5 * (matrix + matrix.T))
+    return Solution(state, solution.cost * sigma_mm**2, factor, solution.iterations, solution.factorisations)
+
+
+def _station_derivative(problem: SeparationProblem, state: State, located: Located, joint: State) -> FloatArray:
+    """Derivative of stations and dead lengths in the machine frame by placement and b, (6 + q, 6 + q)."""
+    forward, jacobian = frame_rotation(state.stations_mm[1])
+    stations = len(joint.stations_mm)
+    derivative = np.zeros((3 * stations + len(joint.dead_length_mm), 6 + len(state.dead_length_mm)))
+    arms = cross_matrices(joint.stations_mm - problem.centre_mm - state.stations_mm[0])
+    derivative[: 3 * stations, :3] = np.tile(np.eye(3), (stations, 1))
+    derivative[: 3 * stations, 3:6] = (-arms @ jacobian).reshape(-1, 3) / LEVER_MM
+    turn = np.eye(len(derivative))
+    turn[: 3 * stations, : 3 * stations] = np.kron(np.eye(stations), forward @ located.placement.rotation)
+    derivative[:, 6:] = turn[:, located.calibration.free]
+    return derivative
+
+
+def _length_residuals(readings: Readings, poses: FloatArray, pose: IntArray, state: State) -> FloatArray:
+    """Model minus reading of every reading, also of those that were not used, (n,), mm."""
+    layout = readings.layout
+    values = layout.values(state.errors, [layout.basis(axis, poses[:, axis]) for axis in range(3)])
+    tip = tip_position(layout.machine, values, poses[:, :3], poses[:, 3:])
+    distance = np.linalg.norm(tip[pose] - state.stations_mm[readings.lengths.station], axis=1)
+    return np.asarray(distance - state.dead_length_mm[readings.group] - readings.lengths.length_mm)
+
+
+def _not_located(lengths: Lengths, rows: IntArray, residual_mm: FloatArray) -> tuple[Rejected, ...]:
+    """Readings of points that fewer than three stations see."""
+    reason = "fewer than three stations see its point, so that it cannot be located; the joint method uses the reading"
+    found = []
+    for row in rows.tolist():
+        file, line = lengths.origin[row] if lengths.origin else ("", 0)
+        station = lengths.stations[lengths.station[row]]
+        residual_um = float(-residual_mm[row]) / MM_PER_UM
+        found.append(Rejected(row, station, str(lengths.point[row]), residual_um, reason, file, line))
+    return tuple(found)
+
+
+def _summary(readings: Readings, located: Located, solution: Solution) -> dict[str, Any]:
+    """Return what each step leaves, for ``identify.json``."""
+    calibration = located.calibration
+    points = len(located.position_mm)
+    freedom = 3 * points - readings.layout.size - 6
+    u = located.deviations.u_mm
+    assert u is not None
+    return {
+        "self_calibration": {
+            "points": points,
+            "readings": len(located.rows),
+            "degrees_of_freedom": calibration.degrees_of_freedom,
+            "reduced_chi_square": calibration.chi_square / max(calibration.degrees_of_freedom, 1),
+            "residual_rms_um": float(np.sqrt(np.mean(calibration.residual_mm**2))) / MM_PER_UM,
+            "stations_mm": calibration.frame.stations_mm.round(7).tolist(),
+            "iterations": calibration.iterations,
+        },
+        "transformation": {
+            "rotation": located.placement.rotation.tolist(),
+            "translation_mm": located.placement.translation_mm.tolist(),
+            "held_at_reference_point": located.anchored,
+            "mirrored": located.placement.mirrored,
+            "deviation_rms_um": located.placement.rms_mm / MM_PER_UM,
+            "u_deviation_max_um": float(u.max()) / MM_PER_UM,
+        },
+        "separation": {
+            "degrees_of_freedom": freedom,
+            "reduced_chi_square": 2.0 * solution.cost / max(freedom, 1),
+        },
+    }
