@@ -23,12 +23,14 @@ from compgen.identify.affine_start import affine_start
 from compgen.identify.covariance import with_systematic
 from compgen.identify.grid_problem import GridProblem, grid_problem, start_moments
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
-from compgen.identify.outliers import accepted_readings, explain_rejected
-from compgen.identify.parameters import error_parameters
+from compgen.identify.outliers import explain_rejected
+from compgen.identify.parameters import ErrorParameters, error_parameters
 from compgen.identify.problem import LengthProblem, length_problem
 from compgen.identify.rank import Rank, analyse_rank
 from compgen.identify.result import Identification, StationResult, worst_uncertainty
-from compgen.identify.solver import Factor, Solution, factorise, solve
+from compgen.identify.robust import Readings, RobustFit, fit_robustly
+from compgen.identify.robust_start import robust_state
+from compgen.identify.solver import Factor, factorise, solve
 from compgen.identify.start import StationStart, station_start, station_start_from_moments
 from compgen.identify.state import IntArray, State
 from compgen.identify.tables import error_table, inverse, metadata_of, unobservable
@@ -80,7 +82,8 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     _check_readings(machine, lengths)
     task = _task(machine, lengths)
     start, searched = _start(task)
-    if isinstance(task.problem, GridProblem) and not searched:
+    start, disturbed = robust_state(start, lengths, task.target_mm, task.station, task.group)
+    if isinstance(task.problem, GridProblem) and not searched and not disturbed:
         start = affine_start(task.problem, start)
     noise = reading_noise(lengths, options)
     sigma_mm = noise.sigma_mm(task.problem.distances(start))
@@ -88,10 +91,24 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     task = replace(task, problem=task.problem.weighted(weights))
     factor, rank = _determined(task, start)
     start = _unmirrored(task, start, searched)
-    solution, accepted, residual = _solve_robustly(
-        task.problem, start, weights, factor, sigma_mm, reject=options.reject
-    )
-    return _result(task, solution, accepted, residual, sigma_mm, noise, rank)
+    fit = _fit(task, start, Readings(lengths, task.group, weights, sigma_mm), factor, options, disturbed=disturbed)
+    task = replace(task, problem=fit.problem, group=fit.group)
+    return _result(task, fit, sigma_mm, noise, rank)
+
+
+def _fit(
+    task: _Task, start: State, readings: Readings, factor: Factor, options: IdentifyOptions, *, disturbed: bool
+) -> RobustFit[GridProblem | LengthProblem]:
+    """Adjust with rejection and beam breaks, or with all readings as they are."""
+    if not options.reject:
+        solution = solve(task.problem, start, factor)
+        accepted = np.ones(len(readings.group), dtype=bool)
+        return RobustFit(task.problem, task.group, solution, accepted, task.problem.residuals(solution.state))
+
+    def rebuilt(group: IntArray) -> GridProblem | LengthProblem:
+        return _problem(task.machine, task.lengths, task.problem.parameters, group).weighted(readings.weight)
+
+    return fit_robustly(task.problem, start, readings, factor, rebuilt, disturbed=disturbed)
 
 
 def _check_readings(machine: Machine, lengths: Lengths) -> None:
@@ -121,16 +138,28 @@ def _check_readings(machine: Machine, lengths: Lengths) -> None:
 
 
 def _task(machine: Machine, lengths: Lengths) -> _Task:
-    tool_mm = tool_of(machine, lengths.tool_mm)
-    several_tools = tool_mm.ndim == 2 and bool(np.any(np.ptp(tool_mm, axis=0) > 1e-9))
-    if tool_mm.ndim == 2 and not several_tools:
-        tool_mm = tool_mm[0]
+    tool_mm = _tool(machine, lengths)
+    several_tools = tool_mm.ndim == 2
     names = modelled_errors(machine, np.unique(tool_mm, axis=0) if several_tools else None)
     layout = error_parameters(machine, names, several_tools=several_tools)
     group = _groups(lengths)
-    on_grid = grid_problem(layout, lengths.position_mm, tool_mm, lengths.station, group, lengths.length_mm)
-    problem = on_grid or length_problem(machine, lengths, layout)
+    problem = _problem(machine, lengths, layout, group)
     return _Task(machine, lengths, problem, lengths.station, group, lengths.position_mm + tool_mm)
+
+
+def _problem(
+    machine: Machine, lengths: Lengths, layout: ErrorParameters, group: IntArray
+) -> GridProblem | LengthProblem:
+    tool_mm = _tool(machine, lengths)
+    on_grid = grid_problem(layout, lengths.position_mm, tool_mm, lengths.station, group, lengths.length_mm)
+    return on_grid or length_problem(machine, lengths, layout, group)
+
+
+def _tool(machine: Machine, lengths: Lengths) -> FloatArray:
+    """Return the tool offset of all readings (3,), or of each (n, 3) if several tools were used."""
+    tool_mm = tool_of(machine, lengths.tool_mm)
+    one = tool_mm.ndim == 2 and not np.any(np.ptp(tool_mm, axis=0) > 1e-9)
+    return tool_mm[0] if one else tool_mm
 
 
 def _groups(lengths: Lengths) -> IntArray:
@@ -225,48 +254,15 @@ def _cost_from(problem: GridProblem | LengthProblem, start: State) -> float:
         return np.inf
 
 
-def _solve_robustly(
-    problem: GridProblem | LengthProblem,
-    start: State,
-    weights: FloatArray,
-    factor: Factor,
-    sigma_mm: FloatArray,
-    *,
-    reject: bool,
-) -> tuple[Solution, NDArray[np.bool_], FloatArray]:
-    """Solve, reject what lies beyond the robust limit, and repeat until the same readings are kept.
-
-    Returns the solution, which readings were kept, and the residuals of all of them.
-    """
-    accepted = np.ones(len(weights), dtype=bool)
-    solution = solve(problem, start, factor)
-    residual = problem.residuals(solution.state)
-    for _ in range(20 if reject else 0):
-        keep = accepted_readings(residual / sigma_mm)
-        if np.count_nonzero(keep) < 0.7 * len(keep):
-            raise ConvergenceError(
-                f"{np.count_nonzero(~keep)} of {len(keep)} readings do not fit the model; check the machine file's chain, "
-                "the station labels and the units before anything is rejected"
-            )
-        if np.array_equal(keep, accepted):
-            break
-        accepted = keep
-        problem = problem.weighted(weights * accepted)
-        solution = solve(problem, solution.state)
-        residual = problem.residuals(solution.state)
-    return solution, accepted, residual
-
-
 def _result(
     task: _Task,
-    solution: Solution,
-    accepted: NDArray[np.bool_],
-    residual: FloatArray,
+    fit: RobustFit[GridProblem | LengthProblem],
     sigma_mm: FloatArray,
     noise: ReadingNoise,
     rank: Rank | None,
 ) -> Identification:
     problem, layout = task.problem, task.problem.parameters
+    solution, accepted, residual = fit.solution, fit.accepted, fit.residual_mm
     freedom = int(np.count_nonzero(accepted)) - problem.size
     if freedom < 1:
         raise UndeterminedError(f"{np.count_nonzero(accepted)} readings for {problem.size} unknowns", [])
@@ -290,8 +286,11 @@ def _result(
         u_length_um_per_m=noise.proportional_um_per_m,
         u_scale=u_scale,
         unobservable=unobservable(layout),
-        rejected=explain_rejected(task.lengths, layout, solution.state, task.group, rejected, residual, sigma_mm),
-        rank=problem.size if rank is None else rank.rank,
+        rejected=explain_rejected(
+            task.lengths, layout, solution.state, task.group, rejected, residual, sigma_mm, fit.segments
+        ),
+        segments=fit.segments,
+        rank=problem.size if rank is None else problem.size - (rank.size - rank.rank),
         unknowns=problem.size,
         condition=1.0 / solution.factor.rcond,
         iterations=solution.iterations,

@@ -148,13 +148,19 @@ class LengthProblem:
         gradient[g0:] -= np.bincount(group, weight * residual, self.groups)
 
 
-def length_problem(machine: Machine, lengths: Lengths, parameters: ErrorParameters) -> LengthProblem:
-    """Sort the readings by pose, station and set-up; all weights 1."""
+def length_problem(
+    machine: Machine, lengths: Lengths, parameters: ErrorParameters, group: IntArray | None = None
+) -> LengthProblem:
+    """Sort the readings by pose, station and dead length; all weights 1.
+
+    ``group`` is the index of the dead length of each reading (n,), by default one for every station and set-up.
+    """
     tool = np.broadcast_to(tool_of(machine, lengths.tool_mm), lengths.position_mm.shape)
     keys = np.column_stack([lengths.position_mm, tool])
     unique, pose = np.unique(keys, axis=0, return_inverse=True)
-    setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
-    _, group = np.unique(np.column_stack([lengths.station, setup]), axis=0, return_inverse=True)
+    if group is None:
+        setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
+        _, group = np.unique(np.column_stack([lengths.station, setup]), axis=0, return_inverse=True)
     position_mm = unique[:, :3]
     bases = tuple(parameters.basis(axis, position_mm[:, axis]) for axis in range(3))
     return LengthProblem(

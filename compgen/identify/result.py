@@ -14,6 +14,7 @@ from compgen.core.names import MM_PER_UM
 from compgen.identify.adjustment import Adjustment
 from compgen.identify.outliers import Rejected
 from compgen.identify.parameters import ErrorParameters
+from compgen.identify.segments import Segment
 from compgen.identify.systematic import Systematic
 
 
@@ -46,6 +47,7 @@ class Identification:
         uncertainties are scaled by the root of the reduced chi-square (``u_scale``).
     unobservable : combinations that the model leaves out because nothing can show them, in words.
     rejected : readings that were not used, with the reason.
+    segments : beam breaks: runs of readings with a dead length of their own, or rejected together.
     rank, unknowns, condition, iterations : of the least-squares problem.
     worst_u : largest standard uncertainty by unit ("um", "urad") with its error.
     covariance : of the unknown errors in the order of ``unknowns`` of the layout, mm and rad.
@@ -75,6 +77,7 @@ class Identification:
     covariance: FloatArray
     layout: ErrorParameters
     adjustment: Adjustment | None = None
+    segments: tuple[Segment, ...] = ()
     systematic: Systematic | None = None
 
     def summary(self) -> dict[str, Any]:
@@ -99,6 +102,7 @@ class Identification:
             "identified": list(self.errors.names),
             "unobservable": list(self.unobservable),
             "rejected": [asdict(item) for item in self.rejected],
+            "segments": [item.summary() for item in self.segments],
             "worst_standard_uncertainty": {
                 unit: {"value": value, "error": name} for unit, (value, name) in self.worst_u.items()
             },

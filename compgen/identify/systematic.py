@@ -131,7 +131,7 @@ def responses(
     InputError
         if a temperature uncertainty is given and the machine file has no expansion coefficient for an axis.
     """
-    linear = _Linear(machine, length_problem(machine, lengths, layout), adjustment)
+    linear = _Linear(machine, length_problem(machine, lengths, layout, adjustment.group), adjustment)
     found = {}
     for name, value in inputs.items():
         if value > 0:

@@ -1,0 +1,203 @@
+"""Start values of the stations in spite of gross errors: least median of squares, then a robust refinement.
+
+Rousseeuw (1984), Least Median of Squares Regression: the closed form of ``start.py`` is solved for many small random
+subsets of a station's readings; the one whose median residual is smallest has met no bad reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.lengths import Lengths
+from compgen.errors import ConvergenceError, InputError
+from compgen.identify.start import StationStart
+from compgen.identify.state import IntArray, State
+
+#: A station is looked at again when a residual at its start exceeds this many robust standard deviations ...
+START_LIMIT = 6.0
+#: ... or when their robust standard deviation is larger than this; errors of a machine are mostly below.
+ORDINARY_MM = 0.5
+#: Beyond this share of the extent of the targets the readings cannot be those of one station at these points.
+GROSS_SHARE = 0.01
+TRIALS = 200
+#: At most so many readings judge a trial.
+JUDGES = 400
+#: Factors that a slip of unit leaves between the readings and millimetres.
+UNITS = {1000.0: "metres", 0.001: "micrometres", 25.4: "inches"}
+
+
+@dataclass(frozen=True)
+class _Station:
+    """Targets (n, 3), readings (n,) and set-up 0 ... g-1 (n,) of one station."""
+
+    target_mm: FloatArray
+    length_mm: FloatArray
+    member: IntArray
+
+    def residuals(self, start: StationStart) -> FloatArray:
+        distance = np.linalg.norm(self.target_mm - start.position_mm, axis=1)
+        return np.asarray(distance - start.dead_length_mm[self.member] - self.length_mm)
+
+    def part(self, rows: IntArray) -> _Station:
+        return _Station(self.target_mm[rows], self.length_mm[rows], self.member[rows])
+
+
+def robust_spread(values: FloatArray) -> float:
+    """Return 1.4826 times the median absolute value: the standard deviation of normal values about zero."""
+    return 1.4826 * float(np.median(np.abs(values)))
+
+
+def robust_state(
+    start: State, lengths: Lengths, target_mm: FloatArray, station: IntArray, group: IntArray
+) -> tuple[State, bool]:
+    """Return start values that gross errors do not move, and whether there are any gross errors.
+
+    Parameters
+    ----------
+    start : closed-form start of all stations.
+    lengths : names, readings and origin.
+    target_mm, station, group : nominal target (n, 3), station and dead length (n,) of every reading.
+
+    Raises
+    ------
+    InputError
+        if the readings of a station fit after a change of unit.
+    ConvergenceError
+        if the readings of a station fit no place, or those of all stations fit none.
+    """
+    stations, dead = start.stations_mm.copy(), start.dead_length_mm.copy()
+    misfit_mm = np.zeros(len(stations))
+    found_any = False
+    parts = {}
+    for k in range(len(stations)):
+        rows = np.flatnonzero(station == k)
+        own, member = np.unique(group[rows], return_inverse=True)
+        part = _Station(target_mm[rows], lengths.length_mm[rows], member.ravel().astype(np.int64))
+        first = StationStart(stations[k], dead[own])
+        if _looks_sound(part, first):
+            continue
+        better = _robust(part, first)
+        stations[k], dead[own] = better.position_mm, better.dead_length_mm
+        misfit_mm[k], parts[k] = robust_spread(part.residuals(better)), part
+        found_any = True
+    gross_mm = GROSS_SHARE * max(float(np.ptp(target_mm, axis=0).max()), 1.0)
+    bad = np.flatnonzero(misfit_mm > gross_mm)
+    if bad.size:
+        raise _no_place(lengths, bad.tolist(), misfit_mm, parts, station)
+    return replace(start, stations_mm=stations, dead_length_mm=dead), found_any
+
+
+def _looks_sound(part: _Station, start: StationStart) -> bool:
+    rows = _sample(len(part.length_mm), 2000)
+    residual = part.part(rows).residuals(start)
+    spread = robust_spread(residual)
+    return bool(spread < ORDINARY_MM and np.abs(residual).max() <= START_LIMIT * max(spread, 1e-9))
+
+
+def _sample(count: int, most: int) -> IntArray:
+    """Rows spread over all, at most ``most``, at random distances so that no period of the data is met."""
+    if count <= most:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
+
+
+def _robust(part: _Station, first: StationStart) -> StationStart:
+    """Least median of squares over random subsets and the given start, then refined."""
+    groups = len(first.dead_length_mm)
+    rng = np.random.default_rng(1)
+    judges = part.part(_sample(len(part.length_mm), JUDGES))
+    best, score = first, float(np.median(np.abs(judges.residuals(first))))
+    size = min(3 + 2 * groups + 4, len(part.length_mm))
+    for _ in range(TRIALS):
+        candidate = _closed_form(part.part(rng.choice(len(part.length_mm), size, replace=False)), groups)
+        if candidate is None:
+            continue
+        median = float(np.median(np.abs(judges.residuals(candidate))))
+        if median < score:
+            best, score = candidate, median
+    return _refined(part, best)
+
+
+def _closed_form(part: _Station, groups: int) -> StationStart | None:
+    """The linear equations of ``start.station_start`` for a few readings; None where they determine nothing."""
+    centre = part.target_mm.mean(axis=0)
+    p = part.target_mm - centre
+    scale = max(float(np.abs(p).max()), 1.0)
+    p, reading = p / scale, part.length_mm / scale
+    member = (part.member[:, None] == np.arange(groups)).astype(np.float64)
+    if not member.any(axis=0).all():
+        return None
+    columns = np.column_stack([2 * p, 2 * reading[:, None] * member, member])
+    target = np.einsum("ij,ij->i", p, p) - reading**2
+    solution, _, rank, _ = np.linalg.lstsq(columns, target, rcond=1e-10)
+    if rank < columns.shape[1]:
+        return None
+    return StationStart(solution[:3] * scale + centre, solution[3 : 3 + groups] * scale)
+
+
+def _refined(part: _Station, start: StationStart) -> StationStart:
+    """Gauss-Newton on the distances with Tukey's weights (zero beyond ``START_LIMIT`` robust deviations)."""
+    groups = len(start.dead_length_mm)
+    member = (part.member[:, None] == np.arange(groups)).astype(np.float64)
+    score = robust_spread(part.residuals(start))
+    for _ in range(20):
+        residual = part.residuals(start)
+        ratio = residual / (START_LIMIT * max(robust_spread(residual), 1e-9))
+        weight = np.clip(1.0 - ratio**2, 0.0, None)
+        sight = part.target_mm - start.position_mm
+        unit = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
+        design = np.hstack([-unit, -member]) * weight[:, None]
+        step = np.linalg.lstsq(design, -weight * residual, rcond=1e-9)[0]
+        moved = StationStart(start.position_mm + step[:3], start.dead_length_mm + step[3:])
+        new = robust_spread(part.residuals(moved))
+        if not new < 1.5 * score:
+            break
+        start, score = moved, new
+        if np.abs(step).max() < 1e-4:
+            break
+    return start
+
+
+def _no_place(
+    lengths: Lengths, bad: Sequence[int], misfit_mm: FloatArray, parts: dict[int, _Station], station: IntArray
+) -> InputError | ConvergenceError:
+    """Return the error for stations whose readings fit no place, with the likely cause."""
+    worst = max(bad, key=lambda k: misfit_mm[k])
+    for k in sorted(bad, key=lambda k: -misfit_mm[k]):
+        unit = _unit_slip(parts[k], float(misfit_mm[k]))
+        if unit:
+            row = int(np.flatnonzero(station == k)[0])
+            file, line = lengths.origin[row] if lengths.origin else (None, None)
+            return InputError(
+                f"the readings of station {lengths.stations[k]!r} fit when they are taken as {unit}; the unit is mm: "
+                "convert them",
+                file=file,
+                line=line,
+                field="column length_mm",
+            )
+    names = ", ".join(lengths.stations[k] for k in bad)
+    if len(bad) > 1 and len(bad) > len(lengths.stations) / 2:
+        return ConvergenceError(
+            f"the lengths do not fit the commanded positions: the readings of {len(bad)} of {len(lengths.stations)} "
+            f"stations ({names}) fit no place, the worst {lengths.stations[worst]!r} with {misfit_mm[worst]:.3g} mm; "
+            "check axis order, signs and unit of x_mm, y_mm, z_mm"
+        )
+    return ConvergenceError(
+        f"the readings of station {lengths.stations[worst]!r} fit no place: the median misfit is "
+        f"{misfit_mm[worst]:.3g} mm; check its unit, and whether readings of another station or of other points "
+        "stand under its name"
+    )
+
+
+def _unit_slip(part: _Station, misfit_mm: float) -> str:
+    for factor, unit in UNITS.items():
+        scaled = replace(part, length_mm=part.length_mm * factor)
+        groups = int(part.member.max()) + 1
+        start = _robust(scaled, StationStart(part.target_mm.mean(axis=0), np.zeros(groups)))
+        if robust_spread(scaled.residuals(start)) < 0.02 * misfit_mm:
+            return unit
+    return ""
