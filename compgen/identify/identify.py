@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from compgen.identify.adjustment import Adjustment
 from compgen.identify.affine_start import affine_start
 from compgen.identify.covariance import with_systematic
 from compgen.identify.grid_problem import GridProblem, grid_problem, start_moments
+from compgen.identify.known_stations import HeldStations, KnownStations, hold, locate_stations, with_known_start
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
 from compgen.identify.outliers import explain_rejected
 from compgen.identify.parameters import ErrorParameters, error_parameters
@@ -35,9 +37,11 @@ from compgen.identify.start import StationStart, station_start, station_start_fr
 from compgen.identify.state import IntArray, State
 from compgen.identify.tables import error_table, inverse, metadata_of, unobservable
 from compgen.identify.threads import one_thread
+from compgen.identify.two_step import TracerReadings, solve_in_two_steps
 from compgen.model.observability import modelled_errors
 from compgen.model.volumetric import tool_of
 
+AnyProblem = GridProblem | LengthProblem | HeldStations
 MIN_STATIONS = 3
 #: Reciprocal condition of the scaled normal matrix below which the rank is looked at in detail.
 SUSPICIOUS_RCOND = 1e-10
@@ -49,7 +53,7 @@ class _Task:
 
     machine: Machine
     lengths: Lengths
-    problem: GridProblem | LengthProblem
+    problem: AnyProblem
     station: IntArray
     group: IntArray
     target_mm: FloatArray
@@ -79,7 +83,7 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
 
 
 def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification:
-    _check_readings(machine, lengths)
+    _check_readings(machine, lengths, 1 if options.stations is not None else MIN_STATIONS)
     task = _task(machine, lengths)
     start, searched = _start(task)
     start, disturbed = robust_state(start, lengths, task.target_mm, task.station, task.group)
@@ -89,34 +93,70 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     sigma_mm = noise.sigma_mm(task.problem.distances(start))
     weights = (sigma_mm.min() / sigma_mm) ** 2
     task = replace(task, problem=task.problem.weighted(weights))
+    if options.stations is not None:
+        task, start = _with_known_stations(task, start, options.stations, float(sigma_mm.min()))
     factor, rank = _determined(task, start)
     start = _unmirrored(task, start, searched)
+    if options.method == "two-step":
+        return _two_step_result(task, start, sigma_mm, noise, options)
     fit = _fit(task, start, Readings(lengths, task.group, weights, sigma_mm), factor, options, disturbed=disturbed)
     task = replace(task, problem=fit.problem, group=fit.group)
     return _result(task, fit, sigma_mm, noise, rank)
 
 
+def _with_known_stations(
+    task: _Task, start: State, stations: KnownStations | Literal["nominal"], sigma_mm: float
+) -> tuple[_Task, State]:
+    """Add the known stations to the problem and start from them."""
+    known = locate_stations(task.machine, task.lengths) if isinstance(stations, str) else stations
+    assert not isinstance(task.problem, HeldStations)
+    start = with_known_start(start, known, task.lengths, task.target_mm, task.group)
+    return replace(task, problem=hold(task.problem, known, task.lengths.stations, sigma_mm)), start
+
+
+def _two_step_result(
+    task: _Task, start: State, sigma_mm: FloatArray, noise: ReadingNoise, options: IdentifyOptions
+) -> Identification:
+    """Identify by self-calibration, transformation and separation (Zha & Zhang 2024, sections 4 and 5)."""
+    if options.stations is not None:
+        raise InputError("known stations belong to the joint method; in two steps the tracers locate themselves")
+    readings = TracerReadings(task.lengths, task.problem.parameters, task.group, sigma_mm, start)
+    found = solve_in_two_steps(readings, reject=options.reject)
+    residual = task.problem.residuals(found.solution.state)
+    fit = RobustFit(task.problem, task.group, found.solution, found.accepted, residual)
+    result = _result(task, fit, sigma_mm, noise, None)
+    reasons = {item.row: item for item in found.rejected}
+    return replace(
+        result,
+        rejected=tuple(reasons.get(item.row, item) for item in result.rejected),
+        method="two-step",
+        steps=found.summary,
+        positions=found.located.deviations,
+    )
+
+
 def _fit(
     task: _Task, start: State, readings: Readings, factor: Factor, options: IdentifyOptions, *, disturbed: bool
-) -> RobustFit[GridProblem | LengthProblem]:
+) -> RobustFit[AnyProblem]:
     """Adjust with rejection and beam breaks, or with all readings as they are."""
     if not options.reject:
         solution = solve(task.problem, start, factor)
         accepted = np.ones(len(readings.group), dtype=bool)
         return RobustFit(task.problem, task.group, solution, accepted, task.problem.residuals(solution.state))
 
-    def rebuilt(group: IntArray) -> GridProblem | LengthProblem:
-        return _problem(task.machine, task.lengths, task.problem.parameters, group).weighted(readings.weight)
+    def rebuilt(group: IntArray) -> AnyProblem:
+        problem = _problem(task.machine, task.lengths, task.problem.parameters, group).weighted(readings.weight)
+        return task.problem.rebuilt(problem) if isinstance(task.problem, HeldStations) else problem
 
     return fit_robustly(task.problem, start, readings, factor, rebuilt, disturbed=disturbed)
 
 
-def _check_readings(machine: Machine, lengths: Lengths) -> None:
-    if len(lengths.stations) < MIN_STATIONS:
+def _check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
+    if len(lengths.stations) < least:
         raise InputError(
             f"holds readings of {len(lengths.stations)} station(s) ({', '.join(lengths.stations)}); identification "
-            f"needs at least {MIN_STATIONS}: with fewer unknown stations a function-valued ambiguity is left. Add the "
-            "missing station, or measure with the same tracer from further places",
+            f"needs at least {least}: with fewer unknown stations a function-valued ambiguity is left. Add the "
+            "missing station, measure with the same tracer from further places, or give known stations",
             file=lengths.origin[0][0] if lengths.origin else None,
         )
     columns = [np.ascontiguousarray(column) for column in lengths.position_mm.T]
@@ -247,7 +287,7 @@ def _unmirrored(task: _Task, start: State, searched: Sequence[int]) -> State:
     return start
 
 
-def _cost_from(problem: GridProblem | LengthProblem, start: State) -> float:
+def _cost_from(problem: AnyProblem, start: State) -> float:
     try:
         return solve(problem, start).cost
     except ConvergenceError:
@@ -256,18 +296,21 @@ def _cost_from(problem: GridProblem | LengthProblem, start: State) -> float:
 
 def _result(
     task: _Task,
-    fit: RobustFit[GridProblem | LengthProblem],
+    fit: RobustFit[AnyProblem],
     sigma_mm: FloatArray,
     noise: ReadingNoise,
     rank: Rank | None,
 ) -> Identification:
     problem, layout = task.problem, task.problem.parameters
     solution, accepted, residual = fit.solution, fit.accepted, fit.residual_mm
-    freedom = int(np.count_nonzero(accepted)) - problem.size
+    held = problem if isinstance(problem, HeldStations) else None
+    freedom = int(np.count_nonzero(accepted)) - problem.size + (held.observations if held else 0)
     if freedom < 1:
         raise UndeterminedError(f"{np.count_nonzero(accepted)} readings for {problem.size} unknowns", [])
     used = residual if accepted.all() else residual[accepted]
-    chi_square = float(np.sum((used / (sigma_mm if accepted.all() else sigma_mm[accepted])) ** 2)) / freedom
+    square_sum = float(np.sum((used / (sigma_mm if accepted.all() else sigma_mm[accepted])) ** 2))
+    square_sum += held.square_sum(solution.state) / float(sigma_mm.min()) ** 2 if held else 0.0
+    chi_square = square_sum / freedom
     u_scale = float(np.sqrt(chi_square)) if noise.source == "assumed" else max(1.0, float(np.sqrt(chi_square)))
     covariance = inverse(solution.factor) * (float(sigma_mm.min()) * u_scale) ** 2
     errors = error_table(layout, solution.state.errors, covariance[: layout.size, : layout.size])

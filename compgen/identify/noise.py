@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -10,7 +11,11 @@ from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.names import MM_PER_UM
 from compgen.errors import InputError
+from compgen.identify.known_stations import KnownStations
 from compgen.identify.systematic import SystematicInputs
+
+Method = Literal["joint", "two-step"]
+METHODS: tuple[Method, ...] = ("joint", "two-step")
 
 #: Standard uncertainty of a laser tracer's length when neither the file nor the user states one: half of the usual
 #: statement 0.2 um + 0.3 um/m at k = 2.
@@ -25,12 +30,19 @@ class IdentifyOptions:
     ``u_length_um`` and ``u_length_um_per_m`` are the standard uncertainty a + b L of a reading; without them the
     comments of that name in the file count, else the usual statement of a laser tracer. ``reject`` False keeps all
     readings. ``systematic`` are the uncertainties of inputs that all readings share.
+
+    ``method`` is "joint" or "two-step" (:mod:`compgen.identify.two_step`). ``stations`` are known beforehand, or located
+    with the machine taken as perfect ("nominal"). ``u_deviation_um`` is the standard uncertainty of a measured deviation;
+    it belongs to deviations files only.
     """
 
     u_length_um: float | None = None
     u_length_um_per_m: float | None = None
     reject: bool = True
     systematic: SystematicInputs = SystematicInputs()
+    method: Method = "joint"
+    stations: KnownStations | Literal["nominal"] | None = None
+    u_deviation_um: float | None = None
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
+from compgen.core.deviations import Deviations
 from compgen.core.error_table import ErrorTable
 from compgen.core.names import MM_PER_UM
 from compgen.identify.adjustment import Adjustment
@@ -54,6 +56,10 @@ class Identification:
     layout : the unknown errors and their bases.
     adjustment : the optimum with its factor, for the joint covariance and for systematic inputs; None if there is none.
     systematic : what systematic inputs contribute, and is part of the standard uncertainties then; None if none is.
+    method : "joint", "two-step", or "deviations" where measured positions were given in place of lengths; then the
+        residuals are those of the components dx, dy, dz, and ``u_length_um`` is their standard uncertainty.
+    steps : figures of the single steps of the two-step method.
+    positions : the positions that it measured in the machine frame, against the commanded ones.
     """
 
     errors: ErrorTable
@@ -79,10 +85,14 @@ class Identification:
     adjustment: Adjustment | None = None
     segments: tuple[Segment, ...] = ()
     systematic: Systematic | None = None
+    method: str = "joint"
+    steps: Mapping[str, Any] = field(default_factory=dict)
+    positions: Deviations | None = None
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``identify.json``."""
         return {
+            "method": self.method,
             "residual_rms_um": self.rms_um,
             "residual_max_um": float(np.max(np.abs(self.residual_mm[self.accepted]))) / MM_PER_UM,
             "degrees_of_freedom": self.degrees_of_freedom,
@@ -111,6 +121,7 @@ class Identification:
             },
             "stations": [asdict(station) for station in self.stations],
             "systematic": None if self.systematic is None else self.systematic.summary(),
+            **({"steps": dict(self.steps)} if self.steps else {}),
         }
 
 

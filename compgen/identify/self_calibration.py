@@ -141,7 +141,7 @@ def self_calibrate(sightings: Sightings, start: Frame) -> SelfCalibration:
         frame=frame,
         free=data.free,
         information=step.information,
-        lever=-np.linalg.solve(step.information, step.coupling),
+        lever=-_solved(step.information, step.coupling),
         station_information=step.reduced,
         residual_mm=residual,
         chi_square=2.0 * step.cost,
@@ -235,7 +235,9 @@ def _linearise(data: _Data, frame: Frame) -> _Linear:
     np.add.at(cross, (own, dead[:, None]), weight[:, None] * unit)
     station_matrix += cross + cross.T
     station_matrix[np.diag_indices(columns)] += np.bincount(dead, weight, columns)
-    gradient = -np.bincount(own.ravel(), pulled.ravel(), columns) - np.bincount(dead, weight * residual, columns)
+    gradient = np.zeros(columns)
+    gradient -= np.bincount(own.ravel(), pulled.ravel(), columns)
+    gradient -= np.bincount(dead, weight * residual, columns)
     free = data.free
     coupling, station_matrix = -coupling[:, :, free], station_matrix[np.ix_(free, free)]
     flat = coupling.reshape(-1, len(free))
@@ -255,7 +257,8 @@ def _linearise(data: _Data, frame: Frame) -> _Linear:
 def _scatter(point: IntArray, column: IntArray, values: FloatArray, points: int, columns: int) -> FloatArray:
     """Sum values (n, 3, k) into (points, 3, columns) at point (n,) and column (n, k)."""
     index = (point[:, None, None] * 3 + np.arange(3)[:, None]) * columns + column[:, None, :]
-    return np.bincount(index.ravel(), values.ravel(), points * 3 * columns).reshape(points, 3, columns)
+    summed = np.bincount(index.ravel(), values.ravel(), points * 3 * columns)
+    return np.asarray(summed, dtype=np.float64).reshape(points, 3, columns)
 
 
 def _solved(information: FloatArray, right: FloatArray) -> FloatArray:

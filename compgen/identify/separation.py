@@ -86,7 +86,7 @@ class SeparationProblem:
 
     def _seen(self, state: State, tip_mm: FloatArray) -> FloatArray:
         """Tips as vectors from the centre in the measured frame, (m, 3)."""
-        return (tip_mm - self.centre_mm - state.stations_mm[0]) @ frame_rotation(-state.stations_mm[1])[0].T
+        return np.asarray((tip_mm - self.centre_mm - state.stations_mm[0]) @ frame_rotation(-state.stations_mm[1])[0].T)
 
     def _rest(self, state: State, seen: FloatArray) -> FloatArray:
         return seen + self.centre_mm - self.measured_mm - self.lever @ state.dead_length_mm

@@ -37,7 +37,7 @@ LEAST_KEPT = 0.7
 
 
 @dataclass(frozen=True)
-class Readings:
+class TracerReadings:
     """Tracer readings as the joint method has prepared them; n readings.
 
     Parameters
@@ -96,7 +96,7 @@ class TwoSteps:
     summary: dict[str, Any]
 
 
-def solve_in_two_steps(readings: Readings, *, reject: bool) -> TwoSteps:
+def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
     """Self-calibrate, place, separate; reject what lies beyond the robust limit, and repeat until the same are kept.
 
     Raises
@@ -142,7 +142,7 @@ def _check_enough(keep: NDArray[np.bool_]) -> None:
         )
 
 
-def _poses(readings: Readings) -> tuple[FloatArray, IntArray]:
+def _poses(readings: TracerReadings) -> tuple[FloatArray, IntArray]:
     """Distinct positions with their tools (m, 6), and the pose of each reading (n,)."""
     lengths = readings.lengths
     tool = np.broadcast_to(tool_of(readings.layout.machine, lengths.tool_mm), lengths.position_mm.shape)
@@ -150,8 +150,8 @@ def _poses(readings: Readings) -> tuple[FloatArray, IntArray]:
     return poses, pose.ravel().astype(np.int64)
 
 
-def _locatable(readings: Readings, pose: IntArray, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Readings whose pose is seen by three stations or more; InputError if they cannot locate the tracers."""
+def _locatable(readings: TracerReadings, pose: IntArray, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """TracerReadings whose pose is seen by three stations or more; InputError if they cannot locate the tracers."""
     lengths = readings.lengths
     names = lengths.stations
     seen = np.zeros((int(pose.max()) + 1, len(names)), dtype=bool)
@@ -177,7 +177,7 @@ def _locatable(readings: Readings, pose: IntArray, keep: NDArray[np.bool_]) -> N
     return np.asarray(rows)
 
 
-def _locate(readings: Readings, poses: FloatArray, pose: IntArray, rows: IntArray) -> Located:
+def _locate(readings: TracerReadings, poses: FloatArray, pose: IntArray, rows: IntArray) -> Located:
     """Steps 1 and 2: eq. 12-19 and eq. 20."""
     lengths = readings.lengths
     present, point = np.unique(pose[rows], return_inverse=True)
@@ -215,14 +215,14 @@ def _locate(readings: Readings, poses: FloatArray, pose: IntArray, rows: IntArra
     )
 
 
-def _anchor(readings: Readings, position_mm: FloatArray) -> int | None:
+def _anchor(readings: TracerReadings, position_mm: FloatArray) -> int | None:
     """The pose at the machine's reference point, if it was measured once."""
     away = np.abs(position_mm - np.array(readings.layout.machine.reference_point_mm)).max(axis=1)
     at = np.flatnonzero(away < 1e-6)
     return int(at[0]) if len(at) == 1 else None
 
 
-def _separation(readings: Readings, located: Located) -> SeparationProblem:
+def _separation(readings: TracerReadings, located: Located) -> SeparationProblem:
     turn, calibration = located.placement.rotation, located.calibration
     bases = tuple(readings.layout.basis(axis, located.position_mm[:, axis]) for axis in range(3))
     return SeparationProblem(
@@ -237,7 +237,7 @@ def _separation(readings: Readings, located: Located) -> SeparationProblem:
     )
 
 
-def _solve(problem: SeparationProblem, located: Located, readings: Readings) -> Solution:
+def _solve(problem: SeparationProblem, located: Located, readings: TracerReadings) -> Solution:
     """Step 3: eq. 21-28."""
     matrix = problem.normal_matrix(problem.start)
     try:
@@ -294,7 +294,7 @@ def _station_derivative(problem: SeparationProblem, state: State, located: Locat
     return derivative
 
 
-def _length_residuals(readings: Readings, poses: FloatArray, pose: IntArray, state: State) -> FloatArray:
+def _length_residuals(readings: TracerReadings, poses: FloatArray, pose: IntArray, state: State) -> FloatArray:
     """Model minus reading of every reading, also of those that were not used, (n,), mm."""
     layout = readings.layout
     values = layout.values(state.errors, [layout.basis(axis, poses[:, axis]) for axis in range(3)])
@@ -304,7 +304,7 @@ def _length_residuals(readings: Readings, poses: FloatArray, pose: IntArray, sta
 
 
 def _not_located(lengths: Lengths, rows: IntArray, residual_mm: FloatArray) -> tuple[Rejected, ...]:
-    """Readings of points that fewer than three stations see."""
+    """TracerReadings of points that fewer than three stations see."""
     reason = "fewer than three stations see its point, so that it cannot be located; the joint method uses the reading"
     found = []
     for row in rows.tolist():
@@ -315,7 +315,7 @@ def _not_located(lengths: Lengths, rows: IntArray, residual_mm: FloatArray) -> t
     return tuple(found)
 
 
-def _summary(readings: Readings, located: Located, solution: Solution) -> dict[str, Any]:
+def _summary(readings: TracerReadings, located: Located, solution: Solution) -> dict[str, Any]:
     """Return what each step leaves, for ``identify.json``."""
     calibration = located.calibration
     points = len(located.position_mm)
