@@ -17,7 +17,7 @@ from scipy.linalg import LinAlgError
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
-from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.names import MM_PER_UM
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjustment import Adjustment
 from compgen.identify.affine_start import affine_start
@@ -26,7 +26,7 @@ from compgen.identify.grid_problem import GridProblem, grid_problem, start_momen
 from compgen.identify.known_stations import HeldStations, KnownStations, hold, locate_stations, with_known_start
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
 from compgen.identify.outliers import explain_rejected
-from compgen.identify.parameters import ErrorParameters, error_parameters
+from compgen.identify.parameters import ErrorParameters, common_tool, parameters_for_tools
 from compgen.identify.problem import LengthProblem, length_problem
 from compgen.identify.rank import Rank, analyse_rank
 from compgen.identify.result import Identification, StationResult, worst_uncertainty
@@ -37,9 +37,8 @@ from compgen.identify.start import StationStart, station_start, station_start_fr
 from compgen.identify.state import IntArray, State
 from compgen.identify.tables import error_table, inverse, metadata_of, unobservable
 from compgen.identify.threads import one_thread
+from compgen.identify.travel import check_travel
 from compgen.identify.two_step import TracerReadings, solve_in_two_steps
-from compgen.model.observability import modelled_errors
-from compgen.model.volumetric import tool_of
 
 AnyProblem = GridProblem | LengthProblem | HeldStations
 MIN_STATIONS = 3
@@ -159,29 +158,12 @@ def _check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
             "missing station, measure with the same tracer from further places, or give known stations",
             file=lengths.origin[0][0] if lengths.origin else None,
         )
-    columns = [np.ascontiguousarray(column) for column in lengths.position_mm.T]
-    low, high = np.array([column.min() for column in columns]), np.array([column.max() for column in columns])
-    outside = (low < machine.lower_mm - 1e-3) | (high > machine.upper_mm + 1e-3)
-    if outside.any():
-        axis = int(np.flatnonzero(outside)[0])
-        first, last = machine.axes[axis].range_mm
-        along = lengths.position_mm[:, axis]
-        row = int(np.flatnonzero((along < first - 1e-3) | (along > last + 1e-3))[0])
-        file, line = lengths.origin[row] if lengths.origin else (None, None)
-        raise InputError(
-            f"{along[row]:g} mm lies outside the travel {first:g} ... {last:g} mm of {AXES[axis]} "
-            f"of machine {machine.name!r}: wrong machine file, wrong axis order or wrong unit?",
-            file=file,
-            line=line,
-            field=f"column {AXES[axis].lower()}_mm",
-        )
+    check_travel(machine, lengths.position_mm, lengths.origin)
 
 
 def _task(machine: Machine, lengths: Lengths) -> _Task:
-    tool_mm = _tool(machine, lengths)
-    several_tools = tool_mm.ndim == 2
-    names = modelled_errors(machine, np.unique(tool_mm, axis=0) if several_tools else None)
-    layout = error_parameters(machine, names, several_tools=several_tools)
+    tool_mm = common_tool(machine, lengths.tool_mm)
+    layout = parameters_for_tools(machine, tool_mm)
     group = _groups(lengths)
     problem = _problem(machine, lengths, layout, group)
     return _Task(machine, lengths, problem, lengths.station, group, lengths.position_mm + tool_mm)
@@ -190,16 +172,9 @@ def _task(machine: Machine, lengths: Lengths) -> _Task:
 def _problem(
     machine: Machine, lengths: Lengths, layout: ErrorParameters, group: IntArray
 ) -> GridProblem | LengthProblem:
-    tool_mm = _tool(machine, lengths)
+    tool_mm = common_tool(machine, lengths.tool_mm)
     on_grid = grid_problem(layout, lengths.position_mm, tool_mm, lengths.station, group, lengths.length_mm)
     return on_grid or length_problem(machine, lengths, layout, group)
-
-
-def _tool(machine: Machine, lengths: Lengths) -> FloatArray:
-    """Return the tool offset of all readings (3,), or of each (n, 3) if several tools were used."""
-    tool_mm = tool_of(machine, lengths.tool_mm)
-    one = tool_mm.ndim == 2 and not np.any(np.ptp(tool_mm, axis=0) > 1e-9)
-    return tool_mm[0] if one else tool_mm
 
 
 def _groups(lengths: Lengths) -> IntArray:

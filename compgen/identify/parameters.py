@@ -11,7 +11,8 @@ from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import ERROR_INDEX, SQUARENESS_NAMES, ErrorName, error_named
 from compgen.model.basis import free_basis, hat_matrix, spline_matrix
-from compgen.model.observability import observable_errors
+from compgen.model.observability import modelled_errors, observable_errors
+from compgen.model.volumetric import tool_of
 
 #: Positions per node interval at which a cubic curve is written, so that linear interpolation loses nothing.
 SUBDIVISION = 8
@@ -104,6 +105,20 @@ def error_parameters(machine: Machine, names: Sequence[str], *, several_tools: b
         size += free.shape[1]
     squareness = tuple(name for name in names if name in SQUARENESS_NAMES)
     return ErrorParameters(machine, tuple(curves), squareness, size + len(squareness))
+
+
+def common_tool(machine: Machine, tool_mm: FloatArray | None) -> FloatArray:
+    """Return the tool offset of all rows (3,), or of each (n, 3) if several tools were used; None is the machine's."""
+    offset_mm = tool_of(machine, tool_mm)
+    one = offset_mm.ndim == 2 and not np.any(np.ptp(offset_mm, axis=0) > 1e-9)
+    return offset_mm[0] if one else offset_mm
+
+
+def parameters_for_tools(machine: Machine, tool_mm: FloatArray) -> ErrorParameters:
+    """Lay out the errors that the machine's model contains for the tools that were used, (3,) or (n, 3)."""
+    several = tool_mm.ndim == 2
+    names = modelled_errors(machine, np.unique(tool_mm, axis=0) if several else None)
+    return error_parameters(machine, names, several_tools=several)
 
 
 def _free_coefficients(machine: Machine, error: ErrorName, *, released: bool) -> FloatArray:
