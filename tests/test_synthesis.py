@@ -1,17 +1,23 @@
 """The wanted correction, and the tables that come closest to it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from compgen.controllers import CONTROLLERS
-from compgen.core.error_table import ErrorTable
-from compgen.core.machine import CHAINS, Chain, Machine
+from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.machine import CHAINS, Axis, Chain, Machine
+from compgen.core.names import SQUARENESS_NAMES, error_named
+from compgen.core.tomlio import Section
 from compgen.errors import ConvergenceError
 from compgen.export import projector, synthesize, wanted_correction
+from compgen.model import modelled_errors
 from compgen.model.exact import tip_position
 
 PICOMETRE = 1e-9
 NANOMETRE = 1e-6
+MICROMETRE = 1e-3
 EXAMPLE_SQUARENESS_RAD = 2.9e-3
 ANCHORED = sorted(name for name, control in CONTROLLERS.items() if control.anchored)
 
@@ -151,3 +157,52 @@ def test_a_field_that_a_basis_can_hold_is_returned_exactly(small_machine, small_
     values = np.concatenate([term.start for term in basis])
     wanted = solver.field(values)
     assert np.max(np.abs(solver.field(solver.project(wanted)) - wanted)) < NANOMETRE
+
+
+def smooth_errors(machine, seed=4):
+    """Smooth curves of some 10 um and 20 urad, in the gauge of the model, on many positions."""
+    rng = np.random.default_rng(seed)
+    curves = {}
+    for name in modelled_errors(machine):
+        if name in SQUARENESS_NAMES:
+            continue
+        error = error_named(name)
+        low, high = machine.axes[error.axis].range_mm
+        where = np.linspace(low, high, 41)
+        s = (where - low) / (high - low)
+        value = sum(rng.normal() * np.sin(np.pi * k * s) / k for k in (1, 2, 3))
+        if not error.is_straightness:
+            value = value - np.interp(machine.reference_point_mm[error.axis], where, value)
+        curves[name] = Curve(where, value * (0.01 if error.kind == "linear" else 2e-5), np.zeros(41))
+    return ErrorTable(curves, {name: (60e-6, 0.0) for name in SQUARENESS_NAMES})
+
+
+@pytest.mark.parametrize("controller", ["siemens-eec", "fanuc-pitch"])
+@pytest.mark.parametrize("reference_mm", [(13.7, 201.3, -77.7), (-299.0, 1.0, -399.0), (299.9, 499.9, -0.1)])
+def test_nodes_beyond_the_travel_continue_the_curve(controller, reference_mm):
+    axes = tuple(Axis(r, np.linspace(*r, 9)) for r in ((-300.0, 300.0), (0.0, 500.0), (-400.0, 0.0)))
+    machine = Machine("m", Chain("WFYXZT"), axes, reference_point_mm=reference_mm)
+    errors = smooth_errors(machine)
+    control = CONTROLLERS[controller]
+    basis = control.basis(machine, control.read_settings(machine), errors)
+    values = synthesize(machine, errors, basis, anchored=True)
+    for term in basis:
+        steps = np.abs(np.diff(values[term.name]))
+        assert max(steps[0], steps[-1]) < 2.0 * np.max(steps[1:-1]) + 1e-5, term.name
+
+
+def test_the_lever_of_an_axis_own_travel_is_held_between_the_nodes():
+    axes = tuple(Axis(r, np.linspace(*r, 6)) for r in ((-300.0, 900.0), (0.0, 800.0), (-400.0, 0.0)))
+    machine = Machine("m", Chain("WXYFZT"), axes, reference_point_mm=(0.0, 0.0, 0.0))
+    settings = Section({"sign": "error"}, path=None, name="controllers.siemens-cec")
+    machine = replace(machine, controllers={"siemens-cec": settings})
+    nodes = axes[0].nodes_mm
+    value = 60e-6 * np.sin(nodes / 170.0)
+    errors = ErrorTable({"ECX": Curve(nodes, value - np.interp(0.0, nodes, value), np.zeros(6))})
+    control = CONTROLLERS["siemens-cec"]
+    basis = control.basis(machine, control.read_settings(machine), errors)
+    solver = projector(machine, basis, anchored=False)
+    wanted = wanted_correction(machine, errors, solver.position_mm)
+    rest = wanted - solver.field(solver.project(wanted), solver.position_mm)
+    assert np.max(np.abs(wanted)) > 0.03
+    assert np.max(np.abs(rest)) < 0.3 * MICROMETRE

@@ -27,6 +27,8 @@ from compgen.model.volumetric import tool_of
 #: leaves one, everywhere. Both weights lie far below that of any data (the normal matrix has unit diagonal).
 KEEP = 1e-7
 RIDGE = 1e-11
+#: A table's end interval of which less than this lies within the travel says too little about the node outside.
+LEAST_SHARE = 0.5
 
 
 def wanted_correction(
@@ -53,6 +55,7 @@ class Projector:
 
     basis: tuple[Term, ...]
     position_mm: FloatArray
+    weight: FloatArray
     tool_mm: FloatArray
     transform: csr_array
     offsets: int
@@ -68,7 +71,8 @@ class Projector:
 
     def project_all(self, wanted_mm: FloatArray) -> FloatArray:
         """Return table values (k, parameters) for k wanted fields (k, n, 3) at once."""
-        right = self.design.T @ wanted_mm.reshape(len(wanted_mm), -1).T
+        weighted = wanted_mm * self.weight[:, None]
+        right = self.design.T @ weighted.reshape(len(wanted_mm), -1).T
         solution = self.scale[:, None] * np.asarray(cho_solve(self.factor, right * self.scale[:, None]))
         return np.asarray((self.transform @ solution[: self.transform.shape[1]]).T)
 
@@ -128,16 +132,17 @@ def projector(machine: Machine, basis: Sequence[Term], *, anchored: bool) -> Pro
         np.unique(np.concatenate([[low, high], *(term.nodes_mm for term in basis if term.axis == axis)]))
         for axis, (low, high) in enumerate(item.range_mm for item in machine.axes)
     )
-    position_mm = volume_sample(machine, nodes)
+    sample = volume_sample(machine, nodes)
+    position_mm, weight = sample.position_mm, sample.weight
     tool_mm = tool_of(machine, None)
-    transform = _transform(basis)
+    transform = _transform(machine, basis)
     offsets = 3 if anchored else 0
     size = transform.shape[1] + offsets
     design = _design(basis, position_mm, tool_mm) @ transform
     if offsets:
         constants = coo_array(np.tile(np.eye(3), (len(position_mm), 1)))
         design = hstack([design, constants], format="csr")
-    normal = (design.T @ design).toarray()
+    normal = (design.T @ (design.multiply(np.repeat(weight, 3)[:, None])).tocsr()).toarray()
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
     regular = RIDGE * np.eye(size)
     regular[transform.shape[1] :] = 0.0
@@ -146,17 +151,37 @@ def projector(machine: Machine, basis: Sequence[Term], *, anchored: bool) -> Pro
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
     regular[: transform.shape[1], : transform.shape[1]] += KEEP * rows.T @ rows
     factor = cho_factor(normal * scale[:, None] * scale + regular, lower=True)
-    return Projector(tuple(basis), position_mm, tool_mm, transform, offsets, design, factor, scale)
+    return Projector(tuple(basis), position_mm, weight, tool_mm, transform, offsets, design, factor, scale)
 
 
-def _transform(basis: Sequence[Term]) -> csr_array:
+def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
     blocks = []
     for term in basis:
-        rows = np.zeros((0, len(term.nodes_mm)))
-        if term.zero_at_mm is not None and term.axis is not None:
-            rows = hat_matrix(term.nodes_mm, np.array([term.zero_at_mm]))
-        blocks.append(free_basis(np.where(np.abs(rows) < 1e-14, 0.0, rows), len(term.nodes_mm)))
+        rows = []
+        if term.axis is not None:
+            if term.zero_at_mm is not None:
+                rows.append(hat_matrix(term.nodes_mm, np.array([term.zero_at_mm]))[0])
+            rows += _beyond_travel(term.nodes_mm, *machine.axes[term.axis].range_mm)
+        blocks.append(free_basis(np.array(rows), len(term.nodes_mm)))
     return csr_array(block_diag(blocks))
+
+
+def _beyond_travel(nodes_mm: FloatArray, low_mm: float, high_mm: float) -> list[FloatArray]:
+    """Rows that make nodes beyond the travel continue the line of the two inside, where few points determine them."""
+    rows: list[FloatArray] = []
+    if len(nodes_mm) < 3:
+        return rows
+    steps = np.diff(nodes_mm)
+    for node, next_node, third, share in (
+        (0, 1, 2, (nodes_mm[1] - low_mm) / steps[0]),
+        (-1, -2, -3, (high_mm - nodes_mm[-2]) / steps[-1]),
+    ):
+        if share < LEAST_SHARE:
+            ratio = (nodes_mm[node] - nodes_mm[next_node]) / (nodes_mm[next_node] - nodes_mm[third])
+            row = np.zeros(len(nodes_mm))
+            row[node], row[next_node], row[third] = 1.0, -(1.0 + ratio), ratio
+            rows.append(row)
+    return rows
 
 
 def _keep_rows(basis: Sequence[Term]) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
 
 from compgen.core.csvio import FloatArray
 
@@ -55,17 +54,24 @@ def spline_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
 
 
 def free_basis(constraints: FloatArray, size: int) -> FloatArray:
-    """Orthonormal-or-unit basis (size, free) of all x with ``constraints`` (k, size) x = 0.
+    """Basis (size, free) of all x with ``constraints`` (k, size) x = 0, by elimination.
 
-    Rows with a single entry just drop that unknown, so that the rest keep their meaning (and exact zeros).
+    Each row drops the unknown with its largest factor, expressed by the others, which keep their meaning: a row with
+    a single entry gives an exact zero, and the basis stays sparse.
     """
-    rows = np.atleast_2d(constraints) if np.size(constraints) else np.zeros((0, size))
-    present = rows != 0.0
-    single = present.sum(axis=1) == 1
-    keep = ~present[single].any(axis=0)
+    rows = np.atleast_2d(constraints).astype(np.float64) if np.size(constraints) else np.zeros((0, size))
+    pivots: list[int] = []
+    for k in range(len(rows)):
+        pivot = int(np.argmax(np.abs(rows[k])))
+        if abs(rows[k, pivot]) < 1e-12:
+            continue  # says nothing beyond the rows before it
+        rows[k] /= rows[k, pivot]
+        others = np.arange(len(rows)) != k
+        rows[others] -= rows[others, pivot][:, None] * rows[k]
+        pivots.append(pivot)
+    keep = np.ones(size, dtype=bool)
+    keep[pivots] = False
     basis = np.eye(size)[:, keep]
-    if single.all():
-        return basis
-    rest = rows[~single] @ basis
-    rest = rest[np.any(rest != 0.0, axis=1)]
-    return basis @ np.asarray(null_space(rest), dtype=np.float64) if len(rest) else basis
+    used = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) > 1e-12).tolist()
+    basis[pivots] = -rows[used][:, keep]
+    return basis

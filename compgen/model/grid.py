@@ -13,6 +13,18 @@ from compgen.core.machine import Machine
 MOST_POINTS = 20_000
 
 
+#: Gauss-Legendre points across an axis of which the own levels are taken.
+LEAST_ACROSS, MOST_ACROSS = 4, 12
+
+
+@dataclass(frozen=True)
+class VolumeSample:
+    """Points (n, 3) in mm with weights (n,) of mean 1, for integrals over the volume."""
+
+    position_mm: FloatArray
+    weight: FloatArray
+
+
 def levels_between(nodes_mm: FloatArray, low_mm: float, high_mm: float) -> FloatArray:
     """Return the nodes within the travel, its ends, and the middle of every interval, ascending."""
     inside = nodes_mm[(nodes_mm > low_mm + 1e-9) & (nodes_mm < high_mm - 1e-9)]
@@ -51,15 +63,33 @@ def volume_grid(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int = 
     return VolumeGrid((levels[0], levels[1], levels[2]))
 
 
-def volume_sample(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int = MOST_POINTS) -> FloatArray:
-    """Return points (n, 3) that determine tables with the given nodes: the full grid, or a seeded Sobol sample."""
+def volume_sample(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int = MOST_POINTS) -> VolumeSample:
+    """Return points that determine tables with the given nodes over the volume: the full grid where it is not too large.
+
+    Otherwise three grids, one for each axis: its own levels by Gauss-Legendre points of the other two. On each of them
+    a function of one axis is orthogonal to functions of the others, as it is over the volume; a random sample is not,
+    and would turn what the tables cannot hold into ragged values.
+    """
     levels = [
         levels_between(np.asarray(nodes), *axis.range_mm) for nodes, axis in zip(nodes_mm, machine.axes, strict=True)
     ]
     if np.prod([len(level) for level in levels]) <= most:
-        return VolumeGrid((levels[0], levels[1], levels[2])).position_mm
-    from scipy.stats import qmc  # imported here: it takes a quarter of a second, and few machines need it
+        position_mm = VolumeGrid((levels[0], levels[1], levels[2])).position_mm
+        return VolumeSample(position_mm, np.ones(len(position_mm)))
+    positions, weights = [], []
+    for axis in range(3):
+        count = int(np.clip(np.sqrt(most / len(levels[axis])), LEAST_ACROSS, MOST_ACROSS))
+        sides = [_gauss_legendre(machine.axes[k].range_mm, count) for k in range(3)]
+        sides[axis] = (levels[axis], np.full(len(levels[axis]), 1.0 / len(levels[axis])))
+        grid = VolumeGrid((sides[0][0], sides[1][0], sides[2][0]))
+        positions.append(grid.position_mm)
+        weights.append(np.einsum("i,j,k->ijk", sides[0][1], sides[1][1], sides[2][1]).ravel())
+    joined = np.concatenate(weights)
+    return VolumeSample(np.concatenate(positions), joined * (len(joined) / joined.sum()))
 
-    unit = qmc.Sobol(3, seed=1).random_base2(int(np.floor(np.log2(most))))
-    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    return machine.lower_mm + np.vstack([unit, corners]) * (machine.upper_mm - machine.lower_mm)
+
+def _gauss_legendre(range_mm: tuple[float, float], count: int) -> tuple[FloatArray, FloatArray]:
+    """Points within a range and their weights, which sum to 1."""
+    points, weights = np.polynomial.legendre.leggauss(count)
+    low, high = range_mm
+    return 0.5 * (low + high) + 0.5 * (high - low) * points, 0.5 * weights
