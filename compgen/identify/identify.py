@@ -98,7 +98,8 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     start = _unmirrored(task, start, searched)
     if options.method == "two-step":
         return _two_step_result(task, start, sigma_mm, noise, options)
-    fit = _fit(task, start, Readings(lengths, task.group, weights, sigma_mm), factor, options, disturbed=disturbed)
+    readings = Readings(lengths, task.target_mm, task.group, weights, sigma_mm)
+    fit = _fit(task, start, readings, factor, options, disturbed=disturbed)
     task = replace(task, problem=fit.problem, group=fit.group)
     return _result(task, fit, sigma_mm, noise, rank)
 

@@ -1,7 +1,7 @@
-"""Start values of the stations in spite of gross errors: least median of squares, then a robust refinement.
+"""Start values of the stations in spite of gross errors: a low quantile of the residuals, then a robust refinement.
 
 Rousseeuw (1984), Least Median of Squares Regression: the closed form of ``start.py`` is solved for many small random
-subsets of a station's readings; the one whose median residual is smallest has met no bad reading.
+subsets of a station's readings; the one whose residuals have the smallest quantile has met no bad reading.
 """
 
 from __future__ import annotations
@@ -47,8 +47,11 @@ class _Station:
 
 
 def robust_spread(values: FloatArray) -> float:
-    """Return 1.4826 times the median absolute value: the standard deviation of normal values about zero."""
-    return 1.4826 * float(np.median(np.abs(values)))
+    """Return 1.907 times the 40 % quantile of the absolute values: the standard deviation of normal ones about zero.
+
+    Less than the median, so that one half of the readings may be off by a beam break.
+    """
+    return 1.907 * float(np.quantile(np.abs(values), 0.4))
 
 
 def robust_state(
@@ -106,19 +109,20 @@ def _sample(count: int, most: int) -> IntArray:
 
 
 def _robust(part: _Station, first: StationStart) -> StationStart:
-    """Least median of squares over random subsets and the given start, then refined."""
+    """Best of random subsets, of all readings and of parts that follow each other, and the given start; refined."""
     groups = len(first.dead_length_mm)
     rng = np.random.default_rng(1)
     judges = part.part(_sample(len(part.length_mm), JUDGES))
-    best, score = first, float(np.median(np.abs(judges.residuals(first))))
-    size = min(3 + 2 * groups + 4, len(part.length_mm))
-    for _ in range(TRIALS):
-        candidate = _closed_form(part.part(rng.choice(len(part.length_mm), size, replace=False)), groups)
-        if candidate is None:
-            continue
-        median = float(np.median(np.abs(judges.residuals(candidate))))
-        if median < score:
-            best, score = candidate, median
+    best, score = first, robust_spread(judges.residuals(first))
+    count = len(part.length_mm)
+    size = min(3 + 2 * groups + 4, count)
+    for trial in range(TRIALS):
+        window = count if trial % 2 else max(size, int(count * rng.uniform(0.1, 0.4)))  # no beam break within a part
+        first_row = int(rng.integers(0, count - window + 1))
+        rows = first_row + rng.choice(window, size, replace=False)
+        candidate = _closed_form(part.part(rows), groups)
+        if candidate is not None and (spread := robust_spread(judges.residuals(candidate))) < score:
+            best, score = candidate, spread
     return _refined(part, best)
 
 
@@ -187,7 +191,7 @@ def _no_place(
             "check axis order, signs and unit of x_mm, y_mm, z_mm"
         )
     return ConvergenceError(
-        f"the readings of station {lengths.stations[worst]!r} fit no place: the median misfit is "
+        f"the readings of station {lengths.stations[worst]!r} fit no place: their misfit is "
         f"{misfit_mm[worst]:.3g} mm; check its unit, and whether readings of another station or of other points "
         "stand under its name"
     )

@@ -19,6 +19,8 @@ WINDOW = 12
 STEP_LIMIT = 8.0
 #: ... and this size: smaller steps are left to the test for whiteness.
 SMALLEST_STEP_MM = 5.0 * MM_PER_UM
+#: Steps smaller than this share of the largest are looked at after it has been dealt with.
+SHARE_OF_LARGEST = 0.2
 #: A segment of at least so many readings gets a dead length of its own; a shorter one is rejected.
 LEAST_OWN_READINGS = 20
 #: More breaks than this at one station are no beam breaks but a model that does not describe the readings.
@@ -83,7 +85,9 @@ def time_order(lengths: Lengths) -> IntArray:
     return np.argsort(time, kind="stable").astype(np.int64)
 
 
-def split_at_breaks(lengths: Lengths, group: IntArray, residual_mm: FloatArray) -> tuple[IntArray, FloatArray] | None:
+def split_at_breaks(
+    lengths: Lengths, group: IntArray, residual_mm: FloatArray, sight: FloatArray
+) -> tuple[IntArray, FloatArray] | None:
     """Give the readings behind a beam break a dead length of their own.
 
     A step that most stations show at the same stop is the machine's, not a station's, and splits nothing.
@@ -92,6 +96,7 @@ def split_at_breaks(lengths: Lengths, group: IntArray, residual_mm: FloatArray) 
     ----------
     lengths, group : the readings, and the dead length of each, (n,).
     residual_mm : model minus reading, (n,).
+    sight : unit vectors from station to target, (n, 3).
 
     Returns
     -------
@@ -100,16 +105,39 @@ def split_at_breaks(lengths: Lengths, group: IntArray, residual_mm: FloatArray) 
     """
     order = time_order(lengths)
     members = {k: order[group[order] == k] for k in range(int(group.max()) + 1)}
-    steps = {k: _steps(residual_mm[rows]) for k, rows in members.items()}
-    steps = _without_common(steps, members, lengths)
+    series = {k: _without_station(residual_mm[rows], sight[rows]) for k, rows in members.items()}
+    steps = _without_common({k: _steps(values) for k, values in series.items()}, members, lengths)
+    off = {k: _off_segments(members[k], series[k], found) for k, found in steps.items()}
+    largest = max((abs(offset) for found in off.values() for _, offset in found), default=0.0)
     new = group.copy()
     offsets = [0.0] * len(members)
-    for k, found in steps.items():
-        for rows, offset in _off_segments(members[k], residual_mm[members[k]], found):
+    for found in off.values():
+        for rows, offset in found:
+            if abs(offset) < SHARE_OF_LARGEST * largest:
+                continue  # may be what the largest one does to the others
             if len(rows) >= LEAST_OWN_READINGS:
                 new[rows] = len(offsets)
                 offsets.append(offset)
     return (new, np.array(offsets)) if len(offsets) > len(members) else None
+
+
+def _without_station(residual_mm: FloatArray, sight: FloatArray) -> FloatArray:
+    """Take a wrong position of the station out of a series (n,), which a beam break leaves behind.
+
+    Differences of successive residuals show a beam break only once; least absolute deviations against the
+    differences of the lines of sight (n, 3) therefore give the position's error.
+    """
+    if len(residual_mm) < 2 * WINDOW:
+        return residual_mm
+    change, turn = np.diff(residual_mm), np.diff(sight, axis=0)
+    weight: FloatArray = np.ones(len(change))
+    moved: FloatArray = np.zeros(3)
+    for _ in range(10):
+        root = np.sqrt(weight)
+        moved = np.linalg.lstsq(turn * root[:, None], change * root, rcond=1e-9)[0]
+        size = np.abs(change - turn @ moved)
+        weight = 1.0 / np.maximum(size, 0.1 * np.median(size) + 1e-12)
+    return np.asarray(residual_mm - sight @ moved)
 
 
 def _steps(residual_mm: FloatArray) -> list[int]:
@@ -182,6 +210,24 @@ def _off_segments(rows: IntArray, residual_mm: FloatArray, steps: Sequence[int])
     ]
 
 
+def merged_groups(first: IntArray, group: IntArray, dead_mm: FloatArray, limit_mm: float) -> IntArray | None:
+    """Join dead lengths of one station and set-up that agree within ``limit_mm``; None where all differ.
+
+    ``first`` and ``group`` (n,) are the indices before and after the splitting, ``dead_mm`` the dead lengths.
+    """
+    owner = np.zeros(len(dead_mm), dtype=np.int64)
+    owner[group] = first
+    target = np.arange(len(dead_mm))
+    for k in range(int(first.max()) + 1, len(dead_mm)):
+        alike = [j for j in range(k) if owner[j] == owner[k] and abs(dead_mm[j] - dead_mm[k]) < limit_mm]
+        if alike:
+            target[k] = target[alike[0]]
+    if np.array_equal(target, np.arange(len(dead_mm))):
+        return None
+    used = np.unique(np.concatenate([np.arange(int(first.max()) + 1), target]))
+    return np.searchsorted(used, target)[group].astype(np.int64)
+
+
 def kept_segments(lengths: Lengths, first: IntArray, group: IntArray, dead_mm: FloatArray) -> tuple[Segment, ...]:
     """Describe the dead lengths that ``split_at_breaks`` added.
 
@@ -191,11 +237,13 @@ def kept_segments(lengths: Lengths, first: IntArray, group: IntArray, dead_mm: F
     dead_mm : dead lengths after the adjustment.
     """
     order = time_order(lengths)
-    return tuple(
-        _segment(lengths, order[group[order] == k], float(dead_mm[first[group == k][0]] - dead_mm[k]), kept=True)
-        for k in range(int(first.max()) + 1, len(dead_mm))
-        if np.any(group == k)
-    )
+    found = []
+    for k in range(int(first.max()) + 1, len(dead_mm)):
+        offset = float(dead_mm[first[group == k][0]] - dead_mm[k])
+        own = order[first[order] == first[group == k][0]]
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], group[own] == k, [0]]).astype(int)))
+        found += [_segment(lengths, own[a:b], offset, kept=True) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return tuple(found)
 
 
 def rejected_runs(
