@@ -13,14 +13,21 @@ import numpy as np
 
 from compgen.controllers import controller_named
 from compgen.core.csvio import FloatArray, format_csv
+from compgen.core.deviations import format_deviations
 from compgen.core.error_table import ErrorTable, format_errors
 from compgen.core.files import OutputFolder, read_bytes, sha256_of
-from compgen.core.lengths import read_lengths
 from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.export import REJECTED_PREFIX, Export, Provenance, export, usable_format
 from compgen.fit import FitOptions, FitResult, fit
-from compgen.identify import Identification, IdentifyOptions, covariance, identify
+from compgen.identify import (
+    Identification,
+    IdentifyOptions,
+    covariance,
+    describe,
+    identify_measurement,
+    read_measurement,
+)
 from compgen.verify import Verification, read_tables, verify
 
 Progress = Callable[[str], None]
@@ -56,7 +63,10 @@ def provenance_of(*paths: str | Path | None) -> Provenance:
 
 
 def identification_files(result: Identification, provenance: Provenance) -> dict[str, str | bytes]:
-    """Return the contents of ``identified.errors.csv`` and its covariance, ``stations.csv`` and ``identify.json``."""
+    """Return the contents of ``identified.errors.csv`` and its covariance, ``stations.csv`` and ``identify.json``.
+
+    The two-step method adds ``measured.deviations.csv``; deviations as input give no stations.
+    """
     stations = result.stations
     columns: dict[str, Sequence[str] | FloatArray] = {
         "station": [item.station for item in stations],
@@ -71,9 +81,14 @@ def identification_files(result: Identification, provenance: Provenance) -> dict
         "residual_rms_um": np.array([item.rms_um for item in stations]),
     }
     summary = {**result.summary(), "inputs": [{"name": name, "sha256": digest} for name, digest in provenance.inputs]}
+    files: dict[str, str | bytes] = {}
+    if stations:
+        files["stations.csv"] = format_csv(columns, {"machine": result.errors.metadata.get("machine", "")})
+    if result.positions is not None:
+        files["measured.deviations.csv"] = format_deviations(result.positions)
     return {
         **_errors_files(result),
-        "stations.csv": format_csv(columns, {"machine": result.errors.metadata.get("machine", "")}),
+        **files,
         "identify.json": json.dumps(summary, indent=2) + "\n",
     }
 
@@ -158,7 +173,7 @@ def run(
     Parameters
     ----------
     machine : the machine.
-    measurements : ``*.lengths.csv`` files.
+    measurements : ``*.lengths.csv`` or ``*.deviations.csv`` files.
     controllers : names of the controls; with one its files stand in ``folder``, with several each has its own
         sub-folder.
     folder : output folder.
@@ -173,10 +188,10 @@ def run(
         controller_named(name).read_settings(machine)
         usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
-    lengths = read_lengths(measurements)
+    measurement = read_measurement(measurements)
     provenance = provenance_of(machine.source, *measurements)
-    progress(f"identifying: {len(lengths)} lengths of {len(lengths.stations)} stations")
-    identification = identify(machine, lengths, identify_options)
+    progress(f"identifying: {describe(measurement)}")
+    identification = identify_measurement(machine, measurement, identify_options)
     progress("fitting smooth curves")
     fitted = fit(machine, identification.errors, fit_options or FitOptions())
     checked: dict[str, tuple[Export, Verification]] = {}

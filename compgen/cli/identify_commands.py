@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,18 @@ import click
 from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.core.error_table import read_errors
 from compgen.core.files import OutputFolder
-from compgen.core.lengths import read_lengths
 from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.fit import FitOptions, fit
-from compgen.identify import IdentifyOptions, SystematicInputs, identify
+from compgen.identify import (
+    IdentifyOptions,
+    SystematicInputs,
+    describe,
+    identify_measurement,
+    read_measurement,
+    read_stations,
+)
+from compgen.identify.noise import METHODS
 from compgen.pipeline import fit_files, identification_files, provenance_of, write_all
 from compgen.report.text import fit_table, identification_table
 
@@ -33,6 +41,14 @@ SYSTEMATIC_HELP = {
     "target_um": "Standard uncertainty of the target's position on the tool, um, for every tool and set-up (default 0).",
     "target_station_um": "The same, for every tool, set-up and station by itself, um (default 0).",
     "drift_um": "Standard uncertainty of each station's drift from its first to its last reading, um (default 0).",
+}
+METHOD_HELP = {
+    "method": "joint (default): errors and stations in one adjustment; two-step: the tracers first locate themselves and "
+    "all points, which needs four stations at common points.",
+    "stations": "CSV with known stations (station, x_mm, y_mm, z_mm; optional u_mm, exact without), or the word nominal: "
+    "located with the machine taken as perfect.",
+    "u_deviation_um": "Standard uncertainty of a measured deviation (*.deviations.csv), um; default: the file's, else 1 um "
+    "scaled by the residuals.",
 }
 
 
@@ -63,6 +79,21 @@ def systematic_options(command: Command) -> Command:
     return decorated  # type: ignore[no-any-return]
 
 
+def method_options(command: Command) -> Command:
+    """Add how to identify; the command receives ``choices``, fields of IdentifyOptions."""
+
+    @functools.wraps(command)
+    def wrapper(*args: Any, method: str, stations: str | None, u_deviation_um: float | None, **options: Any) -> Any:
+        known = read_stations(stations) if stations not in (None, "nominal") else stations
+        choices = {"method": method, "stations": known, "u_deviation_um": u_deviation_um}
+        return command(*args, choices=choices, **options)
+
+    decorated: Any = click.option("--u-deviation-um", type=float, help=METHOD_HELP["u_deviation_um"])(wrapper)
+    decorated = click.option("--stations", metavar="FILE", help=METHOD_HELP["stations"])(decorated)
+    chosen = click.option("--method", type=click.Choice(METHODS), default="joint", help=METHOD_HELP["method"])
+    return chosen(decorated)  # type: ignore[no-any-return]
+
+
 def smoothness_option(command: Command) -> Command:
     """Add --smoothness."""
     text = "Dimensionless weight of the second differences (0 keeps the data); default: chosen from the data."
@@ -70,10 +101,14 @@ def smoothness_option(command: Command) -> Command:
 
 
 def identify_options(
-    u_length_um: float | None, u_length_um_per_m: float | None, keep_all: bool, systematic: SystematicInputs
+    u_length_um: float | None,
+    u_length_um_per_m: float | None,
+    keep_all: bool,
+    systematic: SystematicInputs,
+    choices: Mapping[str, Any],
 ) -> IdentifyOptions:
-    """Return the options of the stage."""
-    return IdentifyOptions(u_length_um, u_length_um_per_m, reject=not keep_all, systematic=systematic)
+    """Return the options of the stage; ``choices`` as :func:`method_options` gives them."""
+    return IdentifyOptions(u_length_um, u_length_um_per_m, reject=not keep_all, systematic=systematic, **choices)
 
 
 def fit_options(smoothness: float | None) -> FitOptions:
@@ -88,6 +123,7 @@ def fit_options(smoothness: float | None) -> FitOptions:
 @out_option
 @instrument_options
 @systematic_options
+@method_options
 @json_option
 def identify_command(
     machine: Machine,
@@ -98,17 +134,24 @@ def identify_command(
     u_length_um_per_m: float | None,
     keep_all: bool,
     systematic: SystematicInputs,
+    choices: Mapping[str, Any],
     as_json: bool,
 ) -> int:
-    """Identify error curves, squareness and stations from tracer lengths.
+    """Identify error curves, squareness and stations from tracer lengths, or errors from measured positions.
 
     Writes identified.errors.csv (um, urad, standard uncertainties) with identified.covariance.npz, stations.csv and
     identify.json to DIR. The uncertainties hold the readings' noise and the inputs given by --u-.... Without
     --u-length-um the comments u_length_um and u_length_um_per_m of the file count, else 0.1 um + 0.15 um/m.
 
+    MEASUREMENTS are *.lengths.csv (mm) or *.deviations.csv files (dx_um, dy_um, dz_um: measured minus commanded; the
+    placement of their frame is found as well). --method two-step also writes measured.deviations.csv. With --stations
+    one or two stations are enough if they determine the errors of the machine file; if not, the combinations that stay
+    open are named and nothing is written.
+
     \b
-    Example:
+    Examples:
       compgen identify zha-gantry examples/zha-gantry.lengths.csv --out identified/
+      compgen identify zha-gantry examples/zha-gantry.lengths.csv --method two-step --out identified/
     """
     if instrument is not None:
         raise InputError(
@@ -117,9 +160,10 @@ def identify_command(
     OutputFolder(out)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
-        lengths = read_lengths(measurements)
-        show(f"identifying: {len(lengths)} lengths of {len(lengths.stations)} stations")
-        result = identify(machine, lengths, identify_options(u_length_um, u_length_um_per_m, keep_all, systematic))
+        measurement = read_measurement(measurements)
+        show(f"identifying: {describe(measurement)}")
+        options = identify_options(u_length_um, u_length_um_per_m, keep_all, systematic, choices)
+        result = identify_measurement(machine, measurement, options)
     write_all(out, identification_files(result, provenance_of(machine.source, *measurements)))
     if as_json:
         print_json(result.summary())

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -19,6 +21,7 @@ from compgen.cli.identify_commands import (
     fit_options,
     identify_options,
     instrument_options,
+    method_options,
     smoothness_option,
     systematic_options,
 )
@@ -35,6 +38,7 @@ from compgen.report.text import identification_table, run_json, verification_tab
 @out_option
 @instrument_options
 @systematic_options
+@method_options
 @smoothness_option
 @click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
@@ -48,6 +52,7 @@ def run_command(
     u_length_um_per_m: float | None,
     keep_all: bool,
     systematic: SystematicInputs,
+    choices: Mapping[str, Any],
     smoothness: float | None,
     templates: Path | None,
     allow_unverified: bool,
@@ -55,8 +60,8 @@ def run_command(
 ) -> int:
     """Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.
 
-    MACHINE is a name in machines/ or the path of a machine TOML; MEASUREMENTS are *.lengths.csv files (mm). With
-    several --controller each gets its own sub-folder of DIR.
+    MACHINE is a name in machines/ or the path of a machine TOML; MEASUREMENTS are *.lengths.csv (mm)
+    or *.deviations.csv files. With several --controller each gets its own sub-folder of DIR.
 
     \b
     Example:
@@ -68,7 +73,7 @@ def run_command(
             measurements,
             tuple(dict.fromkeys(controller)),
             out,
-            identify_options=identify_options(u_length_um, u_length_um_per_m, keep_all, systematic),
+            identify_options=identify_options(u_length_um, u_length_um_per_m, keep_all, systematic, choices),
             fit_options=fit_options(smoothness),
             templates=templates,
             allow_unverified=allow_unverified,

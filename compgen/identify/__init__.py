@@ -1,7 +1,10 @@
 """From tracer lengths to error curves, stations and their uncertainty."""
 
 from compgen.identify.covariance import Covariance, joint_covariance, predict_uncertainty, read_covariance
+from compgen.identify.deviations import identify_deviations
 from compgen.identify.identify import identify
+from compgen.identify.known_stations import KnownStations, locate_stations, read_stations
+from compgen.identify.measurement import describe, identify_measurement, read_measurement
 from compgen.identify.noise import IdentifyOptions
 from compgen.identify.result import Identification, StationResult
 from compgen.identify.systematic import SystematicInputs
@@ -10,10 +13,17 @@ __all__ = [
     "Covariance",
     "Identification",
     "IdentifyOptions",
+    "KnownStations",
     "StationResult",
     "SystematicInputs",
+    "describe",
     "identify",
+    "identify_deviations",
+    "identify_measurement",
     "joint_covariance",
+    "locate_stations",
     "predict_uncertainty",
     "read_covariance",
+    "read_measurement",
+    "read_stations",
 ]

@@ -6,6 +6,7 @@ Zha & Zhang 2024, section 5 (eq. 22-28), with the exact machine model in place o
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -18,7 +19,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
-from compgen.errors import ConvergenceError, InputError, UndeterminedError
+from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjustment import Adjustment
 from compgen.identify.affine_start import affine_start
 from compgen.identify.covariance import with_systematic
@@ -108,7 +109,10 @@ def _with_known_stations(
     task: _Task, start: State, stations: KnownStations | Literal["nominal"], sigma_mm: float
 ) -> tuple[_Task, State]:
     """Add the known stations to the problem and start from them."""
-    known = locate_stations(task.machine, task.lengths) if isinstance(stations, str) else stations
+    known = stations if isinstance(stations, KnownStations) else locate_stations(task.machine, task.lengths)
+    if known is not stations:
+        message = "the stations were located with the machine taken as perfect: its errors are part of their positions"
+        warnings.warn(f"{message} (to {known.u_mm.max() * 1e3:.1f} um)", CompgenWarning, stacklevel=5)
     assert not isinstance(task.problem, HeldStations)
     start = with_known_start(start, known, task.lengths, task.target_mm, task.group)
     return replace(task, problem=hold(task.problem, known, task.lengths.stations, sigma_mm)), start

@@ -97,12 +97,7 @@ class Identification:
             "residual_max_um": float(np.max(np.abs(self.residual_mm[self.accepted]))) / MM_PER_UM,
             "degrees_of_freedom": self.degrees_of_freedom,
             "reduced_chi_square": self.reduced_chi_square,
-            "u_length": {
-                "source": self.u_source,
-                "constant_um": self.u_length_um,
-                "proportional_um_per_m": self.u_length_um_per_m,
-                "scaled_by": self.u_scale,
-            },
+            **self._u_of_the_readings(),
             "readings": len(self.accepted),
             "readings_used": int(np.count_nonzero(self.accepted)),
             "rank": self.rank,
@@ -123,6 +118,13 @@ class Identification:
             "systematic": None if self.systematic is None else self.systematic.summary(),
             **({"steps": dict(self.steps)} if self.steps else {}),
         }
+
+    def _u_of_the_readings(self) -> dict[str, Any]:
+        known = {"source": self.u_source, "constant_um": self.u_length_um}
+        if self.method == "deviations":
+            return {"u_deviation": {**known, "scaled_by": self.u_scale}}
+        proportional = {"proportional_um_per_m": self.u_length_um_per_m, "scaled_by": self.u_scale}
+        return {"u_length": {**known, **proportional}}
 
 
 def worst_uncertainty(errors: ErrorTable) -> dict[str, tuple[float, str]]:

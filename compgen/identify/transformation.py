@@ -53,7 +53,7 @@ def place(
         if the points lie on one line.
     """
     w = np.ones(len(points_mm)) if weight is None else weight / weight.mean()
-    share = pivot_shares(w, anchor)
+    share = w / w.sum() if anchor is None else (np.arange(len(w)) == anchor).astype(np.float64)
     here, there = share @ points_mm, share @ target_mm
     left, size, right = np.linalg.svd((target_mm - there).T @ (w[:, None] * (points_mm - here)))
     if size[1] <= 1e-12 * size[0]:
@@ -73,38 +73,26 @@ def _rotated(
     return rotation, float(np.sqrt(np.average(np.sum(rest**2, axis=1), weights=weight)))
 
 
-def pivot_shares(weight: FloatArray, anchor: int | None) -> FloatArray:
-    """Share of each point in the pivot (n,): the anchor alone, or all by their weight."""
-    if anchor is None:
-        return np.asarray(weight / weight.sum())
-    share = np.zeros(len(weight))
-    share[anchor] = 1.0
-    return share
-
-
 def placed_covariance(
-    own: FloatArray,
-    lever: FloatArray,
-    shared: FloatArray,
-    points_mm: FloatArray,
-    weight: FloatArray,
-    anchor: int | None = None,
+    own: FloatArray, lever: FloatArray, shared: FloatArray, points_mm: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """Covariance of each point after :func:`place` has taken the rigid motion out, (n, 3, 3), mm^2.
+    """Covariance of each point against the best-fit placement of all of them, (n, 3, 3), mm^2.
 
     Parameters
     ----------
     own : covariance of each point by itself, (n, 3, 3).
     lever, shared : (n, 3, q) and (q, q); the points share the part lever shared lever^T.
-    points_mm, weight, anchor : as for :func:`place`, the points in the final frame.
+    points_mm, weight : as for :func:`place`, the points in the final frame.
     """
     w = weight / weight.mean()
-    share = pivot_shares(w, anchor)
+    share = w / w.sum()
     arms = cross_matrices(points_mm - share @ points_mm)
     rigid = np.concatenate([np.broadcast_to(np.eye(3), own.shape), -arms], axis=2)  # movement by (shift, turn)
     moment = np.einsum("n,nji,njk->ik", w, arms, arms)
-    turning = w[:, None, None] * arms - share[:, None, None] * np.einsum("n,nij->ij", w, arms)
-    taken = np.concatenate([share[:, None, None] * np.eye(3), np.linalg.solve(moment, turning)], axis=1)  # (n, 6, 3)
+    turning = np.linalg.solve(moment, w[:, None, None] * arms)
+    taken = np.concatenate(
+        [share[:, None, None] * np.eye(3), turning], axis=1
+    )  # (shift, turn) by each point, (n, 6, 3)
     own_part = taken @ own  # (n, 6, 3)
     total = np.einsum("nij,nkj->ik", own_part, taken)
     cross = rigid @ own_part

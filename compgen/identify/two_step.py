@@ -65,8 +65,9 @@ class Located:
     position_mm, tool_mm : poses of the points, (m, 3).
     calibration : of the tracers in their own frame, right-handed as the machine.
     placement : from that frame into the machine's; ``anchored`` if it was held at the reference point.
-    deviations : measured tip minus nominal one in the machine frame, with the uncertainty of each component.
-    covariance_mm2 : covariance of each point there, (m, 3, 3).
+    deviations : measured tip minus nominal one in the machine frame; the uncertainty is that against the best-fit
+        placement of all points.
+    covariance_mm2 : the same as a covariance of each point, (m, 3, 3).
     """
 
     rows: IntArray
@@ -200,7 +201,7 @@ def _locate(readings: TracerReadings, poses: FloatArray, pose: IntArray, rows: I
     turn = placement.rotation
     measured = placement.apply(calibration.frame.points_mm)
     shared = calibration.station_covariance()
-    covariance = placed_covariance(turn @ own @ turn.T, turn @ calibration.lever, shared, measured, weight, anchor)
+    covariance = placed_covariance(turn @ own @ turn.T, turn @ calibration.lever, shared, measured, weight)
     variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)
     kept = {key: lengths.metadata[key] for key in ("date",) if key in lengths.metadata}
     deviations = Deviations(

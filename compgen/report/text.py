@@ -22,12 +22,14 @@ MOST_REASONS = 10
 
 def identification_table(result: Identification) -> Group:
     """Return the summary of an identification."""
+    lengths = result.method != "deviations"
+    used = f"{int(result.accepted.sum())} of {len(result.accepted)} "
+    used += f"lengths used, {len(result.stations)} stations" if lengths else "components of measured positions used"
+    stated = f"{result.u_length_um:g} um" + (f" + {result.u_length_um_per_m:g} um/m" if lengths else "")
     lines = [
-        f"{int(result.accepted.sum())} of {len(result.accepted)} lengths used, {len(result.stations)} stations, "
-        f"rank {result.rank} of {result.unknowns} unknowns",
+        f"{used}, rank {result.rank} of {result.unknowns} unknowns, method {result.method}",
         f"residual {result.rms_um:.3f} um rms, reduced chi-square {result.reduced_chi_square:.3f} "
-        f"({result.degrees_of_freedom} degrees of freedom, {result.u_source} uncertainty "
-        f"{result.u_length_um:g} um + {result.u_length_um_per_m:g} um/m)",
+        f"({result.degrees_of_freedom} degrees of freedom, {result.u_source} uncertainty {stated})",
     ]
     lines += [
         f"rejected: {item.station} point {item.point} (line {item.line}): {item.reason}"
@@ -89,6 +91,12 @@ def _pair(figures: Residuals) -> str:
     return f"{_um(figures.max_um)} / {_um(figures.rms_um)}"
 
 
+def _verdict(item: Verification) -> Text:
+    if not item.accepted:
+        return Text("REJECTED", "bold red")
+    return Text("partial", "yellow") if item.partial else Text("accepted", "green")
+
+
 def verification_table(results: Sequence[Verification]) -> Group:
     """Return before and after for every control, read from the files, and why tables were not accepted."""
     title = "tool tip error over the volume, max / rms in um, by the files read back"
@@ -101,7 +109,7 @@ def verification_table(results: Sequence[Verification]) -> Group:
     table.add_column("verdict", no_wrap=True, min_width=9)
     notes: list[Text] = []
     for item in results:
-        verdict = Text("accepted", "green") if item.accepted else Text("REJECTED", "bold red")
+        verdict = _verdict(item)
         table.add_row(
             item.controller,
             _pair(item.before),
@@ -114,8 +122,7 @@ def verification_table(results: Sequence[Verification]) -> Group:
         notes += [Text(f"{item.controller}: {reason}", "red") for reason in item.reasons[:MOST_REASONS]]
         if len(item.reasons) > MOST_REASONS:
             notes.append(Text(f"{item.controller}: and {len(item.reasons) - MOST_REASONS} more in result.json", "red"))
-        if item.accepted and item.after.rms_um > item.before.rms_um + 0.005:
-            notes.append(Text(f"{item.controller}: grows as it stands, by a rigid motion; see before* and after*"))
+        notes += [Text(f"{item.controller}: {note}", "yellow") for note in item.notes if item.accepted]
         if item.uncorrected_um:
             listed = ", ".join(f"{name} {_um(value)} um" for name, value in list(item.uncorrected_um.items())[:8])
             more = f" and {len(item.uncorrected_um) - 8} more" if len(item.uncorrected_um) > 8 else ""
