@@ -142,6 +142,8 @@ def _common_context(machine: Machine, errors: ErrorTable, controller: str, prove
         "controller": controller,
         "machine_name": machine.name,
         "chain": machine.chain.name,
+        "tool_offset_mm": [f"{value:g}" for value in machine.tool_offset_mm],
+        "reference_point_mm": [f"{value:g}" for value in machine.reference_point_mm],
         "inputs": [name for name, _ in inputs],
         "input_sha256": sha256_of(format_errors(errors).encode()),
         "input_hashes": dict(inputs),

@@ -35,6 +35,9 @@ COMPONENT_UNCERTAINTIES = 0.5
 #: Errors that stay uncorrected by less than this are not named.
 NAMED_FROM_MM = 0.1 * MM_PER_UM
 
+#: A control that cannot express more than this share of the largest error gives a partial compensation.
+PARTIAL_SHARE = 0.1
+
 
 @dataclass(frozen=True)
 class ReadTables:
@@ -113,10 +116,34 @@ class Verification:
         """Whether the tables may be loaded."""
         return not self.reasons
 
+    @property
+    def partial(self) -> bool:
+        """Whether the control cannot express a good part of the error: the table is right, but much stays."""
+        return self.unrepresentable_um > PARTIAL_SHARE * self.before.max_um
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What else the user should know of accepted tables."""
+        notes = []
+        if self.partial:
+            share = 100.0 * self.after_rigid_removed.rms_um / max(self.before_rigid_removed.rms_um, 1e-12)
+            notes.append(
+                f"partial: this control cannot express {self.unrepresentable_um:.0f} um of the error; "
+                f"{share:.0f} % of the rms stays (rigid motion taken out)"
+            )
+        if self.after.max_um > self.before.max_um + 0.05 or self.after.rms_um > self.before.rms_um + 0.05:
+            notes.append(
+                f"as it stands the error grows from {self.before.max_um:.1f} to {self.after.max_um:.1f} um max, "
+                f"{self.before.rms_um:.1f} to {self.after.rms_um:.1f} um rms, by a rigid motion of the workpiece"
+            )
+        return tuple(notes)
+
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``result.json``."""
         return {
             "accepted": self.accepted,
+            "partial": self.partial,
+            "notes": list(self.notes),
             "reasons": list(self.reasons),
             "controller": self.controller,
             "points": self.points,
