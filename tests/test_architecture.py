@@ -14,6 +14,7 @@ ORDER = (
     ("measure",),
     ("simulate",),
     ("identify",),
+    ("plan",),
     ("fit",),
     ("controllers",),
     ("export",),

@@ -6,7 +6,14 @@ import sys
 
 import click
 
-from compgen.cli import export_commands, identify_commands, listing_commands, run_commands, simulate_commands
+from compgen.cli import (
+    export_commands,
+    identify_commands,
+    listing_commands,
+    plan_commands,
+    run_commands,
+    simulate_commands,
+)
 from compgen.cli.common import run_command
 from compgen.export import program_version
 
@@ -25,7 +32,7 @@ def cli() -> None:
     """
 
 
-for module in (run_commands, simulate_commands, identify_commands, export_commands, listing_commands):
+for module in (run_commands, simulate_commands, identify_commands, plan_commands, export_commands, listing_commands):
     for command in module.COMMANDS:
         cli.add_command(command)
 

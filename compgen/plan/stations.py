@@ -1,0 +1,243 @@
+"""Planned stations, and the regions in which they may stand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.core.csvio import FloatArray, format_csv, read_csv
+from compgen.core.lengths import POSITION_COLUMNS
+from compgen.core.machine import Machine
+from compgen.core.text import nearest, one_line
+from compgen.errors import InputError
+
+#: Columns of the ``stations.csv`` of ``compgen identify`` that a plan does not need.
+_OF_IDENTIFY = (
+    *(f"u_{axis}_um" for axis in "xyz"),
+    "dead_length_mm",
+    "u_dead_length_um",
+    "readings",
+    "residual_rms_um",
+)
+_BOX_COLUMNS = tuple(f"{axis}_{end}_mm" for axis in "xyz" for end in ("min", "max"))
+
+#: The shell in which stations may stand where no box is given: this far from the footprint of the working volume, and
+#: this high above its lowest tool tip, the level of the table.
+SHELL_NEAR_MM, SHELL_FAR_MM, SHELL_HEIGHT_MM = 100.0, 600.0, 300.0
+
+
+@dataclass(frozen=True)
+class PlannedStations:
+    """Stations of a planned measurement.
+
+    Parameters
+    ----------
+    names : one for each station, S of them.
+    position_mm : in the workpiece frame, shape (S, 3).
+    passes : station index and set-up of each pass, shape (p, 2); in a pass a station reads every point once, and each
+        pass has an unknown constant of its own.
+    """
+
+    names: tuple[str, ...]
+    position_mm: FloatArray
+    passes: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Return the number of stations."""
+        return len(self.names)
+
+    def moved(self, position_mm: FloatArray) -> PlannedStations:
+        """Return the same stations at other places (S, 3)."""
+        return PlannedStations(self.names, position_mm, self.passes)
+
+
+def planned_stations(positions: Mapping[str, Sequence[float]]) -> PlannedStations:
+    """Return stations by name, with one pass each."""
+    index = np.arange(len(positions))
+    where = np.array(list(positions.values()), dtype=np.float64).reshape(-1, 3)
+    return PlannedStations(tuple(positions), where, np.column_stack([index, 0 * index]))
+
+
+def read_stations(path: str | Path) -> PlannedStations:
+    """Read a stations file: ``station, x_mm, y_mm, z_mm``, optional ``setup``; that of ``compgen identify`` will do.
+
+    A station with several set-ups has a row for each, at one place.
+    """
+    table = read_csv(path, required=("station", *POSITION_COLUMNS), optional=("setup", *_OF_IDENTIFY))
+    names = table.text("station")
+    where = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
+    setup = table.labels("setup") if "setup" in table.columns else np.zeros(len(table), dtype=np.int64)
+    known = tuple(dict.fromkeys(names))
+    position_mm = np.zeros((len(known), 3))
+    first: dict[tuple[str, int | None], int] = {}
+    for row, name in enumerate(names):
+        earlier = first.setdefault((name, None), row)
+        if first.setdefault((name, int(setup[row])), row) != row:
+            raise table.fail(
+                row, "station", f"{one_line(name)!r} stands here twice; tell set-ups apart in a column setup"
+            )
+        if np.max(np.abs(where[row] - where[earlier])) > 1e-6:
+            message = (
+                f"{one_line(name)!r} stands at another place than in line {table.lines[earlier]}; a tracer that was "
+                "moved is another station"
+            )
+            raise table.fail(row, "x_mm", message)
+        position_mm[known.index(name)] = where[row]
+    station = np.array([known.index(name) for name in names])
+    return PlannedStations(known, position_mm, np.column_stack([station, setup]))
+
+
+def format_stations(stations: PlannedStations, machine: Machine) -> str:
+    """Return the text of a stations file."""
+    station = stations.passes[:, 0]
+    where = stations.position_mm[station]
+    columns: dict[str, Sequence[str] | FloatArray] = {
+        "station": [stations.names[k] for k in station],
+        "setup": [str(setup) for setup in stations.passes[:, 1]],
+        **{name: where[:, k] for k, name in enumerate(POSITION_COLUMNS)},
+    }
+    return format_csv(columns, {"machine": machine.name, "source": "compgen plan"}, dict.fromkeys(POSITION_COLUMNS, 3))
+
+
+# --- where stations may stand --------------------------------------------------------------------------------------
+
+
+class Region(Protocol):
+    """A set of places, reached from three numbers between 0 and 1."""
+
+    def place(self, unit: FloatArray) -> FloatArray:
+        """Place (3,) in mm of numbers (3,)."""
+
+    def unit(self, place_mm: FloatArray) -> FloatArray:
+        """Numbers (3,) of a place (3,) in mm, or of the nearest one that belongs to the region."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box ``lower_mm`` ... ``upper_mm``, each (3,); a box may be flat."""
+
+    lower_mm: FloatArray
+    upper_mm: FloatArray
+
+    def place(self, unit: FloatArray) -> FloatArray:
+        """Return the place for numbers between 0 and 1."""
+        return np.asarray(self.lower_mm + unit * (self.upper_mm - self.lower_mm))
+
+    def unit(self, place_mm: FloatArray) -> FloatArray:
+        """Return the numbers of a place; one outside counts as the nearest inside."""
+        size = self.upper_mm - self.lower_mm
+        return np.clip((place_mm - self.lower_mm) / np.where(size > 0, size, 1.0), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Shell:
+    """The places around a footprint: along its outline, outwards from it, upwards from the table.
+
+    Parameters
+    ----------
+    centre_mm, half_mm : of the footprint in X and Y, each (2,).
+    table_mm : height of the table.
+    """
+
+    centre_mm: FloatArray
+    half_mm: FloatArray
+    table_mm: float
+
+    def place(self, unit: FloatArray) -> FloatArray:
+        """Return the place for the share of the outline, of the distance, and of the height."""
+        outwards = SHELL_NEAR_MM + unit[1] * (SHELL_FAR_MM - SHELL_NEAR_MM)
+        x, y = _on_outline(float(unit[0]) % 1.0, self.half_mm + outwards)
+        return np.array([*(self.centre_mm + [x, y]), self.table_mm + unit[2] * SHELL_HEIGHT_MM])
+
+    def unit(self, place_mm: FloatArray) -> FloatArray:
+        """Return the shares of a place; one that is too near, far, low or high counts as the nearest."""
+        offset = place_mm[:2] - self.centre_mm
+        outwards = float(np.max(np.abs(offset) - self.half_mm))
+        half = self.half_mm + max(outwards, 0.0)
+        if outwards < 0:  # inside: straight out of the nearest side
+            side = int(np.argmax(np.abs(offset) - self.half_mm))
+            offset = offset.copy()
+            offset[side] = np.copysign(half[side], offset[side])
+        far = (outwards - SHELL_NEAR_MM) / (SHELL_FAR_MM - SHELL_NEAR_MM)
+        high = (place_mm[2] - self.table_mm) / SHELL_HEIGHT_MM
+        return np.array([_share_of_outline(offset, half), *np.clip([far, high], 0.0, 1.0)])
+
+
+def _on_outline(share: float, half: FloatArray) -> tuple[float, float]:
+    """Point at a share of the outline of a rectangle (half sizes (2,)), from its lower left corner to the right."""
+    a, b = float(half[0]), float(half[1])
+    along = share * 4 * (a + b)
+    if along < 2 * a:
+        return along - a, -b
+    if along < 2 * a + 2 * b:
+        return a, along - 2 * a - b
+    if along < 4 * a + 2 * b:
+        return 3 * a + 2 * b - along, b
+    return -a, 4 * a + 3 * b - along
+
+
+def _share_of_outline(offset: FloatArray, half: FloatArray) -> float:
+    """The share at which :func:`_on_outline` gives the point ``offset`` (2,) on the outline."""
+    a, b = float(half[0]), float(half[1])
+    x, y = float(offset[0]), float(offset[1])
+    distance = np.abs([y + b, x - a, y - b, x + a])
+    side = int(np.argmin(distance))
+    along = (x + a, 2 * a + y + b, 3 * a + 2 * b - x, 4 * a + 3 * b - y)[side]
+    return float(np.clip(along / (4 * (a + b)), 0.0, 1.0 - 1e-12))
+
+
+def shell_around(machine: Machine) -> Shell:
+    """Return the shell around the working volume of the tool tip, with the table at its lowest level."""
+    tool = np.array(machine.tool_offset_mm)
+    lower, upper = machine.lower_mm + tool, machine.upper_mm + tool
+    return Shell(0.5 * (lower + upper)[:2], 0.5 * (upper - lower)[:2], float(lower[2]))
+
+
+def regions_of(machine: Machine, stations: PlannedStations, boxes: Mapping[str, Box]) -> list[Region]:
+    """Return the region of each station: its box, else the shell around the table.
+
+    Raises
+    ------
+    InputError
+        for a box of a station that is not there.
+    """
+    for name in boxes:
+        if name not in stations.names:
+            raise InputError(f"the box {one_line(name)!r} belongs to no station; {nearest(name, stations.names)}")
+    shell = shell_around(machine)
+    return [boxes.get(name, shell) for name in stations.names]
+
+
+def box_from_text(text: str) -> tuple[str, Box]:
+    """Read ``LABEL:xmin,xmax,ymin,ymax,zmin,zmax`` in mm."""
+    label, colon, rest = text.rpartition(":")
+    try:
+        values = np.array([float(part) for part in rest.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    if not colon or not label or len(values) != 6 or not np.isfinite(values).all():
+        raise InputError(f"{one_line(text)!r} is not LABEL:xmin,xmax,ymin,ymax,zmin,zmax (mm)", field="--box")
+    if np.any(values[0::2] > values[1::2]):
+        raise InputError(f"{one_line(text)!r} has a lower end above the upper one", field="--box")
+    return label, Box(values[0::2], values[1::2])
+
+
+def read_boxes(path: str | Path) -> dict[str, Box]:
+    """Read a boxes file: ``station, x_min_mm, x_max_mm, y_min_mm, y_max_mm, z_min_mm, z_max_mm``."""
+    table = read_csv(path, required=("station", *_BOX_COLUMNS))
+    values = np.column_stack([table.numbers(name) for name in _BOX_COLUMNS])
+    boxes: dict[str, Box] = {}
+    for row, name in enumerate(table.text("station")):
+        if name in boxes:
+            raise table.fail(row, "station", f"{one_line(name)!r} stands here a second time")
+        lower, upper = values[row, 0::2], values[row, 1::2]
+        if np.any(lower > upper):
+            axis = int(np.argmax(lower > upper))
+            raise table.fail(row, _BOX_COLUMNS[2 * axis], f"{lower[axis]:g} lies above the upper end {upper[axis]:g}")
+        boxes[name] = Box(lower, upper)
+    return boxes

@@ -1,0 +1,285 @@
+"""Better places for the stations, and the smallest trajectory that reaches a volumetric uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dtrtri
+
+from compgen.core.csvio import FloatArray
+from compgen.core.machine import Machine
+from compgen.core.names import MM_PER_UM
+from compgen.core.points import Points
+from compgen.errors import InputError
+from compgen.identify.noise import ReadingNoise
+from compgen.identify.solver import factorise
+from compgen.identify.threads import one_thread
+from compgen.model.grid import volume_grid
+from compgen.plan.plan import Plan, plan_of
+from compgen.plan.planned import NEAREST_MM, Planned, planned
+from compgen.plan.stations import PlannedStations, Region
+from compgen.simulate.trajectory import Line, Trajectory, trajectory_points
+
+Criterion = Literal["worst", "rms"]
+Progress = Callable[[str], None]
+
+#: Points of the volume that the search looks at; what it finds is judged on the full grid.
+SEARCH_POINTS = 200
+#: Share of the evaluations that goes into places spread over the regions; the rest improves the best of them.
+SPREAD_SHARE = 0.4
+#: Reciprocal condition below which an arrangement counts as undetermined in the search.
+LEAST_RCOND = 1e-13
+DEFAULT_EVALUATIONS = 400
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Result of a search: the plan for the places found, and how it was found.
+
+    ``start_um`` and ``found_um`` are the criterion at the given stations and at those found, on the search's points;
+    ``improved`` says whether the places differ from the given ones.
+    """
+
+    plan: Plan
+    criterion: Criterion
+    start_um: float
+    found_um: float
+    evaluations: int
+    improved: bool
+
+    def summary(self) -> dict[str, Any]:
+        """Return the object ``suggestion`` of ``plan.json``."""
+        return {
+            "criterion": self.criterion,
+            "improved": self.improved,
+            "criterion_before_um": self.start_um if np.isfinite(self.start_um) else None,
+            "criterion_after_um": self.found_um if np.isfinite(self.found_um) else None,
+            "evaluations": self.evaluations,
+            "determined": self.plan.determined,
+            "stations": self.plan.summary()["stations"],
+            "volume": self.plan.volume.summary(),
+        }
+
+
+class _Search:
+    """The criterion as a function of numbers between 0 and 1, with memory of the best and a limit of evaluations."""
+
+    def __init__(self, found: Planned, regions: Sequence[Region], criterion: Criterion, limit: int) -> None:
+        self.found, self.regions, self.criterion, self.limit = found, regions, criterion, limit
+        nodes = [axis.nodes_mm for axis in found.machine.axes]
+        grid = volume_grid(found.machine, (nodes[0], nodes[1], nodes[2]), SEARCH_POINTS).position_mm
+        self.rows = found.error_rows(grid)
+        self.count = 0
+        self.best_um, self.best_mm = np.inf, found.stations.position_mm
+
+    def places_mm(self, unit: FloatArray) -> FloatArray:
+        """Places (S, 3) of numbers (3 S,)."""
+        return np.array([region.place(part) for region, part in zip(self.regions, unit.reshape(-1, 3), strict=True)])
+
+    def at_units(self, unit: FloatArray) -> float:
+        """Return the criterion in um for numbers (3 S,); StopIteration when the limit is reached."""
+        if self.count >= self.limit:
+            raise StopIteration
+        return self.at(self.places_mm(unit))
+
+    def at(self, stations_mm: FloatArray) -> float:
+        """Return the criterion in um for places (S, 3), remember the best."""
+        self.count += 1
+        value = self._value(stations_mm)
+        if value < self.best_um:
+            self.best_um, self.best_mm = value, stations_mm
+        return value
+
+    def _value(self, stations_mm: FloatArray) -> float:
+        found = self.found
+        sight = found.lengths.position_mm + found.tool_mm - stations_mm[found.lengths.station]
+        if float(np.einsum("ij,ij->i", sight, sight).min()) < NEAREST_MM**2:
+            return np.inf
+        try:
+            factor = factorise(found.normal_matrix(stations_mm))
+        except LinAlgError:
+            return np.inf
+        if factor.rcond < LEAST_RCOND:
+            return np.inf
+        inverse, _ = dtrtri(factor.lower, lower=1)
+        size = found.problem.parameters.size
+        spread = self.rows @ (factor.scale[:size, None] * np.tril(inverse).T[:size])
+        square = np.einsum("nij,nij->n", spread, spread)
+        return float(np.sqrt(square.max() if self.criterion == "worst" else square.mean())) / MM_PER_UM
+
+
+def suggest(
+    start: Planned,
+    regions: Sequence[Region],
+    *,
+    criterion: Criterion = "worst",
+    evaluations: int = DEFAULT_EVALUATIONS,
+    seed: int = 1,
+    progress: Progress = lambda _: None,
+) -> Suggestion:
+    """Search better places for the stations of a planned measurement: first spread, then Powell's method.
+
+    Parameters
+    ----------
+    start : the measurement with the stations as they are; they count as one candidate wherever they stand.
+    regions : where each station may stand.
+    criterion : ``"worst"`` or ``"rms"`` of the standard uncertainty of E over the volume.
+    evaluations : how many arrangements are looked at.
+    seed : of the spread places; the same seed gives the same result.
+    progress : is told how far the search is.
+    """
+    with one_thread():
+        search = _Search(start, regions, criterion, evaluations)
+        start_um = search.at(start.stations.position_mm)
+        _spread(search, seed, progress)
+        _improve(search, progress)
+        better = search.best_um < start_um
+        found = plan_of(_moved(start, search.best_mm)) if better else plan_of(start)
+    return Suggestion(found, criterion, start_um, search.best_um, search.count, better)
+
+
+def _spread(search: _Search, seed: int, progress: Progress) -> None:
+    from scipy.stats import qmc  # imported here: it takes a quarter of a second, and few commands need it
+
+    count = max(1, int(SPREAD_SHARE * search.limit))
+    samples = qmc.Sobol(3 * len(search.regions), seed=seed).random_base2(int(np.ceil(np.log2(count))))
+    for k, unit in enumerate(samples[:count]):
+        if search.count >= search.limit:
+            return
+        search.at_units(unit)
+        progress(f"searching places: {k + 1} of {search.limit}, best {search.best_um:.3g} um")
+
+
+def _improve(search: _Search, progress: Progress) -> None:
+    """Powell's method from the best so far, until the limit; what it passes through is remembered."""
+    from scipy.optimize import minimize  # imported here: slow to load
+
+    start = np.concatenate([r.unit(place) for r, place in zip(search.regions, search.best_mm, strict=True)])
+
+    def cost(unit: FloatArray) -> float:
+        value = search.at_units(np.clip(unit, 0.0, 1.0))
+        progress(f"searching places: {search.count} of {search.limit}, best {search.best_um:.3g} um")
+        return float(np.log(value)) if np.isfinite(value) else 50.0
+
+    try:
+        minimize(cost, start, method="Powell", bounds=[(0.0, 1.0)] * len(start), options={"xtol": 0.02, "ftol": 1e-4})
+    except StopIteration:
+        return
+
+
+def _moved(start: Planned, stations_mm: FloatArray) -> Planned:
+    return planned(start.machine, start.stations.moved(stations_mm), points_of(start), start.noise)
+
+
+def points_of(found: Planned) -> Points:
+    """Return the points of one pass."""
+    count = len(found.lengths) // len(found.stations.passes)
+    tool = found.lengths.tool_mm
+    several = found.tool_mm.ndim == 2 and tool is not None
+    return Points(found.lengths.position_mm[:count], tool[:count] if several and tool is not None else None)
+
+
+# --- trajectories --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A trajectory with its number of points and what it would reach; ``worst_um`` is infinite if undetermined."""
+
+    name: str
+    position_mm: FloatArray
+    determined: bool
+    worst_um: float
+    rms_um: float
+
+    def summary(self) -> dict[str, Any]:
+        """Return one entry of ``trajectories`` of ``plan.json``."""
+        return {
+            "name": self.name,
+            "points": len(self.position_mm),
+            "determined": self.determined,
+            "u_max_um": self.worst_um if np.isfinite(self.worst_um) else None,
+            "u_rms_um": self.rms_um if np.isfinite(self.rms_um) else None,
+        }
+
+
+def candidate_trajectories(machine: Machine) -> dict[str, FloatArray]:
+    """Return trajectories (n, 3) by name, each point once: lines, edges, lattices, faces, the grid of all nodes.
+
+    A lattice of k x k has all nodes along every axis on k x k lines; the 12 edges are the one of 2 x 2.
+    """
+    found = {"12 edges": trajectory_points(Trajectory("frame"), machine)}
+    found["12 edges and cross lines"] = np.concatenate([found["12 edges"], _cross_lines(machine)])
+    for count in (3, 4, 5, 7):
+        if count < min(len(axis.nodes_mm) for axis in machine.axes):
+            found[f"lattice {count} x {count}"] = _lattice(machine, count)
+    found["6 faces"] = trajectory_points(Trajectory("faces"), machine)
+    found["full grid"] = trajectory_points(Trajectory("grid"), machine)
+    unique = {name: _each_once(points) for name, points in found.items()}
+    return dict(sorted(unique.items(), key=lambda item: len(item[1])))
+
+
+def _each_once(points: FloatArray) -> FloatArray:
+    _, first = np.unique(points, axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def _cross_lines(machine: Machine) -> FloatArray:
+    """Three lines through the middle of the volume along the axes, and its four body diagonals."""
+    lower, upper = machine.lower_mm, machine.upper_mm
+    middle, most = 0.5 * (lower + upper), max(len(axis.nodes_mm) for axis in machine.axes)
+    lines = []
+    for axis in range(3):
+        along = np.tile(middle, (len(machine.axes[axis].nodes_mm), 1))
+        along[:, axis] = machine.axes[axis].nodes_mm
+        lines.append(along)
+    ends = []
+    for corner in ((0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)):
+        turned = np.array(corner, dtype=bool)
+        ends.append((np.where(turned, upper, lower), np.where(turned, lower, upper)))
+    diagonals = tuple(Line(tuple(a.tolist()), tuple(b.tolist()), most) for a, b in ends)
+    return np.concatenate([*lines, trajectory_points(Trajectory("lines", lines=diagonals), machine)])
+
+
+def _lattice(machine: Machine, count: int) -> FloatArray:
+    """All nodes along every axis on count x count lines, ends included."""
+    blocks = []
+    for axis in range(3):
+        levels = []
+        for other in range(3):
+            nodes = machine.axes[other].nodes_mm
+            picked = np.unique(np.round(np.linspace(0, len(nodes) - 1, count)).astype(int))
+            levels.append(nodes if other == axis else nodes[picked])
+        trajectory = Trajectory("grid", levels_mm=(levels[0], levels[1], levels[2]))
+        blocks.append(trajectory_points(trajectory, machine))
+    return np.concatenate(blocks)
+
+
+def judge_trajectories(
+    machine: Machine,
+    stations: PlannedStations,
+    noise: ReadingNoise,
+    *,
+    target_um: float,
+    progress: Progress = lambda _: None,
+) -> tuple[list[Candidate], Candidate | None]:
+    """Judge the candidates from the smallest on, and return them with the first that reaches the target, if any does.
+
+    ``target_um`` is the largest standard uncertainty of E in the volume that is allowed, um.
+    """
+    if not (np.isfinite(target_um) and target_um > 0):
+        raise InputError(f"the target is {target_um:g} um; a number above zero is expected")
+    judged: list[Candidate] = []
+    with one_thread():
+        for name, position_mm in candidate_trajectories(machine).items():
+            progress(f"judging trajectory: {name}")
+            result = plan_of(planned(machine, stations, Points(position_mm), noise))
+            worst, rms = result.volume.worst_um, result.volume.rms_um
+            judged.append(Candidate(name, position_mm, result.determined, worst, rms))
+            if result.determined and worst <= target_um:
+                return judged, judged[-1]
+    return judged, None
