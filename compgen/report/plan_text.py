@@ -21,8 +21,7 @@ def plan_table(plan: Plan) -> Group:
     """Return the verdict, the predicted uncertainty of the volume and that of every error."""
     stations, rank = plan.planned.stations, plan.rank
     lines = [
-        f"{plan.readings} readings of {len(stations)} stations, rank {rank.rank} of {rank.size} unknowns, "
-        f"condition {rank.condition:.1e}",
+        f"{plan.readings} readings of {len(stations)} stations, rank {rank.rank} of {rank.size} unknowns",
         f"uncertainty of a reading ({plan.planned.noise.source}): {plan.planned.noise.constant_um:g} um + "
         f"{plan.planned.noise.proportional_um_per_m:g} um/m",
         volume_line("volume", plan),
@@ -48,12 +47,13 @@ def _figure(value: float) -> str:
 
 
 def volume_line(title: str, plan: Plan) -> str:
-    """Return one line with the uncertainty of E over the volume."""
+    """Return a line or two with the uncertainty of E over the volume."""
     report = plan.volume.summary()
     if report["undetermined_points"]:
         return f"{title}: E is not determined at {report['undetermined_points']} of {report['points']} points"
     axes = ", ".join(f"{axis} {report[f'u_{axis}_max_um']:.3f} / {report[f'u_{axis}_rms_um']:.3f}" for axis in "xyz")
-    return f"{title}: u of E max / rms in um: {axes}, together {report['u_max_um']:.3f} / {report['u_rms_um']:.3f}"
+    together = f"{report['u_max_um']:.3f} / {report['u_rms_um']:.3f} um"
+    return f"{title}: u of E, max / rms: {together}\n  by axis: {axes} um"
 
 
 def suggestion_table(suggestion: Suggestion) -> Group:
