@@ -26,7 +26,7 @@ from compgen.identify.covariance import with_systematic
 from compgen.identify.grid_problem import GridProblem, grid_problem, start_moments
 from compgen.identify.known_stations import HeldStations, KnownStations, hold, locate_stations, with_known_start
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
-from compgen.identify.outliers import explain_rejected
+from compgen.identify.outliers import accepted_readings, explain_rejected
 from compgen.identify.parameters import ErrorParameters, common_tool, parameters_for_tools
 from compgen.identify.problem import LengthProblem, length_problem
 from compgen.identify.rank import Rank, analyse_rank
@@ -86,13 +86,13 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     _check_readings(machine, lengths, 1 if options.stations is not None else MIN_STATIONS)
     task = _task(machine, lengths)
     start, searched = _start(task)
+    if not searched and options.stations is None and options.method == "joint":
+        found = _undisturbed(task, start, options)
+        if found is not None:
+            return found
     start, disturbed = robust_state(start, lengths, task.target_mm, task.station, task.group)
-    if isinstance(task.problem, GridProblem) and not searched and not disturbed:
-        start = affine_start(task.problem, start)
     noise = reading_noise(lengths, options)
-    sigma_mm = noise.sigma_mm(task.problem.distances(start))
-    weights = (sigma_mm.min() / sigma_mm) ** 2
-    task = replace(task, problem=task.problem.weighted(weights))
+    task, sigma_mm, weights = _with_weights(task, start, noise)
     if options.stations is not None:
         task, start = _with_known_stations(task, start, options.stations, float(sigma_mm.min()))
     factor, rank = _determined(task, start)
@@ -103,6 +103,34 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     fit = _fit(task, start, readings, factor, options, disturbed=disturbed)
     task = replace(task, problem=fit.problem, group=fit.group)
     return _result(task, fit, sigma_mm, noise, rank)
+
+
+def _with_weights(task: _Task, start: State, noise: ReadingNoise) -> tuple[_Task, FloatArray, FloatArray]:
+    """Return the task with weighted readings, their standard uncertainty in mm and their weights, each (n,)."""
+    sigma_mm = noise.sigma_mm(task.problem.distances(start))
+    weights = (sigma_mm.min() / sigma_mm) ** 2
+    return replace(task, problem=task.problem.weighted(weights)), sigma_mm, weights
+
+
+def _undisturbed(task: _Task, start: State, options: IdentifyOptions) -> Identification | None:
+    """Identify by plain least squares; None where a reading does not belong, or where it does not converge.
+
+    Undisturbed readings are the rule, and need none of the search for gross errors.
+    """
+    if isinstance(task.problem, GridProblem):
+        start = affine_start(task.problem, start)
+    noise = reading_noise(task.lengths, options)
+    task, sigma_mm, _ = _with_weights(task, start, noise)
+    factor, rank = _determined(task, start)
+    try:
+        solution = solve(task.problem, start, factor)
+    except ConvergenceError:
+        return None
+    residual = task.problem.residuals(solution.state)
+    if options.reject and not accepted_readings(residual / sigma_mm).all():
+        return None
+    accepted = np.ones(len(residual), dtype=bool)
+    return _result(task, RobustFit(task.problem, task.group, solution, accepted, residual), sigma_mm, noise, rank)
 
 
 def _with_known_stations(
