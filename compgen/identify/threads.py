@@ -1,19 +1,5 @@
-"""One BLAS thread inside a solve: for matrices of a few hundred unknowns a second thread only waits."""
+"""One BLAS thread inside a solve."""
 
-from __future__ import annotations
+from compgen.core.threads import one_thread
 
-from contextlib import AbstractContextManager
-from functools import cache
-
-from threadpoolctl import ThreadpoolController
-
-
-@cache
-def _controller() -> ThreadpoolController:
-    return ThreadpoolController()
-
-
-def one_thread() -> AbstractContextManager[object]:
-    """Limit the numerical libraries to one thread for the duration of a ``with`` block."""
-    limiter: AbstractContextManager[object] = _controller().limit(limits=1)
-    return limiter
+__all__ = ["one_thread"]
