@@ -16,7 +16,7 @@ POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
 TOOL_COLUMNS = ("tool_x_mm", "tool_y_mm", "tool_z_mm")
 APPROACH_COLUMNS = ("approach_x", "approach_y", "approach_z")
 LABEL_COLUMNS = ("run", "line", "repeat", "block", "setup", "pose")
-COVARIATE_COLUMNS = ("time_s", "feed_mm_min", "load_kg")
+COVARIATE_COLUMNS = ("time_s", "feed_mm_min", "load_kg", "u_length_um")
 
 
 @dataclass(frozen=True)

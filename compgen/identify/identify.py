@@ -30,6 +30,7 @@ from compgen.identify.outliers import accepted_readings, explain_rejected
 from compgen.identify.parameters import ErrorParameters, common_tool, parameters_for_tools
 from compgen.identify.problem import LengthProblem, length_problem
 from compgen.identify.rank import Rank, analyse_rank
+from compgen.identify.reference import identify_at_reference
 from compgen.identify.result import Identification, StationResult, worst_uncertainty
 from compgen.identify.robust import Readings, RobustFit, fit_robustly
 from compgen.identify.robust_start import robust_state
@@ -79,7 +80,21 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
     """
     chosen = options or IdentifyOptions()
     with one_thread():
-        return with_systematic(machine, lengths, _identify(machine, lengths, chosen), chosen.systematic)
+        found = identify_at_reference(
+            machine,
+            lengths,
+            lambda readings: _identify(machine, readings, chosen),
+            lambda readings: _rough(machine, readings),
+            temperature=chosen.temperature,
+        )
+        return with_systematic(machine, lengths, found, chosen.systematic)
+
+
+def _rough(machine: Machine, lengths: Lengths) -> tuple[ErrorParameters, State, IntArray]:
+    """Return the unknown errors, start values of everything and the dead length of each reading."""
+    task = _task(machine, lengths)
+    start, _ = robust_state(_start(task)[0], lengths, task.target_mm, task.station, task.group)
+    return task.problem.parameters, start, task.group
 
 
 def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification:
@@ -354,6 +369,7 @@ def _result(
             weight=(float(sigma_mm.min()) / sigma_mm) ** 2 * accepted,
             group=task.group,
             sigma_mm=float(sigma_mm.min()) * u_scale,
+            held_weight=held.held_weight if held else None,
         ),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -33,7 +33,7 @@ class IdentifyOptions:
 
     ``method`` is "joint" or "two-step" (:mod:`compgen.identify.two_step`). ``stations`` are known beforehand, or located
     with the machine taken as perfect ("nominal"). ``u_deviation_um`` is the standard uncertainty of a measured deviation;
-    it belongs to deviations files only.
+    it belongs to deviations files only. ``temperature`` False leaves the scales at the temperature that they had.
     """
 
     u_length_um: float | None = None
@@ -43,23 +43,55 @@ class IdentifyOptions:
     method: Method = "joint"
     stations: KnownStations | Literal["nominal"] | None = None
     u_deviation_um: float | None = None
+    temperature: bool = True
 
 
 @dataclass(frozen=True)
 class ReadingNoise:
-    """Standard uncertainty a + b L of a reading; ``source`` is "stated" or "assumed"."""
+    """Standard uncertainty a + b L of a reading; ``source`` is "stated" or "assumed".
+
+    ``column_um`` (n,) takes its place for readings that state their own; nan for the others.
+    """
 
     source: str
     constant_um: float
     proportional_um_per_m: float
+    column_um: FloatArray | None = None
 
     def sigma_mm(self, distance_mm: FloatArray) -> FloatArray:
         """Standard uncertainty in mm of readings over the given distances."""
-        return (self.constant_um + self.proportional_um_per_m * distance_mm / 1000.0) * MM_PER_UM
+        common = (self.constant_um + self.proportional_um_per_m * distance_mm / 1000.0) * MM_PER_UM
+        if self.column_um is None:
+            return common
+        return np.where(np.isfinite(self.column_um), self.column_um * MM_PER_UM, common)
 
 
 def reading_noise(lengths: Lengths, options: IdentifyOptions) -> ReadingNoise:
-    """Return the uncertainty of the readings: options first, then the file's comments, then the usual statement."""
+    """Return the uncertainty of the readings.
+
+    Options count first, then the column ``u_length_um``, then the file's comments, then the usual statement.
+    """
+    column = _column(lengths) if options.u_length_um is None and options.u_length_um_per_m is None else None
+    if column is not None and np.isfinite(column).all():
+        return ReadingNoise("stated", float(np.median(column)), 0.0, column)
+    noise = _common_noise(lengths, options)
+    return noise if column is None else replace(noise, column_um=column)
+
+
+def _column(lengths: Lengths) -> FloatArray | None:
+    column = lengths.covariates.get("u_length_um")
+    if column is None:
+        return None
+    wrong = np.flatnonzero(np.isfinite(column) & ~(column > 0))
+    if wrong.size:
+        file, line = lengths.origin[int(wrong[0])] if lengths.origin else (None, None)
+        message = f"{column[wrong[0]]:g} is no standard uncertainty; a number above zero is due"
+        raise InputError(message, file=file, line=line, field="column u_length_um")
+    return column
+
+
+def _common_noise(lengths: Lengths, options: IdentifyOptions) -> ReadingNoise:
+    """Uncertainty a + b L of all readings."""
     constant = _stated(lengths, "u_length_um", options.u_length_um)
     proportional = _stated(lengths, "u_length_um_per_m", options.u_length_um_per_m)
     if constant is None and proportional is None:

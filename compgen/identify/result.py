@@ -16,8 +16,10 @@ from compgen.core.names import MM_PER_UM
 from compgen.identify.adjustment import Adjustment
 from compgen.identify.outliers import Rejected
 from compgen.identify.parameters import ErrorParameters
+from compgen.identify.reversal import Reversal
 from compgen.identify.segments import Segment
 from compgen.identify.systematic import Systematic
+from compgen.identify.whiteness import Whiteness
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,9 @@ class Identification:
     unobservable : combinations that the model leaves out because nothing can show them, in words.
     rejected : readings that were not used, with the reason.
     segments : beam breaks: runs of readings with a dead length of their own, or rejected together.
+    reversal : mean difference between the directions of approach; None if no stop was approached from both sides.
+    whiteness : tests of the residuals; None if none was made.
+    corrections : what was taken out of the readings (temperature of the scales, wavelength).
     rank, unknowns, condition, iterations : of the least-squares problem.
     worst_u : largest standard uncertainty by unit ("um", "urad") with its error.
     covariance : of the unknown errors in the order of ``unknowns`` of the layout, mm and rad.
@@ -84,6 +89,9 @@ class Identification:
     layout: ErrorParameters
     adjustment: Adjustment | None = None
     segments: tuple[Segment, ...] = ()
+    reversal: Reversal | None = None
+    whiteness: Whiteness | None = None
+    corrections: Mapping[str, Any] = field(default_factory=dict)
     systematic: Systematic | None = None
     method: str = "joint"
     steps: Mapping[str, Any] = field(default_factory=dict)
@@ -108,6 +116,9 @@ class Identification:
             "unobservable": list(self.unobservable),
             "rejected": [asdict(item) for item in self.rejected],
             "segments": [item.summary() for item in self.segments],
+            "reversal": None if self.reversal is None else self.reversal.summary(),
+            "whiteness": None if self.whiteness is None else self.whiteness.summary(),
+            "corrections": dict(self.corrections),
             "worst_standard_uncertainty": {
                 unit: {"value": value, "error": name} for unit, (value, name) in self.worst_u.items()
             },

@@ -134,7 +134,7 @@ def _without_station(residual_mm: FloatArray, sight: FloatArray) -> FloatArray:
     moved: FloatArray = np.zeros(3)
     for _ in range(10):
         root = np.sqrt(weight)
-        moved = np.linalg.lstsq(turn * root[:, None], change * root, rcond=1e-9)[0]
+        moved = np.asarray(np.linalg.lstsq(turn * root[:, None], change * root, rcond=1e-9)[0], dtype=np.float64)
         size = np.abs(change - turn @ moved)
         weight = 1.0 / np.maximum(size, 0.1 * np.median(size) + 1e-12)
     return np.asarray(residual_mm - sight @ moved)

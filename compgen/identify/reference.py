@@ -1,0 +1,108 @@
+"""Identification at reference conditions: scales at 20 degC, the right wavelength, the mean of both directions.
+
+What has to be taken out of the readings depends a little on stations and errors; so they are identified, and once or
+twice again with better corrected readings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.lengths import Lengths
+from compgen.core.machine import Machine
+from compgen.identify.adjustment import Adjustment
+from compgen.identify.corrections import Conditions, reading_conditions
+from compgen.identify.parameters import ErrorParameters
+from compgen.identify.result import Identification
+from compgen.identify.reversal import Reversal, approach_signs, estimate_reversal
+from compgen.identify.state import IntArray, State
+from compgen.identify.whiteness import Whiteness, check_whiteness, warn_of_residuals
+from compgen.model.volumetric import tool_of
+
+ROUNDS = 3
+#: Corrections that change by less than this are settled, mm.
+SETTLED_MM = 1e-8
+
+
+def identify_at_reference(
+    machine: Machine,
+    lengths: Lengths,
+    adjust: Callable[[Lengths], Identification],
+    rough: Callable[[Lengths], tuple[ErrorParameters, State, IntArray]],
+    *,
+    temperature: bool = True,
+) -> Identification:
+    """Identify from readings that are brought to reference conditions, and test the residuals.
+
+    Parameters
+    ----------
+    machine, lengths : as in :func:`compgen.identify.identify`.
+    adjust : identifies from readings as they are.
+    rough : start values for stations and dead lengths.
+    temperature : whether the scales are corrected to 20 degC.
+    """
+    lengths, conditions = reading_conditions(machine, lengths, temperature=temperature)
+    still = np.zeros_like(lengths.position_mm)
+    used = lengths
+    if conditions.needs_geometry:
+        used = _added(lengths, conditions.correction_mm(lengths, *rough(lengths), still))
+    found = adjust(used)
+    approach = approach_signs(lengths)
+    reversal, removed = None, False
+    for _ in range(ROUNDS if approach is not None or conditions.needs_geometry else 0):
+        assert found.adjustment is not None
+        geometry = (found.layout, found.adjustment.state, found.adjustment.group)
+        plain = conditions.correction_mm(lengths, *geometry, still) if conditions.needs_geometry else still[:, 0]
+        expected = used.length_mm + found.residual_mm
+        moved = still
+        if approach is not None:
+            reversal = _reversal(machine, lengths, approach, lengths.length_mm + plain - expected, found.adjustment)
+            if reversal is not None and reversal.significant:
+                moved, removed = reversal.displacement(approach), True
+        if not conditions.needs_geometry and not removed:
+            break
+        again = _added(lengths, conditions.correction_mm(lengths, *geometry, moved))
+        settled = np.abs(again.length_mm - used.length_mm).max() < SETTLED_MM
+        used = again
+        if settled:
+            break
+        found = adjust(used)
+    if reversal is not None:
+        reversal = replace(reversal, removed=removed)
+    return _tested(machine, used, found, conditions, reversal)
+
+
+def _added(lengths: Lengths, correction_mm: FloatArray) -> Lengths:
+    return replace(lengths, length_mm=lengths.length_mm + correction_mm)
+
+
+def _sight(machine: Machine, lengths: Lengths, stations_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors from station to nominal target (n, 3), and distances (n,)."""
+    vector = lengths.position_mm + tool_of(machine, lengths.tool_mm) - stations_mm[lengths.station]
+    distance = np.sqrt(np.einsum("ij,ij->i", vector, vector))
+    return vector / distance[:, None], distance
+
+
+def _reversal(
+    machine: Machine, lengths: Lengths, approach: FloatArray, difference_mm: FloatArray, adjustment: Adjustment
+) -> Reversal | None:
+    sight, _ = _sight(machine, lengths, adjustment.state.stations_mm)
+    return estimate_reversal(lengths, approach, adjustment.group, difference_mm, sight, adjustment.weight)
+
+
+def _tested(
+    machine: Machine, used: Lengths, found: Identification, conditions: Conditions, reversal: Reversal | None
+) -> Identification:
+    """Add the tests of the residuals and what was corrected; warn where the residuals are not as they should be."""
+    whiteness = Whiteness({}, 1.0, {}, ())
+    if (adjustment := found.adjustment) is not None:
+        sigma = adjustment.sigma_mm / found.u_scale / np.sqrt(np.where(found.accepted, adjustment.weight, 1.0))
+        standardised = np.where(found.accepted, found.residual_mm / sigma, np.nan)
+        _, distance = _sight(machine, used, adjustment.state.stations_mm)
+        whiteness = check_whiteness(used, adjustment.group, standardised, distance, found.unknowns)
+        warn_of_residuals(whiteness, found.reduced_chi_square, found.u_source)
+    return replace(found, whiteness=whiteness, reversal=reversal, corrections=conditions.notes)

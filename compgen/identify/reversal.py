@@ -1,0 +1,208 @@
+"""Reversal: how the tool stands differently when an axis comes from the other side (ISO 230-1, 3.5.6; ISO 230-2).
+
+Readings of one station at one stop in both directions differ by the line of sight times the vector of each axis whose
+direction of approach changed. Taken against their mean at that stop, they do not depend on the error curves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.core.csvio import FloatArray
+from compgen.core.lengths import Lengths
+from compgen.core.names import AXES, MM_PER_UM
+from compgen.identify.segments import time_order
+from compgen.identify.state import IntArray
+from compgen.simulate.trajectory import approach_of
+
+#: A reversal smaller than this many standard uncertainties is not taken out of the readings.
+SIGNIFICANT = 4.0
+#: Eigenvalue of the normal matrix with unit diagonal below which a direction counts as undetermined.
+ZERO = 1e-8
+
+
+@dataclass(frozen=True)
+class AxisReversal:
+    """Displacement of the tool tip, approached in positive minus approached in negative direction of one axis.
+
+    ``vector_mm`` and its standard uncertainty ``u_mm`` have the components X, Y, Z. ``stations`` holds for each station
+    the mean difference of its readings and the standard uncertainty of that, mm.
+    """
+
+    vector_mm: tuple[float, float, float]
+    u_mm: tuple[float, float, float]
+    stations: Mapping[str, tuple[float, float]]
+
+    @property
+    def significant(self) -> bool:
+        """Whether any component is far beyond its uncertainty."""
+        return any(abs(value) > SIGNIFICANT * u for value, u in zip(self.vector_mm, self.u_mm, strict=True))
+
+
+@dataclass(frozen=True)
+class Reversal:
+    """Mean reversal of each axis that was approached from both sides at the same stops.
+
+    ``pairs`` counts the readings that have one from another side at the same station and stop. ``removed`` says whether
+    the readings were brought to the mean of both directions, so that the curves are the two-way means.
+    """
+
+    axes: Mapping[str, AxisReversal]
+    pairs: int
+    removed: bool = False
+
+    @property
+    def significant(self) -> bool:
+        """Whether any axis has a significant reversal."""
+        return any(axis.significant for axis in self.axes.values())
+
+    def displacement(self, approach: FloatArray) -> FloatArray:
+        """Displacement of the tip against the mean of both directions for approaches (n, 3): shape (n, 3), mm."""
+        vectors = np.zeros((3, 3))
+        for name, axis in self.axes.items():
+            vectors[AXES.index(name)] = axis.vector_mm if axis.significant else 0.0
+        return np.asarray(0.5 * approach @ vectors)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the object ``reversal`` of ``identify.json``."""
+        axes = {
+            name: {
+                "vector_um": [value / MM_PER_UM for value in axis.vector_mm],
+                "u_um": [value / MM_PER_UM for value in axis.u_mm],
+                "significant": axis.significant,
+                "stations_um": {
+                    station: {"value": value / MM_PER_UM, "u": u / MM_PER_UM}
+                    for station, (value, u) in axis.stations.items()
+                },
+            }
+            for name, axis in self.axes.items()
+        }
+        undetermined = [name for name in AXES if name not in self.axes]
+        return {"axes": axes, "undetermined": undetermined, "pairs": self.pairs, "removed": self.removed}
+
+
+def approach_signs(lengths: Lengths) -> FloatArray | None:
+    """Return the last direction of travel of each axis at each reading, (n, 3), +1, -1 or 0; None if unknown.
+
+    Columns ``approach_x`` ... count first; with the column ``approach`` or several runs the directions follow from the
+    order of the stops.
+    """
+    if lengths.approach is not None:
+        return lengths.approach if np.any(lengths.approach) else None
+    last = lengths.covariates.get("approach")
+    run = lengths.labels.get("run")
+    if last is None and (run is None or not np.any(run != run[0])):
+        return None
+    signs = np.zeros((len(lengths), 3))
+    order = time_order(lengths)
+    for k in range(len(lengths.stations)):
+        rows = order[lengths.station[order] == k]
+        moves = np.diff(lengths.position_mm[rows], axis=0, prepend=lengths.position_mm[rows[:1]])
+        signs[rows] = approach_of(moves)
+        if last is not None:
+            stated = np.nan_to_num(last[rows])[:, None]
+            signs[rows] = np.where((moves != 0) & (stated != 0), stated, signs[rows])
+    return signs
+
+
+def estimate_reversal(
+    lengths: Lengths,
+    approach: FloatArray,
+    group: IntArray,
+    difference_mm: FloatArray,
+    sight: FloatArray,
+    weight: FloatArray,
+) -> Reversal | None:
+    """Estimate the reversal of each axis; None where no stop was approached from both sides.
+
+    Parameters
+    ----------
+    lengths : the readings.
+    approach : direction of each axis, (n, 3).
+    group : index of the dead length, (n,).
+    difference_mm : reading minus model without reversal, (n,).
+    sight : unit vectors from station to target, (n, 3).
+    weight : 1/variance of each reading in 1/mm^2 (n,), zero for a rejected one.
+    """
+    cell = _cells(lengths, group)
+    design = 0.5 * approach[:, :, None] * sight[:, None, :]
+    columns = _centred(design.reshape(len(cell), 9), cell, weight)
+    target = _centred(difference_mm[:, None], cell, weight)[:, 0]
+    moved = np.any(np.abs(columns) > 1e-9, axis=1) & (weight > 0)
+    if np.count_nonzero(moved) < 12:
+        return None
+    rows = (cell[moved], columns[moved], target[moved], weight[moved])
+    value, u, known = _solved(*rows)
+    axes = {}
+    for axis, name in enumerate(AXES):
+        part = slice(3 * axis, 3 * axis + 3)
+        if known[part].all():
+            vector, u_vector = tuple(value[part].tolist()), tuple(u[part].tolist())
+            axes[name] = AxisReversal(vector, u_vector, {})
+    stations = _by_station(lengths, approach, difference_mm, weight, cell)
+    axes = {
+        name: AxisReversal(
+            item.vector_mm, item.u_mm, {s: found[name] for s, found in stations.items() if name in found}
+        )
+        for name, item in axes.items()
+    }
+    return Reversal(axes, int(np.count_nonzero(moved))) if axes else None
+
+
+def _cells(lengths: Lengths, group: IntArray) -> IntArray:
+    """Index of station, dead length and stop (position and tool) of each reading."""
+    columns = [*lengths.position_mm.T, *(() if lengths.tool_mm is None else lengths.tool_mm.T)]
+    cell = group
+    for column in columns:
+        levels, level = np.unique(column, return_inverse=True)
+        _, cell = np.unique(cell * len(levels) + level.ravel(), return_inverse=True)
+    return cell.ravel().astype(np.int64)
+
+
+def _centred(columns: FloatArray, cell: IntArray, weight: FloatArray) -> FloatArray:
+    """Take the weighted mean of each cell out of columns (n, k)."""
+    total = np.bincount(cell, weight)
+    total[total == 0] = 1.0
+    centred = np.empty_like(columns)
+    for k in range(columns.shape[1]):
+        centred[:, k] = columns[:, k] - (np.bincount(cell, weight * columns[:, k]) / total)[cell]
+    return centred
+
+
+def _solved(
+    cell: IntArray, columns: FloatArray, target: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Weighted least squares: values, standard uncertainties from the residuals, and which are determined."""
+    matrix = columns.T @ (columns * weight[:, None])
+    diagonal = np.diag(matrix)
+    present = diagonal > ZERO * max(float(diagonal.max()), 1e-300)
+    scale = np.where(present, 1.0 / np.sqrt(np.where(present, diagonal, 1.0)), 0.0)
+    eigenvalues, vectors = np.linalg.eigh(matrix * scale * scale[:, None] + np.diag((~present).astype(float)))
+    kept = eigenvalues > ZERO
+    known = present & (np.abs(vectors[:, ~kept]).max(axis=1, initial=0.0) < 1e-3)
+    inverse = (vectors[:, kept] / eigenvalues[kept]) @ vectors[:, kept].T * scale * scale[:, None]
+    value = inverse @ (columns.T @ (weight * target))
+    left = target - columns @ value
+    freedom = len(target) - len(np.unique(cell)) - int(np.count_nonzero(kept & (eigenvalues > 0)))
+    variance = float(weight @ left**2) / max(freedom, 1)
+    return value, np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance), known
+
+
+def _by_station(
+    lengths: Lengths, approach: FloatArray, difference_mm: FloatArray, weight: FloatArray, cell: IntArray
+) -> dict[str, dict[str, tuple[float, float]]]:
+    """Mean difference of the readings of each station between the directions of each axis, with its uncertainty."""
+    columns = _centred(0.5 * approach, cell, weight)
+    target = _centred(difference_mm[:, None], cell, weight)[:, 0]
+    found = {}
+    for k, name in enumerate(lengths.stations):
+        rows = (lengths.station == k) & (weight > 0) & np.any(np.abs(columns) > 1e-9, axis=1)
+        if np.count_nonzero(rows) >= 8:
+            value, u, known = _solved(cell[rows], columns[rows], target[rows], weight[rows])
+            found[name] = {AXES[a]: (float(value[a]), float(u[a])) for a in range(3) if known[a]}
+    return found
