@@ -149,9 +149,8 @@ def identify_command(
     open are named and nothing is written.
 
     \b
-    Examples:
+    Example:
       compgen identify zha-gantry examples/zha-gantry.lengths.csv --out identified/
-      compgen identify zha-gantry examples/zha-gantry.lengths.csv --method two-step --out identified/
     """
     if instrument is not None:
         raise InputError(
