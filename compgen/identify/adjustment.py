@@ -23,6 +23,7 @@ class Adjustment:
     weight : dimensionless weight of each reading (n,), zero for a rejected one.
     group : index of the dead length of each reading, (n,).
     sigma_mm : standard uncertainty of a reading of weight 1, so that the covariance is sigma^2 (J^T W J)^-1.
+    held_weight : weight of unknowns that were known beforehand, (size,), part of the normal matrix; None without any.
     """
 
     state: State
@@ -30,6 +31,7 @@ class Adjustment:
     weight: FloatArray
     group: IntArray
     sigma_mm: float
+    held_weight: FloatArray | None = None
 
     def covariance_factor(self) -> FloatArray:
         """Upper triangular F (size, size) with F F^T the covariance of all unknowns, mm and rad.

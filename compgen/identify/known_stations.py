@@ -143,6 +143,13 @@ class HeldStations:
     def _columns(self) -> IntArray:
         return self.parameters.size + 3 * self.station[:, None] + np.arange(3)
 
+    @property
+    def held_weight(self) -> FloatArray:
+        """Weight of each unknown as an observation of its own (size,), zero for those that are not known."""
+        weight = np.zeros(self.size)
+        weight[self._columns()] += self.weight[:, None]
+        return weight
+
     def square_sum(self, state: State) -> float:
         """Weighted sum of squares of the known coordinates."""
         return float(np.sum(self.weight[:, None] * (state.stations_mm[self.station] - self.position_mm) ** 2))

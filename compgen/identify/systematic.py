@@ -234,10 +234,12 @@ class _Linear:
 
     def response(self, pattern_mm: FloatArray) -> FloatArray:
         """Return the change of the unknowns (size, q) for disturbances (n, q) of the readings."""
-        found = np.zeros((self.problem.size, pattern_mm.shape[1]))
-        for _ in range(PASSES):
-            left = pattern_mm - self.forward(found) if found.any() else pattern_mm
-            found += self.adjustment.factor.solve(self.backward(left))
+        found = self.adjustment.factor.solve(self.backward(pattern_mm))
+        for _ in range(PASSES - 1):
+            right = self.backward(pattern_mm - self.forward(found))
+            if self.adjustment.held_weight is not None:
+                right -= self.adjustment.held_weight[:, None] * found
+            found = found + self.adjustment.factor.solve(right)
         return found
 
     def forward(self, unknowns: FloatArray) -> FloatArray:
