@@ -20,6 +20,7 @@ from scipy.sparse import coo_array, csr_array
 
 from compgen.core.csvio import FloatArray
 from compgen.core.names import SQUARENESS_NAMES
+from compgen.identify.kernels import compiled_loops
 from compgen.identify.parameters import ErrorParameters
 from compgen.identify.state import IntArray, State
 from compgen.model.exact import level_rotations, passing_order, travel_directions
@@ -206,13 +207,40 @@ class GridProblem:
     def _backward(
         self, state: State, data: ToolData, bodies: Sequence[_Body], tips: Sequence[FloatArray], gradient: FloatArray
     ) -> float:
+        force = np.zeros_like(tips[-1])
+        loops = compiled_loops()
+        if loops is None:
+            cost = self._forces(state, data, tips[-1], force, gradient)
+        else:
+            by_group = np.zeros((self.groups, 4))
+            stations = state.stations_mm[self.station_of]
+            cost = float(
+                loops.forces(
+                    np.ascontiguousarray(tips[-1]),
+                    stations,
+                    state.dead_length_mm,
+                    data.weight,
+                    data.length_mm,
+                    force,
+                    by_group,
+                )
+            )
+            first, second = self.parameters.size, self.parameters.size + 3 * self.stations
+            for group, station in enumerate(self.station_of.tolist()):
+                gradient[first + 3 * station : first + 3 * station + 3] += by_group[group, :3]
+            gradient[second:] += by_group[:, 3]
+        _pull_back(self, bodies, tips, force, gradient)
+        return cost
+
+    def _forces(self, state: State, data: ToolData, tip: FloatArray, force: FloatArray, gradient: FloatArray) -> float:
+        """Return the cost; add forces on the tips and the gradient by stations and dead lengths (numpy)."""
         first, second = self.parameters.size, self.parameters.size + 3 * self.stations
-        cost, force = 0.0, np.zeros_like(tips[-1])
-        step = max(1, BATCH // max(1, tips[-1].size))
+        cost = 0.0
+        step = max(1, BATCH // max(1, tip.size))
         for start in range(0, self.groups, step):
             batch = slice(start, min(start + step, self.groups))
             station = self.station_of[batch]
-            sight = tips[-1] - state.stations_mm[station][:, None, :, None]
+            sight = tip - state.stations_mm[station][:, None, :, None]
             distance = _lengths(sight)
             residual = distance - data.length_mm[batch]
             residual -= state.dead_length_mm[batch, None, None]
@@ -224,7 +252,6 @@ class GridProblem:
             for group, total in zip(station.tolist(), sight.sum(axis=3).sum(axis=1), strict=True):
                 gradient[first + 3 * group : first + 3 * group + 3] -= total
             force += sight.sum(axis=0)
-        _pull_back(self, bodies, tips, force, gradient)
         return cost
 
     def predicted(self, state: State) -> list[FloatArray]:
@@ -385,18 +412,32 @@ def _add_normal(problem: GridProblem, data: ToolData, tip: FloatArray, state: St
         problem.parameters, problem.levels_mm, problem.reduced, data.tool_mm, _squareness(problem.parameters, state)
     )
     first, second = problem.parameters.size, problem.parameters.size + 3 * problem.stations
+    loops = compiled_loops()
+    step = problem.groups if loops else max(1, BATCH // tip.size)
     weighted = np.zeros((6, *shape))
-    step = max(1, BATCH // tip.size)
     for start in range(0, problem.groups, step):
         batch = slice(start, min(start + step, problem.groups))
         stations = problem.station_of[batch]
-        sight = tip - state.stations_mm[stations][:, None, :, None]
-        sight /= _lengths(sight)[:, :, None, :]
-        moments = _outer_products(sight, data.weight[batch], shape)  # 6 of w u u^T, 3 of w u, 1 of w
-        weighted += moments[:, :6].sum(axis=0) if len(stations) > 1 else moments[0, :6]
-        by_station, by_group = _station_moments(problem, level, moments)
+        if loops is None:
+            sight = tip - state.stations_mm[stations][:, None, :, None]
+            sight /= _lengths(sight)[:, :, None, :]
+            products = _outer_products(sight, data.weight[batch], shape)  # 6 of w u u^T, 3 of w u, 1 of w
+            weighted += products[:, :6].sum(axis=0) if len(stations) > 1 else products[0, :6]
+            tables = _moment_tables(problem, products)
+        else:
+            coordinates = [problem.levels_mm[axis] for axis in problem.order]
+            tables = [np.zeros((len(stations), count, 3, 10)) for count in shape]
+            loops.moments(
+                np.ascontiguousarray(tip),
+                state.stations_mm[stations],
+                data.weight[batch],
+                *coordinates,
+                weighted,
+                *tables,
+            )
+        by_station, by_group = _station_moments(problem, level, tables)
         by_station = level.transposed @ by_station  # (size, batch * 3)
-        sums = moments.reshape(len(stations), 10, -1).sum(axis=2)
+        sums = tables[0][:, :, 0].sum(axis=1)
         for k, station in enumerate(stations.tolist()):
             columns = slice(first + 3 * station, first + 3 * station + 3)
             matrix[:first, columns] -= by_station[:, 3 * k : 3 * k + 3]
@@ -429,30 +470,38 @@ def _powers(levels_mm: FloatArray, count: int) -> FloatArray:
     return powers
 
 
-def _station_moments(problem: GridProblem, level: LevelMap, moments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Per kind and level: sums of w q u_o u^T (levels, groups * 3) and of w q u_o (levels, groups), q the kind's lever."""
+def _moment_tables(problem: GridProblem, products: FloatArray) -> list[FloatArray]:
+    """Sum the products (groups, 10, n_out, n_mid, n_in) per level of the outer, middle and inner axis.
+
+    Each table is (groups, levels, 3, 10): the sums times 1 and times the coordinates of the other two axes, in the
+    order inner, mid, out.
+    """
     out, mid, inner = (_powers(problem.levels_mm[axis], 2) for axis in problem.order)
-    groups = len(moments)
-    over_inner = moments @ inner  # [group, 10, out, mid, q_in]
+    groups = len(products)
+    over_inner = products @ inner  # [group, 10, out, mid, q_in]
     by_out = over_inner.swapaxes(3, 4) @ mid  # [group, 10, out, q_in, q_mid]
     by_mid = over_inner.transpose(0, 1, 3, 4, 2) @ out  # [group, 10, mid, q_in, q_out]
-    flat = moments.reshape(groups * 10, *moments.shape[2:])
+    flat = products.reshape(groups * 10, *products.shape[2:])
     over_out = _contract_first(flat, out)  # [group * 10, q_out, mid, in]
     by_inner = (over_out.swapaxes(2, 3) @ mid).transpose(0, 2, 3, 1)  # [group * 10, in, q_mid, q_out]
-    by_inner = by_inner.reshape(groups, 10, *by_inner.shape[1:])
-    axis_out, axis_mid, axis_in = problem.order
-    tables = {
-        axis_out: (by_out, axis_in, axis_mid),
-        axis_mid: (by_mid, axis_in, axis_out),
-        axis_in: (by_inner, axis_mid, axis_out),
-    }
+    tables = (by_out, by_mid, by_inner.reshape(groups, 10, *by_inner.shape[1:]))
+    return [np.stack([t[..., 0, 0], t[..., 1, 0], t[..., 0, 1]]).transpose(1, 3, 0, 2) for t in tables]
+
+
+def _station_moments(
+    problem: GridProblem, level: LevelMap, tables: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Per kind and level: sums of w q u_o u^T (levels, groups * 3) and of w q u_o (levels, groups), q the kind's lever."""
+    out, mid, inner = problem.order
+    place = {out: (tables[0], (inner, mid)), mid: (tables[1], (inner, out)), inner: (tables[2], (mid, out))}
     stations, dead = [], []
     for axis, kinds in enumerate(level.kinds):
-        table, first_lever, second_lever = tables[axis]
+        table, levers = place[axis]
         for kind in kinds:
-            part = table[:, :, :, int(kind.lever == first_lever), int(kind.lever == second_lever)]
-            stations.append(part[:, _SYMMETRIC[kind.output]].reshape(groups * 3, -1).T)
-            dead.append(part[:, 6 + kind.output].T)
+            part = table[:, :, 0 if kind.lever is None else 1 + levers.index(kind.lever)]  # [group, level, 10]
+            chosen = part[:, :, _SYMMETRIC[kind.output]]  # [group, level, 3]
+            stations.append(chosen.transpose(1, 0, 2).reshape(part.shape[1], -1))
+            dead.append(part[:, :, 6 + kind.output].T)
     return np.concatenate(stations), np.concatenate(dead)
 
 
@@ -542,7 +591,7 @@ def _merge(
     return tuple(merged), scatter
 
 
-def _levels(position_mm: FloatArray) -> tuple[FloatArray, IntArray]:
+def levels_of(position_mm: FloatArray) -> tuple[FloatArray, IntArray]:
     """Distinct values (k,) of (n,) and the index of each position; a sample is tried first, sorting all is slow."""
     sample = np.unique(position_mm[:: max(1, len(position_mm) // 1999) | 1])
     found = np.minimum(np.searchsorted(sample, position_mm), len(sample) - 1)
@@ -616,7 +665,7 @@ def grid_problem(
     station, group, reading_mm : of each reading, shape (n,).
     """
     count = len(reading_mm)
-    found = [_levels(np.ascontiguousarray(position_mm[:, axis])) for axis in range(3)]
+    found = [levels_of(np.ascontiguousarray(position_mm[:, axis])) for axis in range(3)]
     levels, at = [item[0] for item in found], [item[1] for item in found]
     if tool_mm.ndim == 1:
         tools, tool = tool_mm[None], np.zeros(count, dtype=np.int64)

@@ -26,7 +26,7 @@ from compgen.identify.covariance import with_systematic
 from compgen.identify.grid_problem import GridProblem, grid_problem, start_moments
 from compgen.identify.known_stations import HeldStations, KnownStations, hold, locate_stations, with_known_start
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
-from compgen.identify.outliers import accepted_readings, explain_rejected
+from compgen.identify.outliers import belonging, explain_rejected
 from compgen.identify.parameters import ErrorParameters, common_tool, parameters_for_tools
 from compgen.identify.problem import LengthProblem, length_problem
 from compgen.identify.rank import Rank, analyse_rank
@@ -142,7 +142,7 @@ def _undisturbed(task: _Task, start: State, options: IdentifyOptions) -> Identif
     except ConvergenceError:
         return None
     residual = task.problem.residuals(solution.state)
-    if options.reject and not accepted_readings(residual / sigma_mm).all():
+    if options.reject and not belonging(residual / sigma_mm):
         return None
     accepted = np.ones(len(residual), dtype=bool)
     return _result(task, RobustFit(task.problem, task.group, solution, accepted, residual), sigma_mm, noise, rank)

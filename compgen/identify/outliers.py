@@ -19,6 +19,8 @@ from compgen.model.volumetric import tool_of
 
 #: A reading is rejected when its residual exceeds this many robust standard deviations (1.4826 MAD).
 LIMIT = 6.0
+#: Residuals that scatter more than so many standard uncertainties are looked at for gross mistakes.
+LARGEST_SPREAD = 10.0
 #: A reading fits another point or station when it agrees within so many standard deviations.
 CLOSE = 10.0
 #: Below this size a residual is no exchange of points: neighbours in the volume are further apart.
@@ -54,6 +56,11 @@ def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
     if largest <= LIMIT * max(quick, 1e-3):
         return np.ones(len(size), dtype=bool)
     return np.asarray(size <= LIMIT * standardised_spread(standardised))
+
+
+def belonging(standardised: FloatArray) -> bool:
+    """Whether all readings belong: none beyond the limit, and no residuals so large that a mistake may hide in them."""
+    return bool(accepted_readings(standardised).all()) and standardised_spread(standardised[::7]) < LARGEST_SPREAD
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.names import AXES, MM_PER_UM
+from compgen.identify.grid_problem import levels_of
 from compgen.identify.segments import time_order
 from compgen.identify.state import IntArray
 from compgen.simulate.trajectory import approach_of
 
 #: A reversal smaller than this many standard uncertainties is not taken out of the readings.
 SIGNIFICANT = 4.0
+#: Cells are counted anew when there could be so many times more of them than readings.
+SPARSE = 8
 #: Eigenvalue of the normal matrix with unit diagonal below which a direction counts as undetermined.
 ZERO = 1e-8
 
@@ -157,10 +160,13 @@ def estimate_reversal(
 def _cells(lengths: Lengths, group: IntArray) -> IntArray:
     """Index of station, dead length and stop (position and tool) of each reading."""
     columns = [*lengths.position_mm.T, *(() if lengths.tool_mm is None else lengths.tool_mm.T)]
-    cell = group
+    cell, count = group, int(group.max()) + 1
     for column in columns:
-        levels, level = np.unique(column, return_inverse=True)
-        _, cell = np.unique(cell * len(levels) + level.ravel(), return_inverse=True)
+        levels, level = levels_of(np.ascontiguousarray(column))
+        cell, count = cell * len(levels) + level, count * len(levels)
+        if count > SPARSE * len(cell):
+            present, cell = np.unique(cell, return_inverse=True)
+            count = len(present)
     return cell.ravel().astype(np.int64)
 
 
@@ -188,7 +194,7 @@ def _solved(
     inverse = (vectors[:, kept] / eigenvalues[kept]) @ vectors[:, kept].T * scale * scale[:, None]
     value = inverse @ (columns.T @ (weight * target))
     left = target - columns @ value
-    freedom = len(target) - len(np.unique(cell)) - int(np.count_nonzero(kept & (eigenvalues > 0)))
+    freedom = len(target) - int(np.count_nonzero(np.bincount(cell))) - int(np.count_nonzero(kept & (eigenvalues > 0)))
     variance = float(weight @ left**2) / max(freedom, 1)
     return value, np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance), known
 
