@@ -12,9 +12,19 @@ from compgen.core.points import Points, format_points, read_points
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.export import Export, export, wanted_correction
 from compgen.fit import FitOptions, FitResult, fit
-from compgen.identify import Identification, IdentifyOptions, identify
+from compgen.identify import (
+    Covariance,
+    Identification,
+    IdentifyOptions,
+    SystematicInputs,
+    identify,
+    joint_covariance,
+    predict_uncertainty,
+    read_covariance,
+)
 from compgen.model import c_matrix, exact_error, modelled_errors, observable_errors, predict, volumetric_error
 from compgen.pipeline import RunResult, run
+from compgen.plan import Plan, PlannedStations, plan, planned_stations, suggest
 from compgen.simulate import Scenario, Simulation, read_scenario, simulate, write_simulation
 from compgen.verify import ReadTables, Residuals, Verification, read_tables, residuals, verify, without_rigid_motion
 
@@ -25,6 +35,7 @@ __all__ = [
     "CompgenError",
     "CompgenWarning",
     "ConvergenceError",
+    "Covariance",
     "Curve",
     "ErrorTable",
     "Export",
@@ -35,12 +46,15 @@ __all__ = [
     "InputError",
     "Lengths",
     "Machine",
+    "Plan",
+    "PlannedStations",
     "Points",
     "ReadTables",
     "Residuals",
     "RunResult",
     "Scenario",
     "Simulation",
+    "SystematicInputs",
     "UndeterminedError",
     "Verification",
     "c_matrix",
@@ -51,10 +65,15 @@ __all__ = [
     "format_lengths",
     "format_points",
     "identify",
+    "joint_covariance",
     "load_machine",
     "modelled_errors",
     "observable_errors",
+    "plan",
+    "planned_stations",
     "predict",
+    "predict_uncertainty",
+    "read_covariance",
     "read_errors",
     "read_lengths",
     "read_points",
@@ -63,9 +82,10 @@ __all__ = [
     "residuals",
     "run",
     "simulate",
+    "suggest",
     "verify",
     "volumetric_error",
-    "without_rigid_motion",
     "wanted_correction",
+    "without_rigid_motion",
     "write_simulation",
 ]

@@ -480,6 +480,8 @@ def test_no_command_shows_the_help(call):
 def output_cases(small_machine_file, small_lengths_file, errors_file, points_file, tables, out):
     files = ("--controller", "isg-csv")
     scenario = small_lengths_file.parent / "scenario.toml"
+    stations = small_lengths_file.parent / "planned.csv"
+    stations.write_text("station,x_mm,y_mm,z_mm\nS1,-420,-210,-420\nS2,330,-190,-405\nS3,310,410,-415\nS4,-400,430,-90\n")
     return {
         "run": (small_machine_file, small_lengths_file, *files, "--out", out),
         "identify": (small_machine_file, small_lengths_file, "--out", out),
@@ -489,10 +491,11 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
         "simulate": (small_machine_file, "--scenario", scenario, "--out", out),
         "read": (small_machine_file, tables / "volcomp0.csv", *files, "--points", points_file, "--out", out / "c.csv"),
         "predict": (small_machine_file, errors_file, "--points", points_file, "--out", out / "e.csv"),
+        "plan": (small_machine_file, "--stations", stations, "--grid", "--out", out),
     }
 
 
-WRITING = ["run", "identify", "fit", "export", "verify", "simulate", "read", "predict"]
+WRITING = ["run", "identify", "fit", "export", "verify", "simulate", "read", "predict", "plan"]
 
 
 def test_every_command_that_writes_is_among_these():
