@@ -481,7 +481,9 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
     files = ("--controller", "isg-csv")
     scenario = small_lengths_file.parent / "scenario.toml"
     stations = small_lengths_file.parent / "planned.csv"
-    stations.write_text("station,x_mm,y_mm,z_mm\nS1,-420,-210,-420\nS2,330,-190,-405\nS3,310,410,-415\nS4,-400,430,-90\n")
+    stations.write_text(
+        "station,x_mm,y_mm,z_mm\nS1,-420,-210,-420\nS2,330,-190,-405\nS3,310,410,-415\nS4,-400,430,-90\n"
+    )
     return {
         "run": (small_machine_file, small_lengths_file, *files, "--out", out),
         "identify": (small_machine_file, small_lengths_file, "--out", out),
