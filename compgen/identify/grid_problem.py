@@ -524,11 +524,15 @@ def _level_matrix(problem: GridProblem, level: LevelMap, weighted: FloatArray) -
     starts = np.cumsum([0, *(len(level.kinds[axis]) * sizes[axis] for axis in range(3))])
     result = np.zeros((int(starts[3]), int(starts[3])))
     for (a, b), table in pair.items():
+        if not level.kinds[a] or not level.kinds[b]:  # the model may leave an axis without any error
+            continue
         block = _pair_block(level.kinds[a], level.kinds[b], table, problem.levels_mm[a], problem.levels_mm[b])
         rows, columns = slice(starts[a], starts[a + 1]), slice(starts[b], starts[b + 1])
         result[rows, columns] = block
         result[columns, rows] = block.T
     for axis, (first, second) in {out: (out, mid), mid: (out, mid), inner: (out, inner)}.items():
+        if not level.kinds[axis]:
+            continue
         table = pair[(first, second)]
         other = second if axis == first else first
         turned = table if axis == first else table.transpose(0, 1, 3, 2)
@@ -665,6 +669,7 @@ def grid_problem(
     station, group, reading_mm : of each reading, shape (n,).
     """
     count = len(reading_mm)
+    compiled_loops(count)
     found = [levels_of(np.ascontiguousarray(position_mm[:, axis])) for axis in range(3)]
     levels, at = [item[0] for item in found], [item[1] for item in found]
     if tool_mm.ndim == 1:

@@ -126,7 +126,10 @@ def _free_coefficients(machine: Machine, error: ErrorName, *, released: bool) ->
     count = len(axis.nodes_mm)
     if released:
         return np.eye(count)
+    zeros = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
+    held = np.isin(axis.nodes_mm, zeros)
+    if machine.curves == "linear" and np.count_nonzero(held) == len(zeros):
+        return np.eye(count)[:, ~held]
     build = spline_matrix if machine.curves == "cubic" else hat_matrix
-    zeros = np.array(axis.range_mm) if error.is_straightness else np.array([machine.reference_point_mm[error.axis]])
-    rows = build(axis.nodes_mm, zeros)
+    rows = build(axis.nodes_mm, np.array(zeros))
     return free_basis(np.where(np.abs(rows) < 1e-14, 0.0, rows), count)

@@ -1,0 +1,34 @@
+"""Access to the compiled inner loops of :mod:`compgen.identify.compiled`, which need numba.
+
+Loading them takes a fifth of a second. They are loaded for large data, and for a process that identifies repeatedly;
+a single small identification from the command line is faster without.
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+#: Readings from which the compiled loops pay at once.
+LARGE = 100_000
+_state: dict[str, int] = {"calls": 0, "allowed": 1}
+_loaded: dict[str, ModuleType | None] = {}
+
+
+def allow(compiled: bool) -> None:
+    """Allow or forbid the compiled loops; for tests and benchmarks that compare both paths."""
+    _state["allowed"] = int(compiled)
+
+
+def compiled_loops(readings: int = 0) -> ModuleType | None:
+    """Return the compiled module, or None where numpy serves; ``readings`` is given once for each identification."""
+    if not _state["allowed"]:
+        return None
+    if readings:
+        _state["calls"] += 1
+    if "module" not in _loaded and (_state["calls"] > 1 or readings >= LARGE):
+        try:
+            _loaded["module"] = importlib.import_module("compgen.identify.compiled")
+        except ImportError:
+            _loaded["module"] = None
+    return _loaded.get("module")
