@@ -62,8 +62,9 @@ def read_stations(path: str | Path) -> KnownStations:
 def locate_stations(machine: Machine, lengths: Lengths) -> KnownStations:
     """Locate every station with the machine taken as perfect (single-station method of Zha & Zhang 2024, section 1).
 
-    The machine's own errors go into the positions. The uncertainty is the residual RMS times the root of the cofactor,
-    and not less than the residual RMS itself, because the residuals are errors of the machine and no noise.
+    The machine's own errors go into the positions. They are smooth over the volume, so that more readings do not average
+    them out: the uncertainty is what errors of the size of the residual RMS do if all of them act in the worst way,
+    the root of n times that of independent ones.
     """
     target = lengths.position_mm + tool_of(machine, lengths.tool_mm)
     setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
@@ -95,7 +96,8 @@ def _locate(name: str, target_mm: FloatArray, length_mm: FloatArray, group: IntA
             break
     rms = float(np.sqrt(np.sum(residual**2) / freedom))
     cofactor = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14)
-    return unknowns[:3], max(rms * float(np.sqrt(np.diag(cofactor)[:3].max())), rms, HELD_MM)
+    worst = float(np.sqrt(len(length_mm) * np.linalg.eigvalsh(cofactor[:3, :3]).max()))
+    return unknowns[:3], max(rms * worst, HELD_MM)
 
 
 def with_known_start(

@@ -171,12 +171,20 @@ def _to_own_frame(start: Frame) -> Frame:
         raise UndeterminedError("all stations stand on one line; the tracers cannot locate themselves", [])
     y /= length
     rotation = np.stack([x, y, np.cross(x, y)])
-    return start.moved(rotation, -rotation @ origin)
+    frame = start.moved(rotation, -rotation @ origin)
+    coordinates = frame.stations_mm.ravel()
+    coordinates[_held_coordinates(start.stations_mm)] = 0.0
+    return replace(frame, stations_mm=coordinates.reshape(-1, 3))
+
+
+def _held_coordinates(stations_mm: FloatArray) -> list[int]:
+    """Places of the six zeros of eq. 17 among the coordinates of all stations."""
+    first, second, third = frame_stations(stations_mm)
+    return [3 * first, 3 * first + 1, 3 * first + 2, 3 * second + 1, 3 * second + 2, 3 * third + 2]
 
 
 def _free_unknowns(start: Frame) -> IntArray:
-    first, second, third = frame_stations(start.stations_mm)
-    held = [3 * first, 3 * first + 1, 3 * first + 2, 3 * second + 1, 3 * second + 2, 3 * third + 2]
+    held = _held_coordinates(start.stations_mm)
     return np.setdiff1d(np.arange(start.stations_mm.size + len(start.dead_length_mm)), held).astype(np.int64)
 
 
