@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from compgen.core.deviations import format_deviations
 from compgen.core.error_table import ErrorTable, format_errors
 from compgen.core.files import OutputFolder, read_bytes, sha256_of
 from compgen.core.machine import Machine
-from compgen.errors import InputError
+from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.export import REJECTED_PREFIX, Export, Provenance, export, usable_format
 from compgen.fit import FitOptions, FitResult, fit
 from compgen.identify import (
@@ -71,6 +72,7 @@ def identification_files(result: Identification, provenance: Provenance) -> dict
     columns: dict[str, Sequence[str] | FloatArray] = {
         "station": [item.station for item in stations],
         "setup": [str(item.setup) for item in stations],
+        "segment": [str(item.segment) for item in stations],
         **{f"{axis}_mm": np.array([item.position_mm[k] for item in stations]) for k, axis in enumerate("xyz")},
         **{
             f"u_{axis}_um": 1e3 * np.array([item.u_position_mm[k] for item in stations]) for k, axis in enumerate("xyz")
@@ -156,6 +158,21 @@ def _write_result(exported: Export, verification: Verification, folder: str | Pa
     return ControllerResult(exported, verification, tuple(paths))
 
 
+@contextmanager
+def failure_reported(folder: str | Path) -> Iterator[None]:
+    """Write ``identify.json`` where the data do not determine the errors, or no optimum is found, and pass the error on.
+
+    No error curve is written then; ``identified`` is false and the reason stands there.
+    """
+    try:
+        yield
+    except (UndeterminedError, ConvergenceError) as error:
+        combinations = list(getattr(error, "combinations", []))
+        report = {"identified": False, "error": str(error), "unobservable": combinations}
+        write_all(folder, {"identify.json": json.dumps(report, indent=2) + "\n"})
+        raise
+
+
 def run(
     machine: Machine,
     measurements: Sequence[str | Path],
@@ -191,7 +208,8 @@ def run(
     measurement = read_measurement(measurements)
     provenance = provenance_of(machine.source, *measurements)
     progress(f"identifying: {describe(measurement)}")
-    identification = identify_measurement(machine, measurement, identify_options)
+    with failure_reported(folder):
+        identification = identify_measurement(machine, measurement, identify_options)
     progress("fitting smooth curves")
     fitted = fit(machine, identification.errors, fit_options or FitOptions())
     checked: dict[str, tuple[Export, Verification]] = {}

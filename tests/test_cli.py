@@ -641,3 +641,18 @@ def test_no_figure_and_no_verdict_is_cut_off(width, name, small_machine, small_e
         assert text.count("4321") == text.count("1234") == 2
         assert all(reason in text for reason in reasons)
         assert max(map(len, text.splitlines())) <= width
+
+
+def test_what_the_data_do_not_determine_is_reported_and_no_curve_is_written(
+    call, small_machine_file, small_lengths_file, tmp_path
+):
+    machine = tmp_path / "fine.toml"
+    machine.write_text(small_machine_file.read_text().replace("nodes = 6", "nodes = 13"))
+    out = tmp_path / "out"
+    code, _, stderr = call("identify", machine, small_lengths_file, "--out", out)
+    assert code == 1
+    assert "no data at all" in stderr
+    report = json.loads((out / "identify.json").read_text())
+    assert report["identified"] is False
+    assert any("EXX" in text for text in report["unobservable"])
+    assert [path.name for path in out.iterdir()] == ["identify.json"]

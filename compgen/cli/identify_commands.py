@@ -24,7 +24,7 @@ from compgen.identify import (
     read_stations,
 )
 from compgen.identify.noise import METHODS
-from compgen.pipeline import fit_files, identification_files, provenance_of, write_all
+from compgen.pipeline import failure_reported, fit_files, identification_files, provenance_of, write_all
 from compgen.report.text import fit_table, identification_table
 
 #: Options --u-... and the fields of SystematicInputs that they fill.
@@ -47,6 +47,8 @@ METHOD_HELP = {
     "all points, which needs four stations at common points.",
     "stations": "CSV with known stations (station, x_mm, y_mm, z_mm; optional u_mm, exact without), or the word nominal: "
     "located with the machine taken as perfect.",
+    "no_temperature": "Leave the scales at the temperature that they had; by default they are corrected to 20 degC where the "
+    "file has temp_x_c, temp_y_c, temp_z_c and the machine file expansion_um_per_m_k.",
     "u_deviation_um": "Standard uncertainty of a measured deviation (*.deviations.csv), um; default: the file's, else 1 um "
     "scaled by the residuals.",
 }
@@ -83,12 +85,14 @@ def method_options(command: Command) -> Command:
     """Add how to identify; the command receives ``choices``, fields of IdentifyOptions."""
 
     @functools.wraps(command)
-    def wrapper(*args: Any, method: str, stations: str | None, u_deviation_um: float | None, **options: Any) -> Any:
+    def wrapper(*args: Any, method: str, stations: str | None, no_temperature: bool, **options: Any) -> Any:
         known = read_stations(stations) if stations not in (None, "nominal") else stations
-        choices = {"method": method, "stations": known, "u_deviation_um": u_deviation_um}
+        choices = {"method": method, "stations": known, "temperature": not no_temperature}
+        choices["u_deviation_um"] = options.pop("u_deviation_um")
         return command(*args, choices=choices, **options)
 
     decorated: Any = click.option("--u-deviation-um", type=float, help=METHOD_HELP["u_deviation_um"])(wrapper)
+    decorated = click.option("--no-temperature", is_flag=True, help=METHOD_HELP["no_temperature"])(decorated)
     decorated = click.option("--stations", metavar="FILE", help=METHOD_HELP["stations"])(decorated)
     chosen = click.option("--method", type=click.Choice(METHODS), default="joint", help=METHOD_HELP["method"])
     return chosen(decorated)  # type: ignore[no-any-return]
@@ -146,7 +150,7 @@ def identify_command(
     MEASUREMENTS are *.lengths.csv (mm) or *.deviations.csv files (dx_um, dy_um, dz_um: measured minus commanded; the
     placement of their frame is found as well). --method two-step also writes measured.deviations.csv. With --stations
     one or two stations are enough if they determine the errors of the machine file; if not, the combinations that stay
-    open are named and nothing is written.
+    open are named in identify.json and no error is written.
 
     \b
     Example:
@@ -162,7 +166,8 @@ def identify_command(
         measurement = read_measurement(measurements)
         show(f"identifying: {describe(measurement)}")
         options = identify_options(u_length_um, u_length_um_per_m, keep_all, systematic, choices)
-        result = identify_measurement(machine, measurement, options)
+        with failure_reported(out):
+            result = identify_measurement(machine, measurement, options)
     write_all(out, identification_files(result, provenance_of(machine.source, *measurements)))
     if as_json:
         print_json(result.summary())
