@@ -25,6 +25,7 @@ from compgen.identify.affine_start import affine_start
 from compgen.identify.covariance import with_systematic
 from compgen.identify.grid_problem import GridProblem, grid_problem, start_moments
 from compgen.identify.known_stations import HeldStations, KnownStations, hold, locate_stations, with_known_start
+from compgen.identify.located import TracerReadings
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
 from compgen.identify.outliers import belonging, explain_rejected
 from compgen.identify.parameters import ErrorParameters, common_tool, parameters_for_tools
@@ -40,7 +41,7 @@ from compgen.identify.state import IntArray, State
 from compgen.identify.tables import error_table, inverse, metadata_of, unobservable
 from compgen.identify.threads import one_thread
 from compgen.identify.travel import check_travel
-from compgen.identify.two_step import TracerReadings, solve_in_two_steps
+from compgen.identify.two_step import solve_in_two_steps
 
 AnyProblem = GridProblem | LengthProblem | HeldStations
 MIN_STATIONS = 3
@@ -136,10 +137,10 @@ def _undisturbed(task: _Task, start: State, options: IdentifyOptions) -> Identif
         start = affine_start(task.problem, start)
     noise = reading_noise(task.lengths, options)
     task, sigma_mm, _ = _with_weights(task, start, noise)
-    factor, rank = _determined(task, start)
     try:
+        factor, rank = _determined(task, start)
         solution = solve(task.problem, start, factor)
-    except ConvergenceError:
+    except (ConvergenceError, UndeterminedError):
         return None
     residual = task.problem.residuals(solution.state)
     if options.reject and not belonging(residual / sigma_mm):
@@ -386,7 +387,7 @@ def _stations(
     setups = task.lengths.labels.get("setup", np.zeros(len(task.lengths), dtype=np.int64))
     row_of = np.zeros(groups, dtype=np.int64)
     row_of[task.group] = np.arange(len(task.group))
-    results = []
+    results: list[StationResult] = []
     for group in range(groups):
         k = int(task.station[row_of[group]])
         x, y, z = state.stations_mm[k].tolist()
@@ -401,6 +402,7 @@ def _stations(
                 u_dead_length_mm=float(u[second + group]),
                 readings=int(used[group]),
                 rms_um=float(np.sqrt(squares[group] / max(used[group], 1.0))) / MM_PER_UM,
+                segment=sum((r.station, r.setup) == (task.lengths.stations[k], setups[row_of[group]]) for r in results),
             )
         )
     return tuple(results)

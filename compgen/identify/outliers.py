@@ -19,6 +19,8 @@ from compgen.model.volumetric import tool_of
 
 #: A reading is rejected when its residual exceeds this many robust standard deviations (1.4826 MAD).
 LIMIT = 6.0
+#: The robust standard deviation is not let below this share of the stated uncertainty.
+LEAST_SPREAD = 0.02
 #: Residuals that scatter more than so many standard uncertainties are looked at for gross mistakes.
 LARGEST_SPREAD = 10.0
 #: A reading fits another point or station when it agrees within so many standard deviations.
@@ -43,9 +45,9 @@ class Rejected:
 def standardised_spread(standardised: FloatArray) -> float:
     """Robust standard deviation (1.4826 MAD) of residuals over their standard uncertainties (n,).
 
-    Not let below a thousandth, so that rounding in noise-free data rejects nothing.
+    Not let below ``LEAST_SPREAD``, so that rounding in noise-free data rejects nothing.
     """
-    return max(1.4826 * float(np.median(np.abs(standardised - np.median(standardised)))), 1e-3)
+    return max(1.4826 * float(np.median(np.abs(standardised - np.median(standardised)))), LEAST_SPREAD)
 
 
 def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
@@ -53,7 +55,7 @@ def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
     size = np.abs(standardised)
     largest = float(size.max())
     quick = 1.25 * float(np.median(size[:: max(1, len(size) // 500) | 1]))  # of a sample, and on the safe side
-    if largest <= LIMIT * max(quick, 1e-3):
+    if largest <= LIMIT * max(quick, LEAST_SPREAD):
         return np.ones(len(size), dtype=bool)
     return np.asarray(size <= LIMIT * standardised_spread(standardised))
 

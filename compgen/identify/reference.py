@@ -18,7 +18,7 @@ from compgen.identify.adjustment import Adjustment
 from compgen.identify.corrections import Conditions, reading_conditions
 from compgen.identify.parameters import ErrorParameters
 from compgen.identify.result import Identification
-from compgen.identify.reversal import Reversal, approach_signs, estimate_reversal
+from compgen.identify.reversal import Reversal, Stops, approach_signs, estimate_reversal, stop_cells
 from compgen.identify.state import IntArray, State
 from compgen.identify.whiteness import Whiteness, check_whiteness, warn_of_residuals
 from compgen.model.volumetric import tool_of
@@ -60,9 +60,11 @@ def identify_at_reference(
         expected = used.length_mm + found.residual_mm
         moved = still
         if approach is not None:
-            reversal = _reversal(machine, lengths, approach, lengths.length_mm + plain - expected, found.adjustment)
+            stops = _stops(machine, lengths, lengths.length_mm + plain - expected, found.adjustment)
+            reversal = estimate_reversal(lengths, approach, stops)
             if reversal is not None and reversal.significant:
-                moved, removed = reversal.displacement(approach), True
+                moved = reversal.displacement(reversal.resolved(approach, lengths.station, stops))
+                removed = True
         if not conditions.needs_geometry and not removed:
             break
         again = _added(lengths, conditions.correction_mm(lengths, *geometry, moved))
@@ -87,11 +89,9 @@ def _sight(machine: Machine, lengths: Lengths, stations_mm: FloatArray) -> tuple
     return vector / distance[:, None], distance
 
 
-def _reversal(
-    machine: Machine, lengths: Lengths, approach: FloatArray, difference_mm: FloatArray, adjustment: Adjustment
-) -> Reversal | None:
+def _stops(machine: Machine, lengths: Lengths, difference_mm: FloatArray, adjustment: Adjustment) -> Stops:
     sight, _ = _sight(machine, lengths, adjustment.state.stations_mm)
-    return estimate_reversal(lengths, approach, adjustment.group, difference_mm, sight, adjustment.weight)
+    return Stops(stop_cells(lengths, adjustment.group), difference_mm, sight, adjustment.weight)
 
 
 def _tested(

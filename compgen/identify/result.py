@@ -24,7 +24,10 @@ from compgen.identify.whiteness import Whiteness
 
 @dataclass(frozen=True)
 class StationResult:
-    """One station and set-up: position and dead length with standard uncertainties, mm, and residual RMS in um."""
+    """One station and set-up: position and dead length with standard uncertainties, mm, and residual RMS in um.
+
+    ``segment`` counts the dead lengths that beam breaks added to it, 0 being the main one.
+    """
 
     station: str
     setup: int
@@ -34,6 +37,7 @@ class StationResult:
     u_dead_length_mm: float
     readings: int
     rms_um: float
+    segment: int = 0
 
 
 @dataclass(frozen=True)

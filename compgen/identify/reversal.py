@@ -22,11 +22,36 @@ from compgen.identify.state import IntArray
 from compgen.simulate.trajectory import approach_of
 
 #: A reversal smaller than this many standard uncertainties is not taken out of the readings.
-SIGNIFICANT = 4.0
+SIGNIFICANT = 5.0
 #: Cells are counted anew when there could be so many times more of them than readings.
 SPARSE = 8
+#: Fewer readings than this, of all stations or of one, say nothing.
+LEAST_READINGS = 12
 #: Eigenvalue of the normal matrix with unit diagonal below which a direction counts as undetermined.
 ZERO = 1e-8
+
+
+@dataclass(frozen=True)
+class Stops:
+    """Readings to be compared within their stops.
+
+    Parameters
+    ----------
+    cell : index of station, dead length and stop of each reading, (n,).
+    difference_mm : reading minus model without reversal, (n,).
+    sight : unit vectors from station to target, (n, 3).
+    weight : weight of each reading (n,), zero for a rejected one.
+    """
+
+    cell: IntArray
+    difference_mm: FloatArray
+    sight: FloatArray
+    weight: FloatArray
+
+    def cost(self, displacement_mm: FloatArray) -> float:
+        """Weighted square sum of the differences within the stops if the tip is displaced by (n, 3)."""
+        left = self.difference_mm - np.einsum("ij,ij->i", self.sight, displacement_mm)
+        return float(self.weight @ _centred(left[:, None], self.cell, self.weight)[:, 0] ** 2)
 
 
 @dataclass(frozen=True)
@@ -63,6 +88,24 @@ class Reversal:
     def significant(self) -> bool:
         """Whether any axis has a significant reversal."""
         return any(axis.significant for axis in self.axes.values())
+
+    def resolved(self, approach: FloatArray, station: IntArray, stops: Stops) -> FloatArray:
+        """Give unknown directions (0) the sign that fits: an axis that has not moved yet has one direction.
+
+        ``approach`` (n, 3) and ``station`` (n,) belong to the readings of ``stops``; an axis of which nothing is known
+        stays unknown.
+        """
+        known = approach.copy()
+        for axis in np.flatnonzero(np.any(approach != 0, axis=0)).tolist():
+            unknown = approach[:, axis] == 0
+            for k in np.unique(station[unknown]):
+                rows = unknown & (station == k)
+                known[rows, axis] = 1.0
+                forward = stops.cost(self.displacement(known))
+                known[rows, axis] = -1.0
+                if forward <= stops.cost(self.displacement(known)):
+                    known[rows, axis] = 1.0
+        return known
 
     def displacement(self, approach: FloatArray) -> FloatArray:
         """Displacement of the tip against the mean of both directions for approaches (n, 3): shape (n, 3), mm."""
@@ -113,51 +156,42 @@ def approach_signs(lengths: Lengths) -> FloatArray | None:
     return signs
 
 
-def estimate_reversal(
-    lengths: Lengths,
-    approach: FloatArray,
-    group: IntArray,
-    difference_mm: FloatArray,
-    sight: FloatArray,
-    weight: FloatArray,
-) -> Reversal | None:
+def estimate_reversal(lengths: Lengths, approach: FloatArray, stops: Stops) -> Reversal | None:
     """Estimate the reversal of each axis; None where no stop was approached from both sides.
 
     Parameters
     ----------
     lengths : the readings.
-    approach : direction of each axis, (n, 3).
-    group : index of the dead length, (n,).
-    difference_mm : reading minus model without reversal, (n,).
-    sight : unit vectors from station to target, (n, 3).
-    weight : 1/variance of each reading in 1/mm^2 (n,), zero for a rejected one.
+    approach : direction of each axis, (n, 3); readings for which that of a moving axis is unknown do not count.
+    stops : what is compared.
     """
-    cell = _cells(lengths, group)
-    design = 0.5 * approach[:, :, None] * sight[:, None, :]
+    unknown = np.any((approach == 0) & np.any(approach != 0, axis=0), axis=1)
+    cell, weight = stops.cell, np.where(unknown, 0.0, stops.weight)
+    design = 0.5 * approach[:, :, None] * stops.sight[:, None, :]
     columns = _centred(design.reshape(len(cell), 9), cell, weight)
-    target = _centred(difference_mm[:, None], cell, weight)[:, 0]
+    target = _centred(stops.difference_mm[:, None], cell, weight)[:, 0]
     moved = np.any(np.abs(columns) > 1e-9, axis=1) & (weight > 0)
-    if np.count_nonzero(moved) < 12:
+    if np.count_nonzero(moved) < LEAST_READINGS:
         return None
-    rows = (cell[moved], columns[moved], target[moved], weight[moved])
-    value, u, known = _solved(*rows)
+    value, u, known = _solved(cell[moved], columns[moved], target[moved], weight[moved])
+    u *= _alikeness(lengths, np.where(moved, target - columns @ value, np.nan))
+    stations = _by_station(lengths, _centred(0.5 * approach, cell, weight), target, weight, cell)
     axes = {}
     for axis, name in enumerate(AXES):
-        part = slice(3 * axis, 3 * axis + 3)
-        if known[part].all():
-            vector, u_vector = tuple(value[part].tolist()), tuple(u[part].tolist())
-            axes[name] = AxisReversal(vector, u_vector, {})
-    stations = _by_station(lengths, approach, difference_mm, weight, cell)
-    axes = {
-        name: AxisReversal(
-            item.vector_mm, item.u_mm, {s: found[name] for s, found in stations.items() if name in found}
-        )
-        for name, item in axes.items()
-    }
+        x, y, z = range(3 * axis, 3 * axis + 3)
+        if known[[x, y, z]].all():
+            vector, u_vector = (value[x], value[y], value[z]), (u[x], u[y], u[z])
+            means = {station: found[name] for station, found in stations.items() if name in found}
+            axes[name] = AxisReversal(_floats(vector), _floats(u_vector), means)
     return Reversal(axes, int(np.count_nonzero(moved))) if axes else None
 
 
-def _cells(lengths: Lengths, group: IntArray) -> IntArray:
+def _floats(vector: tuple[Any, Any, Any]) -> tuple[float, float, float]:
+    x, y, z = vector
+    return float(x), float(y), float(z)
+
+
+def stop_cells(lengths: Lengths, group: IntArray) -> IntArray:
     """Index of station, dead length and stop (position and tool) of each reading."""
     columns = [*lengths.position_mm.T, *(() if lengths.tool_mm is None else lengths.tool_mm.T)]
     cell, count = group, int(group.max()) + 1
@@ -199,16 +233,28 @@ def _solved(
     return value, np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance), known
 
 
+def _alikeness(lengths: Lengths, left_mm: FloatArray) -> float:
+    """Factor by which the uncertainty of a mean grows because successive residuals (n,) are alike; nan ones left out.
+
+    For an autoregressive process of first order with correlation rho it is the root of (1 + rho)/(1 - rho).
+    """
+    order = time_order(lengths)
+    order = order[np.argsort(lengths.station[order], kind="stable")]
+    series = left_mm[order][np.isfinite(left_mm[order])]
+    square = float(series @ series)
+    rho = float(series[1:] @ series[:-1]) / square if square > 0 else 0.0
+    rho = min(max(rho, 0.0), 0.98)
+    return float(np.sqrt((1.0 + rho) / (1.0 - rho)))
+
+
 def _by_station(
-    lengths: Lengths, approach: FloatArray, difference_mm: FloatArray, weight: FloatArray, cell: IntArray
+    lengths: Lengths, columns: FloatArray, target: FloatArray, weight: FloatArray, cell: IntArray
 ) -> dict[str, dict[str, tuple[float, float]]]:
     """Mean difference of the readings of each station between the directions of each axis, with its uncertainty."""
-    columns = _centred(0.5 * approach, cell, weight)
-    target = _centred(difference_mm[:, None], cell, weight)[:, 0]
     found = {}
     for k, name in enumerate(lengths.stations):
         rows = (lengths.station == k) & (weight > 0) & np.any(np.abs(columns) > 1e-9, axis=1)
-        if np.count_nonzero(rows) >= 8:
+        if np.count_nonzero(rows) >= LEAST_READINGS:
             value, u, known = _solved(cell[rows], columns[rows], target[rows], weight[rows])
             found[name] = {AXES[a]: (float(value[a]), float(u[a])) for a in range(3) if known[a]}
     return found

@@ -15,12 +15,16 @@ from compgen.identify.state import IntArray
 
 #: Readings on either side of a step whose medians are compared.
 WINDOW = 12
-#: A step is a beam break when it exceeds this many robust standard deviations of the readings about it ...
+#: A step is a beam break when it exceeds this many robust standard deviations of the steps elsewhere in the series (of
+#: the readings, if it is shorter than LONG) ...
 STEP_LIMIT = 8.0
+LONG = 8 * WINDOW
 #: ... and this size: smaller steps are left to the test for whiteness.
 SMALLEST_STEP_MM = 5.0 * MM_PER_UM
 #: Steps smaller than this share of the largest are looked at after it has been dealt with.
 SHARE_OF_LARGEST = 0.2
+#: Levels that differ by less than this share of the largest step of the series are taken for one at first.
+SAME_LEVEL = 0.3
 #: A segment of at least so many readings gets a dead length of its own; a shorter one is rejected.
 LEAST_OWN_READINGS = 20
 #: More breaks than this at one station are no beam breaks but a model that does not describe the readings.
@@ -147,7 +151,10 @@ def _steps(residual_mm: FloatArray) -> list[int]:
         return []
     medians = np.median(np.lib.stride_tricks.sliding_window_view(residual_mm, WINDOW), axis=1)
     step = np.abs(medians[WINDOW:] - medians[:-WINDOW])  # between [t - WINDOW, t) and [t, t + WINDOW), t = WINDOW ...
-    noise = 1.4826 * float(np.median(np.abs(np.diff(residual_mm)))) / np.sqrt(2.0)
+    if count >= LONG:
+        noise = 1.4826 * float(np.median(step))
+    else:
+        noise = 1.4826 * float(np.median(np.abs(np.diff(residual_mm)))) / np.sqrt(2.0)
     limit = max(STEP_LIMIT * noise, SMALLEST_STEP_MM)
     found: list[int] = []
     while step.size and step.max() > limit:
@@ -201,8 +208,7 @@ def _off_segments(rows: IntArray, residual_mm: FloatArray, steps: Sequence[int])
         after = np.median(residual_mm[step : min(bounds[bounds.index(step) + 1], step + WINDOW)])
         levels.append(levels[-1] + float(after - before))
     sizes = np.diff(bounds)
-    noise = 1.4826 * float(np.median(np.abs(np.diff(residual_mm)))) / np.sqrt(2.0)
-    same = max(STEP_LIMIT * noise / 2, SMALLEST_STEP_MM / 2)
+    same = max(SAME_LEVEL * float(np.abs(np.diff(levels)).max()), SMALLEST_STEP_MM / 2)
     weight = [sum(sizes[j] for j in range(len(sizes)) if abs(levels[j] - level) < same) for level in levels]
     main = levels[int(np.argmax(weight))]
     return [

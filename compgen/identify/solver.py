@@ -98,6 +98,8 @@ def solve(problem: Problem, start: State, factor: Factor | None = None) -> Solut
         candidate = state.moved(step)
         new_cost, new_gradient = problem.evaluate(candidate)
         if not new_cost <= cost * (1 + 1e-9) + 1e-18:
+            if size < TOLERANCE_MM and not damping:  # the cost cannot be told from its rounding any more
+                return Solution(state, cost, factor, iteration, factorisations)
             if fresh:
                 damping = max(10.0 * damping, 1e-6)
                 if damping > 1e6:

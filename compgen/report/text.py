@@ -31,6 +31,7 @@ def identification_table(result: Identification) -> Group:
         f"residual {result.rms_um:.3f} um rms, reduced chi-square {result.reduced_chi_square:.3f} "
         f"({result.degrees_of_freedom} degrees of freedom, {result.u_source} uncertainty {stated})",
     ]
+    lines += [segment.text for segment in result.segments[:MOST_REASONS]]
     lines += [
         f"rejected: {item.station} point {item.point} (line {item.line}): {item.reason}"
         for item in result.rejected[:MOST_REASONS]
