@@ -172,6 +172,21 @@ def test_self_calibration_meets_the_optimum_of_an_independent_solver():
     assert np.allclose(by_point.ravel(), u[10:], rtol=1e-4)
 
 
+def test_the_mirrored_calibration_is_the_one_that_a_mirrored_start_finds():
+    points = np.random.default_rng(4).uniform(-400, 400, (25, 3))
+    data, start = sightings_of(points, STATIONS, SIGMA_MM), rough(points, STATIONS, 0.5)
+    flip = np.array([1.0, 1.0, -1.0])
+    found = self_calibrate(data, start).mirrored()
+    other = self_calibrate(data, Frame(start.stations_mm * flip, start.dead_length_mm, start.points_mm * flip))
+    assert found.chi_square == pytest.approx(other.chi_square, rel=1e-12)
+    assert np.allclose(found.frame.points_mm, other.frame.points_mm, rtol=0, atol=NANOMETRE)
+    assert np.allclose(found.lever, other.lever, rtol=1e-6, atol=1e-9)
+    assert np.allclose(found.covariance(), other.covariance(), rtol=1e-6, atol=1e-15)
+    nominal = points + 0.001
+    assert place(other.frame.points_mm, nominal).mirrored
+    assert not place(other.mirrored().frame.points_mm, nominal).mirrored
+
+
 def test_stations_in_a_plane_cannot_locate_themselves():
     flat = STATIONS * [1.0, 1.0, 0.0] + [0.0, 0.0, -600.0]
     points = grid_of(GANTRY)
@@ -697,8 +712,8 @@ def test_known_stations_on_the_command_line(tmp_path, gantry_file, make_errors):
     lengths.write_text(format_lengths(measured(GANTRY, truth, stations=STATIONS[:1])))
     stations.write_text("station,x_mm,y_mm,z_mm\nLT1,620,-750,50\n")
     words = ["identify", str(gantry_file), str(lengths), "--stations", str(stations), "--out", str(tmp_path / "out")]
-    assert run_command(cli, words) == 1  # not determined: named, and nothing is written
-    assert not (tmp_path / "out").exists()
+    assert run_command(cli, words) == 1  # not determined: named, and no errors are written
+    assert not (tmp_path / "out" / "identified.errors.csv").exists()
     text = gantry_file.read_text().replace("chain =", 'errors = ["EXX", "EYY", "EZZ", "EC0Y"]\nchain =')
     gantry_file.write_text(text)
     assert run_command(cli, words) == 0

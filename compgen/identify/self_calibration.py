@@ -17,6 +17,7 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.errors import ConvergenceError, UndeterminedError
+from compgen.identify.network import Frame, Linear, Network, Sightings, cost, linearise, solved
 from compgen.identify.state import IntArray
 
 #: A point is located by at least this many stations; only from one more on does it help to locate them.
@@ -27,38 +28,6 @@ MAX_ITERATIONS = 100
 ZERO_EIGENVALUE = 1e-12
 #: Sine of the angle at the first station from which the third one may define the xy plane.
 OFF_THE_LINE = 0.02
-
-
-@dataclass(frozen=True)
-class Sightings:
-    """n readings of S stations (with G dead lengths) to m points; every point has a reading.
-
-    ``point``, ``station``, ``group`` (dead length) are indices (n,), ``length_mm`` and ``sigma_mm`` (n,) the reading
-    and its standard uncertainty.
-    """
-
-    point: IntArray
-    station: IntArray
-    group: IntArray
-    length_mm: FloatArray
-    sigma_mm: FloatArray
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Stations (S, 3), dead lengths (G,) and points (m, 3) in one frame, mm."""
-
-    stations_mm: FloatArray
-    dead_length_mm: FloatArray
-    points_mm: FloatArray
-
-    def moved(self, rotation: FloatArray, translation_mm: FloatArray) -> Frame:
-        """Return the same after x -> R x + t."""
-        return Frame(
-            self.stations_mm @ rotation.T + translation_mm,
-            self.dead_length_mm,
-            self.points_mm @ rotation.T + translation_mm,
-        )
 
 
 @dataclass(frozen=True)
@@ -129,7 +98,7 @@ def self_calibrate(sightings: Sightings, start: Frame) -> SelfCalibration:
         if no optimum is reached.
     """
     order = np.argsort(sightings.point, kind="stable")
-    data = _Data(
+    data = Network(
         Sightings(*(part[order] for part in vars(sightings).values())),
         np.searchsorted(sightings.point[order], np.arange(len(start.points_mm))),
         _free_unknowns(start),
@@ -141,7 +110,7 @@ def self_calibrate(sightings: Sightings, start: Frame) -> SelfCalibration:
         frame=frame,
         free=data.free,
         information=step.information,
-        lever=-_solved(step.information, step.coupling),
+        lever=-solved(step.information, step.coupling),
         station_information=step.reduced,
         residual_mm=residual,
         chi_square=2.0 * step.cost,
@@ -188,110 +157,20 @@ def _free_unknowns(start: Frame) -> IntArray:
     return np.setdiff1d(np.arange(start.stations_mm.size + len(start.dead_length_mm)), held).astype(np.int64)
 
 
-@dataclass(frozen=True)
-class _Data:
-    """Sightings in the order of their points, the first reading of each point (m,), and the free unknowns (q,)."""
-
-    sightings: Sightings
-    first: IntArray
-    free: IntArray
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """Readings linearised at a frame: residuals, cost, and the normal equations with the points split off."""
-
-    residual_mm: FloatArray
-    cost: float
-    information: FloatArray
-    coupling: FloatArray
-    station_matrix: FloatArray
-    reduced: FloatArray
-    point_gradient: FloatArray
-    station_gradient: FloatArray
-
-
-def _residuals(data: _Data, frame: Frame) -> tuple[FloatArray, FloatArray]:
-    """Model minus reading (n,) and unit lines of sight (n, 3)."""
-    seen = data.sightings
-    sight = frame.points_mm[seen.point] - frame.stations_mm[seen.station]
-    distance = np.sqrt(np.einsum("ij,ij->i", sight, sight))
-    return distance - frame.dead_length_mm[seen.group] - seen.length_mm, sight / distance[:, None]
-
-
-def _cost(data: _Data, frame: Frame) -> float:
-    residual, _ = _residuals(data, frame)
-    return 0.5 * float(np.sum((residual / data.sightings.sigma_mm) ** 2))
-
-
-def _linearise(data: _Data, frame: Frame) -> _Linear:
-    """Normal equations at a frame; ``reduced`` is the Schur complement of the points."""
-    seen = data.sightings
-    residual, unit = _residuals(data, frame)
-    weight = 1.0 / seen.sigma_mm**2
-    points, columns = len(frame.points_mm), frame.stations_mm.size + len(frame.dead_length_mm)
-    outer = weight[:, None, None] * unit[:, :, None] * unit[:, None, :]
-    information = np.add.reduceat(outer, data.first, axis=0)
-    pulled = (weight * residual)[:, None] * unit
-    own = 3 * seen.station[:, None] + np.arange(3)
-    dead = frame.stations_mm.size + seen.group
-    coupling = _scatter(seen.point, own, outer, points, columns)
-    coupling += _scatter(seen.point, dead[:, None], weight[:, None, None] * unit[:, :, None], points, columns)
-    station_matrix = np.zeros((columns, columns))
-    np.add.at(station_matrix, (own[:, :, None], own[:, None, :]), outer)
-    cross = np.zeros((columns, columns))
-    np.add.at(cross, (own, dead[:, None]), weight[:, None] * unit)
-    station_matrix += cross + cross.T
-    station_matrix[np.diag_indices(columns)] += np.bincount(dead, weight, columns)
-    gradient = np.zeros(columns)
-    gradient -= np.bincount(own.ravel(), pulled.ravel(), columns)
-    gradient -= np.bincount(dead, weight * residual, columns)
-    free = data.free
-    coupling, station_matrix = -coupling[:, :, free], station_matrix[np.ix_(free, free)]
-    flat = coupling.reshape(-1, len(free))
-    reduced = station_matrix - flat.T @ _solved(information, coupling).reshape(-1, len(free))
-    return _Linear(
-        residual_mm=residual,
-        cost=0.5 * float(np.dot(weight, residual**2)),
-        information=information,
-        coupling=coupling,
-        station_matrix=station_matrix,
-        reduced=0.5 * (reduced + reduced.T),
-        point_gradient=np.add.reduceat(pulled, data.first, axis=0),
-        station_gradient=gradient[free],
-    )
-
-
-def _scatter(point: IntArray, column: IntArray, values: FloatArray, points: int, columns: int) -> FloatArray:
-    """Sum values (n, 3, k) into (points, 3, columns) at point (n,) and column (n, k)."""
-    index = (point[:, None, None] * 3 + np.arange(3)[:, None]) * columns + column[:, None, :]
-    summed = np.bincount(index.ravel(), values.ravel(), points * 3 * columns)
-    return np.asarray(summed, dtype=np.float64).reshape(points, 3, columns)
-
-
-def _solved(information: FloatArray, right: FloatArray) -> FloatArray:
-    try:
-        return np.asarray(np.linalg.solve(information, right))
-    except np.linalg.LinAlgError:
-        raise UndeterminedError(
-            "a point lies in line with its stations, or they stand on one line; it cannot be located", []
-        ) from None
-
-
-def _minimise(data: _Data, start: Frame) -> tuple[Frame, _Linear, int]:
+def _minimise(data: Network, start: Frame) -> tuple[Frame, Linear, int]:
     """Levenberg-Marquardt (eq. 19) with the points eliminated; the damping starts at zero."""
-    frame, linear, damping = start, _linearise(data, start), 0.0
+    frame, linear, damping = start, linearise(data, start), 0.0
     _check_rank(linear, data)
     for iteration in range(1, MAX_ITERATIONS + 1):
         points, stations = _step(linear, damping)
         size = max(float(np.abs(points).max()), float(np.abs(stations).max()))
         candidate = _moved(frame, points, stations, data.free)
-        if not _cost(data, candidate) <= linear.cost * (1 + 1e-9) + 1e-12:
+        if not cost(data, candidate) <= linear.cost * (1 + 1e-9) + 1e-12:
             damping = max(10.0 * damping, 1e-6)
             if damping > 1e6:
                 break
             continue
-        frame, linear = candidate, _linearise(data, candidate)
+        frame, linear = candidate, linearise(data, candidate)
         if size < TOLERANCE_MM and not damping:
             _check_rank(linear, data)
             return frame, linear, iteration
@@ -301,19 +180,19 @@ def _minimise(data: _Data, start: Frame) -> tuple[Frame, _Linear, int]:
     )
 
 
-def _step(linear: _Linear, damping: float) -> tuple[FloatArray, FloatArray]:
+def _step(linear: Linear, damping: float) -> tuple[FloatArray, FloatArray]:
     """Steps of the points (m, 3) and of the free unknowns of the stations (q,)."""
     information, reduced = linear.information, linear.reduced
     flat = linear.coupling.reshape(-1, linear.coupling.shape[2])
     if damping:
         information = information * (1.0 + damping * np.eye(3))
         damped = linear.station_matrix + damping * np.diag(np.diag(linear.station_matrix))
-        reduced = damped - flat.T @ _solved(information, linear.coupling).reshape(flat.shape)
-    own = _solved(information, linear.point_gradient[:, :, None])[:, :, 0]
+        reduced = damped - flat.T @ solved(information, linear.coupling).reshape(flat.shape)
+    own = solved(information, linear.point_gradient[:, :, None])[:, :, 0]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), 1e-300))
     right = (linear.station_gradient - flat.T @ own.ravel()) * scale
     stations = -scale * np.linalg.solve(reduced * np.outer(scale, scale), right)
-    moved = _solved(information, (linear.coupling @ stations)[:, :, None])[:, :, 0]
+    moved = solved(information, (linear.coupling @ stations)[:, :, None])[:, :, 0]
     return -own - moved, stations
 
 
@@ -324,7 +203,7 @@ def _moved(frame: Frame, points: FloatArray, stations: FloatArray, free: IntArra
     return Frame(everything[:split].reshape(-1, 3), everything[split:], frame.points_mm + points)
 
 
-def _check_rank(linear: _Linear, data: _Data) -> None:
+def _check_rank(linear: Linear, data: Network) -> None:
     """UndeterminedError if the points leave more of the stations open than the frame of eq. 17."""
     freedom = len(linear.residual_mm) - linear.point_gradient.size - len(data.free)
     if freedom < 0:
