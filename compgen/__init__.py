@@ -5,6 +5,7 @@ Each stage is a function on plain data, without side effects: :func:`load_machin
 """
 
 from compgen.controllers import CONTROLLERS
+from compgen.core.deviations import Deviations, format_deviations, read_deviations
 from compgen.core.error_table import Curve, ErrorTable, format_errors, read_errors
 from compgen.core.lengths import Lengths, format_lengths, read_lengths
 from compgen.core.machine import Axis, Chain, Machine, load_machine
@@ -18,6 +19,7 @@ from compgen.identify import (
     IdentifyOptions,
     SystematicInputs,
     identify,
+    identify_deviations,
     joint_covariance,
     predict_uncertainty,
     read_covariance,
@@ -37,6 +39,7 @@ __all__ = [
     "ConvergenceError",
     "Covariance",
     "Curve",
+    "Deviations",
     "ErrorTable",
     "Export",
     "FitOptions",
@@ -61,10 +64,12 @@ __all__ = [
     "exact_error",
     "export",
     "fit",
+    "format_deviations",
     "format_errors",
     "format_lengths",
     "format_points",
     "identify",
+    "identify_deviations",
     "joint_covariance",
     "load_machine",
     "modelled_errors",
@@ -74,6 +79,7 @@ __all__ = [
     "predict",
     "predict_uncertainty",
     "read_covariance",
+    "read_deviations",
     "read_errors",
     "read_lengths",
     "read_points",
