@@ -34,6 +34,8 @@ ROUNDING_MM = 1e-12
 COMMON = {
     "machine_name": 'mill "7"',
     "chain": "WXYFZT",
+    "tool_offset_mm": ["0", "0", "0"],
+    "reference_point_mm": ["0", "0", "0"],
     "version": "1.0",
     "inputs": ["a.errors.csv"],
     "input_sha256": "0123456789abcdef" * 4,

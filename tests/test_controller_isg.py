@@ -59,7 +59,8 @@ def built(name, machine, errors):
 
 def context_of(name, machine, tables):
     control = CONTROLLERS[name]
-    common = {"version": "1.2.3", "machine_name": machine.name, "chain": machine.chain.name, "files": []}
+    places = {"tool_offset_mm": ["0", "0", "0"], "reference_point_mm": ["0", "0", "0"]}
+    common = {**places, "version": "1.2.3", "machine_name": machine.name, "chain": machine.chain.name, "files": []}
     common |= {"inputs": ["a.errors.csv"], "input_sha256": "0123456789abcdef" * 4}
     return common | control.context(machine, control.read_settings(machine), tables)
 

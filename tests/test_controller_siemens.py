@@ -44,7 +44,15 @@ nodes = 5
 """
 #: Own steps for encoder tables: the random curves have no wide grid through the reference point.
 STEPS = "step_mm = { X = 10.0, Y = 12.5, Z = 7.3 }"
-COMMON = {"version": "1", "machine_name": "lopsided", "chain": "WFYXZT", "inputs": ["a"], "input_sha256": "0" * 64}
+PLACES = {"tool_offset_mm": ["0", "0", "0"], "reference_point_mm": ["0", "0", "0"]}
+COMMON = {
+    **PLACES,
+    "version": "1",
+    "machine_name": "lopsided",
+    "chain": "WFYXZT",
+    "inputs": ["a"],
+    "input_sha256": "0" * 64,
+}
 
 
 def make_machine(folder: Path, own: str = "", chain: str = "WFYXZT", control: str = "siemens-cec") -> Machine:

@@ -8,7 +8,7 @@ from numba import njit
 from compgen.core.csvio import FloatArray
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, fastmath={"contract"})  # type: ignore[untyped-decorator,unused-ignore]
 def forces(
     tip: FloatArray,
     stations: FloatArray,
@@ -53,7 +53,7 @@ def forces(
     return cost
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, fastmath={"contract"})  # type: ignore[untyped-decorator,unused-ignore]
 def moments(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     tip: FloatArray,
     stations: FloatArray,
