@@ -47,6 +47,8 @@ AnyProblem = GridProblem | LengthProblem | HeldStations
 MIN_STATIONS = 3
 #: Reciprocal condition of the scaled normal matrix below which the rank is looked at in detail.
 SUSPICIOUS_RCOND = 1e-10
+#: Eigenvalue of the scaled normal matrix below which a combination is named when nothing converges.
+HARDLY_DETERMINED = 1e-6
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,10 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     if options.method == "two-step":
         return _two_step_result(task, start, sigma_mm, noise, options)
     readings = Readings(lengths, task.target_mm, task.group, weights, sigma_mm)
-    fit = _fit(task, start, readings, factor, options, disturbed=disturbed)
+    try:
+        fit = _fit(task, start, readings, factor, options, disturbed=disturbed)
+    except ConvergenceError as error:
+        raise ConvergenceError(f"{error}{_weakness(task, factor)}") from error
     task = replace(task, problem=fit.problem, group=fit.group)
     return _result(task, fit, sigma_mm, noise, rank)
 
@@ -197,6 +202,17 @@ def _fit(
         return task.problem.rebuilt(problem) if isinstance(task.problem, HeldStations) else problem
 
     return fit_robustly(task.problem, start, readings, factor, rebuilt, disturbed=disturbed)
+
+
+def _weakness(task: _Task, factor: Factor) -> str:
+    """Say which combinations are hardly determined, where that may be why nothing converged."""
+    rank = analyse_rank(task.problem, factor.matrix, task.lengths.stations, task.station, task.group, HARDLY_DETERMINED)
+    if rank.rank == rank.size:
+        return ""
+    return (
+        f"; hardly determined even at the start: {'; '.join(rank.combinations[:3])}; stations must not stand on a line, "
+        "nor in a plane with an end of the travel"
+    )
 
 
 def _check_readings(machine: Machine, lengths: Lengths, least: int) -> None:

@@ -31,23 +31,28 @@ class Rank:
 
 
 def analyse_rank(
-    problem: Problem, matrix: FloatArray, stations: tuple[str, ...], station: IntArray, group: IntArray
+    problem: Problem,
+    matrix: FloatArray,
+    stations: tuple[str, ...],
+    station: IntArray,
+    group: IntArray,
+    zero: float = ZERO_EIGENVALUE,
 ) -> Rank:
     """Analyse the normal matrix (size, size) of a problem.
 
     ``stations`` are the names, ``station`` and ``group`` (dead length) the indices of each reading, for the messages.
     """
-    return describe_rank(matrix, unknown_names(problem, stations, station, group))
+    return describe_rank(matrix, unknown_names(problem, stations, station, group), zero)
 
 
-def describe_rank(matrix: FloatArray, names: list[str]) -> Rank:
-    """Analyse a normal matrix (size, size) whose unknowns have ``names``."""
+def describe_rank(matrix: FloatArray, names: list[str], zero: float = ZERO_EIGENVALUE) -> Rank:
+    """Analyse a normal matrix (size, size) whose unknowns have ``names``; eigenvalues below ``zero`` count as none."""
     diagonal = np.diag(matrix)
     empty = diagonal <= 1e-14 * np.median(diagonal[diagonal > 0])
     scale = 1.0 / np.sqrt(np.where(empty, 1.0, diagonal))
     scaled = np.where(np.outer(empty, empty), 0.0, matrix * np.outer(scale, scale))
     eigenvalues, vectors = np.linalg.eigh(scaled)
-    null = eigenvalues < ZERO_EIGENVALUE
+    null = eigenvalues < zero
     kept = eigenvalues[~null]
     undetermined = np.sqrt(np.sum(vectors[:, null] ** 2, axis=1)) > 1e-4
     return Rank(

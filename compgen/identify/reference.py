@@ -20,7 +20,7 @@ from compgen.identify.parameters import ErrorParameters
 from compgen.identify.result import Identification
 from compgen.identify.reversal import Reversal, Stops, approach_signs, estimate_reversal, stop_cells
 from compgen.identify.state import IntArray, State
-from compgen.identify.whiteness import Whiteness, check_whiteness, warn_of_residuals
+from compgen.identify.whiteness import Whiteness, check_whiteness, warn_of_residuals, warn_of_weakness
 from compgen.model.volumetric import tool_of
 
 ROUNDS = 3
@@ -104,5 +104,7 @@ def _tested(
         standardised = np.where(found.accepted, found.residual_mm / sigma, np.nan)
         _, distance = _sight(machine, used, adjustment.state.stations_mm)
         whiteness = check_whiteness(used, adjustment.group, standardised, distance, found.unknowns)
+        if adjustment.held_weight is None:  # known stations bring their own uncertainty in
+            warn_of_weakness(found.worst_u, float(np.median(sigma)) * found.u_scale)
         warn_of_residuals(whiteness, found.reduced_chi_square, found.u_source)
     return replace(found, whiteness=whiteness, reversal=reversal, corrections=conditions.notes)

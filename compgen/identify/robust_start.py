@@ -26,8 +26,15 @@ GROSS_SHARE = 0.01
 TRIALS = 200
 #: At most so many readings judge a trial.
 JUDGES = 400
-#: Factors that a slip of unit leaves between the readings and millimetres.
-UNITS = {1000.0: "metres", 0.001: "micrometres", 25.4: "inches"}
+#: A station is never further away than so many times the extent of its targets.
+FARTHEST = 100.0
+#: Factors that a slip leaves between readings and displacements in millimetres.
+SLIPS = {
+    1000.0: "when they are taken as metres; the unit is mm: convert them",
+    0.001: "when they are taken as micrometres; the unit is mm: convert them",
+    25.4: "when they are taken as inches; the unit is mm: convert them",
+    -1.0: "with the opposite sign; a reading grows with the distance: reverse the sign",
+}
 
 
 @dataclass(frozen=True)
@@ -68,7 +75,7 @@ def robust_state(
     Raises
     ------
     InputError
-        if the readings of a station fit after a change of unit.
+        if the readings of a station fit after a change of unit or sign.
     ConvergenceError
         if the readings of a station fit no place, or those of all stations fit none.
     """
@@ -172,13 +179,12 @@ def _no_place(
     """Return the error for stations whose readings fit no place, with the likely cause."""
     worst = max(bad, key=lambda k: misfit_mm[k])
     for k in sorted(bad, key=lambda k: -misfit_mm[k]):
-        unit = _unit_slip(parts[k], float(misfit_mm[k]))
-        if unit:
+        slip = _slip(parts[k], float(misfit_mm[k]))
+        if slip:
             row = int(np.flatnonzero(station == k)[0])
             file, line = lengths.origin[row] if lengths.origin else (None, None)
             return InputError(
-                f"the readings of station {lengths.stations[k]!r} fit when they are taken as {unit}; the unit is mm: "
-                "convert them",
+                f"the readings of station {lengths.stations[k]!r} fit {slip}",
                 file=file,
                 line=line,
                 field="column length_mm",
@@ -197,11 +203,16 @@ def _no_place(
     )
 
 
-def _unit_slip(part: _Station, misfit_mm: float) -> str:
-    for factor, unit in UNITS.items():
+def _slip(part: _Station, misfit_mm: float) -> str:
+    """Say which slip of unit or sign explains the readings of a station; empty if none does."""
+    extent_mm = float(np.ptp(part.target_mm, axis=0).max())
+    groups = int(part.member.max()) + 1
+    best, found = 0.02 * misfit_mm, ""
+    for factor, slip in SLIPS.items():
         scaled = replace(part, length_mm=part.length_mm * factor)
-        groups = int(part.member.max()) + 1
         start = _robust(scaled, StationStart(part.target_mm.mean(axis=0), np.zeros(groups)))
-        if robust_spread(scaled.residuals(start)) < 0.02 * misfit_mm:
-            return unit
-    return ""
+        near = np.linalg.norm(start.position_mm - part.target_mm[0]) < FARTHEST * extent_mm
+        spread = robust_spread(scaled.residuals(start))
+        if near and spread < best:
+            best, found = spread, slip
+    return found

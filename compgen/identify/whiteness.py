@@ -15,7 +15,7 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
-from compgen.core.names import AXES
+from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import CompgenWarning
 from compgen.identify.grid_problem import levels_of
 from compgen.identify.segments import time_order
@@ -32,6 +32,8 @@ LEAST_READINGS = 30
 ROUNDING = 0.02
 #: Levels of an axis are gathered into at most so many bins.
 MOST_BINS = 60
+#: An error is hardly determined when its standard uncertainty in um or urad is so many times that of a reading in um.
+WEAK = 50.0
 #: Reduced chi-square from which the model does not describe the readings, with stated and with assumed uncertainty.
 LARGEST_CHI_SQUARE = {"stated": 25.0, "assumed": 1000.0}
 
@@ -201,6 +203,24 @@ def _axis(lengths: Lengths, z: FloatArray, used: np.ndarray[Any, Any], axis: int
     # Wilson & Hilferty (1931): the upper tail of chi-square over its degrees of freedom
     spread = 2.0 / (9.0 * cells)
     return ratio, float((1.0 - spread + _normal_limit(3) * np.sqrt(spread)) ** 3)
+
+
+def warn_of_weakness(worst: Mapping[str, tuple[float, str]], sigma_mm: float) -> None:
+    """Warn when the standard uncertainty of an error is far above that of a reading: the set-up hardly shows it.
+
+    ``worst`` is the largest standard uncertainty by unit with its error, ``sigma_mm`` that of a reading.
+    """
+    for unit, (value, name) in worst.items():
+        times = value * MM_PER_UM / sigma_mm
+        if times > WEAK:
+            warnings.warn(
+                f"{name} is hardly determined: its standard uncertainty is {value:.3g} {unit}, {times:.0f} "
+                "times that of a reading; place the stations at different heights, not on a line, and not in a plane with "
+                "an end of the travel",
+                CompgenWarning,
+                stacklevel=4,
+            )
+            return
 
 
 def warn_of_residuals(whiteness: Whiteness, reduced_chi_square: float, u_source: str) -> None:
