@@ -99,9 +99,9 @@ def exact_error(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> FloatArray:
     """Exact error of the tool tip at commanded positions (n, 3): tip minus (position + tool offset), (n, 3), mm."""
-    position_mm = np.asarray(position_mm, dtype=np.float64)
-    nominal = position_mm + tool_of(machine, tool_mm)
-    return tip_position(machine, errors.at(position_mm), position_mm, tool_mm) - nominal
+    from compgen.model.exact_points import exact_error_at  # imported here: it builds on the chain below
+
+    return exact_error_at(machine, errors, position_mm, tool_mm)
 
 
 def exact_columns(

@@ -98,13 +98,6 @@ def volumetric_error(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> FloatArray:
     """Error E = C P of the tool tip against the workpiece at commanded positions (n, 3): shape (n, 3), mm."""
-    position_mm = np.asarray(position_mm, dtype=np.float64)
-    tool = tool_of(machine, tool_mm)
-    values = errors.at(position_mm)
-    result = np.zeros_like(position_mm)
-    present = set(errors.names)
-    for term in coefficients(machine.chain, machine.squareness_reference):
-        if term.error in present:
-            weight = term.sign * factor(term.lever, position_mm, tool)
-            result[:, term.output] += weight * values[:, ERROR_INDEX[term.error]]
-    return result
+    from compgen.model.evaluate import volumetric_error_at  # imported here: it builds on the list of terms above
+
+    return volumetric_error_at(machine, errors, position_mm, tool_mm)

@@ -1,0 +1,272 @@
+"""Compiled kernels: E = C P at points and on grids, and the exact model, each in one pass. Needs numba.
+
+Import through :mod:`compgen.model.kernels`. Rows of a table hold four numbers left of an interval and four steps
+(three components and a zero), so that one vector instruction works on a row. Compiled code is kept in the user's cache
+folder; nothing is written beside the program.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+import numpy as np
+from numba import types
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Row = tuple[float, float, float, float]
+
+_FLOATS = types.float64[::1]
+_POINTS = types.Array(types.float64, 2, "C", readonly=True)
+_RESULT = types.float64[:, ::1]
+#: low, high, buckets per mm, last interval, first intervals, nodes, upper ends, 1/gaps, rows
+_AXIS = types.Tuple(
+    (types.float64, types.float64, types.float64, types.uint64) + (types.int64[::1], _FLOATS, _FLOATS, _FLOATS, _FLOATS)
+)
+_AXES = types.UniTuple(_AXIS, 3)
+
+
+def cache_folder() -> Path:
+    """Folder for compiled code, below the user's cache folder."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "compgen" / "numba"
+
+
+@contextmanager
+def _settings() -> Iterator[None]:
+    """Compile with vectors inside a row, and keep the code in :func:`cache_folder` unless numba was told where."""
+    before = numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR
+    numba.config.SLP_VECTORIZE = 1
+    numba.config.CACHE_DIR = before[1] or str(cache_folder())
+    try:
+        yield
+    finally:
+        numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR = before
+
+
+def _compiled(function: Function, signature: object) -> Function:
+    """Compile for one signature; without the cache where no folder can be written."""
+    options = {"error_model": "numpy", "fastmath": {"contract"}}
+    with _settings():
+        try:
+            kernel: Function = numba.njit(signature, cache=True, **options)(function)
+        except (RuntimeError, OSError):
+            kernel = numba.njit(signature, **options)(function)
+    return kernel
+
+
+def _inline(function: Function) -> Function:
+    part: Function = numba.njit(error_model="numpy", fastmath={"contract"})(function)
+    return part
+
+
+@_inline
+def _locate(position: Any, axis: Any, even: bool) -> Any:
+    """Interval and share of its upper node; as ``NodeIndex.locate``. Unsigned numbers need no test for the sign."""
+    low, high, per_mm, last, start, nodes, upper, per_gap, _ = axis
+    inside = low if position < low else position
+    inside = high if inside > high else inside
+    scaled = (inside - low) * per_mm
+    bucket = np.uint64(np.int64(scaled))
+    if even:
+        bucket = last if bucket > last else bucket
+        return bucket, scaled - np.int64(bucket)
+    final = np.uint64(len(start) - 1)
+    cell = np.uint64(start[final if bucket > final else bucket])
+    while inside >= upper[cell]:
+        cell += np.uint64(1)
+    return cell, (inside - nodes[cell]) * per_gap[cell]
+
+
+@_inline
+def _row(rows: Any, at: Any, share: Any) -> Row:
+    return (
+        rows[at] + share * rows[at + np.uint64(4)],
+        rows[at + np.uint64(1)] + share * rows[at + np.uint64(5)],
+        rows[at + np.uint64(2)] + share * rows[at + np.uint64(6)],
+        rows[at + np.uint64(3)] + share * rows[at + np.uint64(7)],
+    )
+
+
+@_inline
+def _plus(a: Row, b: Row) -> Row:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
+
+
+@_inline
+def _plus_times(a: Row, factor: Any, b: Row) -> Row:
+    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2], a[3] + factor * b[3]
+
+
+@_inline
+def _axis_terms(total: Row, axis: Any, located: Any, factors: Any, offsets: Any) -> Row:
+    """Add the rows of one axis; ``offsets`` are known when this is compiled, so absent groups leave no trace."""
+    rows, (cell, share) = axis[8], located
+    at = cell * np.uint64(offsets[7])
+    if offsets[0] >= 0:
+        total = _plus(total, _row(rows, at + np.uint64(offsets[0]), share))
+    if offsets[1] >= 0:
+        total = _plus_times(total, factors[0], _row(rows, at + np.uint64(offsets[1]), share))
+    if offsets[2] >= 0:
+        total = _plus_times(total, factors[1], _row(rows, at + np.uint64(offsets[2]), share))
+    if offsets[3] >= 0:
+        total = _plus_times(total, factors[2], _row(rows, at + np.uint64(offsets[3]), share))
+    if offsets[4] >= 0:
+        total = _plus_times(total, factors[3], _row(rows, at + np.uint64(offsets[4]), share))
+    if offsets[5] >= 0:
+        total = _plus_times(total, factors[4], _row(rows, at + np.uint64(offsets[5]), share))
+    if offsets[6] >= 0:
+        total = _plus_times(total, factors[5], _row(rows, at + np.uint64(offsets[6]), share))
+    return total
+
+
+@lru_cache(maxsize=64)
+def field_kernel(
+    offsets: tuple[tuple[int, ...], ...], even: tuple[bool, bool, bool], tools: bool
+) -> Callable[..., None]:
+    """Kernel ``(axes, position, tool, out)`` of E = C P at points.
+
+    Parameters
+    ----------
+    offsets : per axis the place of each of seven groups in a row (-1: absent), and the length of a row.
+    even : whether the nodes of X, Y and Z are equidistant.
+    tools : whether ``tool`` holds an offset for each point.
+    """
+    of_x, of_y, of_z = offsets
+    even_x, even_y, even_z = even
+
+    @_inline
+    def at_point(axes: Any, position: Any, tool: Any, i: Any) -> Row:
+        axis_x, axis_y, axis_z = axes
+        x, y, z = position[i, 0], position[i, 1], position[i, 2]
+        t = i if tools else 0
+        factors = x, y, z, tool[t, 0], tool[t, 1], tool[t, 2]
+        total = _axis_terms((0.0, 0.0, 0.0, 0.0), axis_x, _locate(x, axis_x, even_x), factors, of_x)
+        total = _axis_terms(total, axis_y, _locate(y, axis_y, even_y), factors, of_y)
+        return _axis_terms(total, axis_z, _locate(z, axis_z, even_z), factors, of_z)
+
+    def kernel(axes: Any, position: Any, tool: Any, out: Any) -> None:
+        flat, end = out.reshape(out.size), len(position) - 1
+        for i in range(end):  # four numbers at once; the next point overwrites the fourth
+            at, total = np.uint64(3 * i), at_point(axes, position, tool, i)
+            flat[at] = total[0]
+            flat[at + np.uint64(1)] = total[1]
+            flat[at + np.uint64(2)] = total[2]
+            flat[at + np.uint64(3)] = total[3]
+        if end >= 0:
+            total = at_point(axes, position, tool, end)
+            out[end, 0], out[end, 1], out[end, 2] = total[0], total[1], total[2]
+
+    return _compiled(kernel, types.void(_AXES, _POINTS, _POINTS, _RESULT))
+
+
+@_inline
+def _row_along_z(x: Any, along_x: Any, y: Any, along_y: Any) -> Any:
+    """Constant (three components) and slope (three) of a row along z, from the tables (4, 3) at its x and y."""
+    return (
+        along_x[0, 0] + x * along_x[1, 0] + y * along_x[2, 0] + along_y[0, 0] + x * along_y[1, 0] + y * along_y[2, 0],
+        along_x[0, 1] + x * along_x[1, 1] + y * along_x[2, 1] + along_y[0, 1] + x * along_y[1, 1] + y * along_y[2, 1],
+        along_x[0, 2] + x * along_x[1, 2] + y * along_x[2, 2] + along_y[0, 2] + x * along_y[1, 2] + y * along_y[2, 2],
+        along_x[3, 0] + along_y[3, 0],
+        along_x[3, 1] + along_y[3, 1],
+        along_x[3, 2] + along_y[3, 2],
+    )
+
+
+@lru_cache(maxsize=2)
+def grid_kernel(tilted: bool) -> Callable[..., None]:
+    """Kernel ``(x, y, z, along_x, along_y, along_z, out)`` of E = C P on a grid.
+
+    ``tilted``: the Z axis has errors whose lever is y, so that a row along z also depends on y by more than a line.
+    """
+
+    def kernel(x: Any, y: Any, z: Any, along_x: Any, along_y: Any, along_z: Any, out: Any) -> None:
+        row, side = np.empty((len(z), 3)), np.empty((len(z), 3))
+        for k in range(len(z)):
+            side[k, 0], side[k, 1], side[k, 2] = along_z[k, 2, 0], along_z[k, 2, 1], along_z[k, 2, 2]
+        for i in range(len(x)):
+            for k in range(len(z)):
+                for o in range(3):
+                    row[k, o] = along_z[k, 0, o] + z[k] * along_z[k, 3, o] + x[i] * along_z[k, 1, o]
+            for j in range(len(y)):
+                p0, p1, p2, q0, q1, q2 = _row_along_z(x[i], along_x[i], y[j], along_y[j])
+                if tilted:
+                    for k in range(len(z)):
+                        out[i, j, k, 0] = p0 + z[k] * q0 + row[k, 0] + y[j] * side[k, 0]
+                        out[i, j, k, 1] = p1 + z[k] * q1 + row[k, 1] + y[j] * side[k, 1]
+                        out[i, j, k, 2] = p2 + z[k] * q2 + row[k, 2] + y[j] * side[k, 2]
+                else:
+                    for k in range(len(z)):
+                        out[i, j, k, 0] = p0 + z[k] * q0 + row[k, 0]
+                        out[i, j, k, 1] = p1 + z[k] * q1 + row[k, 1]
+                        out[i, j, k, 2] = p2 + z[k] * q2 + row[k, 2]
+
+    levels = types.Array(types.float64, 1, "C", readonly=True)
+    values = types.Array(types.float64, 3, "C", readonly=True)
+    return _compiled(kernel, types.void(levels, levels, levels, values, values, values, types.float64[:, :, :, ::1]))
+
+
+@_inline
+def _turned(eps: Row, v: Row) -> Row:
+    """R(eps) v - v by Rodrigues' formula; series below 0.01 rad, whose next term is below 1e-21."""
+    a, b, c, _ = eps
+    square = a * a + b * b + c * c
+    if square < 1e-4:
+        first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+        second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
+    else:
+        angle = np.sqrt(square)
+        first = np.sin(angle) / angle
+        second = 2.0 * (np.sin(0.5 * angle) / angle) ** 2
+    once = b * v[2] - c * v[1], c * v[0] - a * v[2], a * v[1] - b * v[0]
+    twice = b * once[2] - c * once[1], c * once[0] - a * once[2], a * once[1] - b * once[0]
+    return (
+        first * once[0] + second * twice[0],
+        first * once[1] + second * twice[1],
+        first * once[2] + second * twice[2],
+        0.0,
+    )
+
+
+def _exact(axes: Any, even: Any, order: Any, tool_side: Any, tilt: Any, position: Any, tool: Any, out: Any) -> None:
+    """Exact error at points; ``order`` (3,) and ``tool_side`` (3,) as ``passing_order``, ``tilt`` = directions - I.
+
+    ``tool`` has one row, or one per point.
+    """
+    single = len(tool) == 1
+    for i in range(len(position)):
+        t = 0 if single else i
+        nominal = tool[t, 0], tool[t, 1], tool[t, 2], 0.0
+        error = 0.0, 0.0, 0.0, 0.0
+        for body in range(3):
+            axis = order[body]
+            q = position[i, axis]
+            cell, share = _locate(q, axes[axis], even[axis])
+            at = cell * np.uint64(16)
+            delta = _row(axes[axis][8], at, share)
+            eps = _row(axes[axis][8], at + np.uint64(8), share)
+            moved = _plus_times(delta, q, (tilt[axis, 0], tilt[axis, 1], tilt[axis, 2], 0.0))
+            travel = q if axis == 0 else 0.0, q if axis == 1 else 0.0, q if axis == 2 else 0.0, 0.0
+            if tool_side[body]:
+                error = _plus(error, _plus(moved, _turned(eps, _plus(nominal, error))))
+                nominal = _plus(nominal, travel)
+            else:
+                nominal, error = _plus(nominal, travel), _plus(error, moved)
+                error = _plus(error, _turned(eps, _plus(nominal, error)))
+        out[i, 0], out[i, 1], out[i, 2] = error[0], error[1], error[2]
+
+
+@lru_cache(maxsize=1)
+def exact_kernel() -> Callable[..., None]:
+    """Kernel ``(axes, even, order, tool_side, tilt, position, tool, out)`` of the exact model."""
+    arguments = (_AXES, types.boolean[::1], types.int64[::1], types.boolean[::1], _RESULT, _POINTS, _POINTS, _RESULT)
+    return _compiled(_exact, types.void(*arguments))
