@@ -2,8 +2,8 @@
 
 from compgen.model.evaluate import load_kernels, volumetric_error_at, volumetric_error_on_grid
 from compgen.model.exact import exact_columns, exact_error
-from compgen.model.gauge import align, gauge_directions
 from compgen.model.exact_points import exact_error_at
+from compgen.model.gauge import align, gauge_directions
 from compgen.model.observability import modelled_errors, observable_errors
 from compgen.model.predict import predict
 from compgen.model.volumetric import c_matrix, coefficients, volumetric_error
