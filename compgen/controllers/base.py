@@ -8,7 +8,7 @@ the wanted one; the control turns them into its own numbers, parses them back fr
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -19,6 +19,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
 from compgen.errors import InputError
 from compgen.model.basis import hat_matrix
 from compgen.model.volumetric import factor
@@ -97,6 +98,22 @@ class SourceFile:
         return InputError(message, file=self.path, line=line)
 
 
+@dataclass(frozen=True)
+class Usage:
+    """How much of one limit is used, in ``unit``: ``used`` of ``allowed``; ``stated`` is False for a usual default."""
+
+    name: str
+    used: float
+    allowed: float
+    unit: str
+    stated: bool = True
+
+    @property
+    def share(self) -> float:
+        """Used part of the limit, 1 where it is reached."""
+        return self.used / self.allowed if self.allowed else float(self.used > 0)
+
+
 class Controller(ABC, Generic[Settings, Tables]):
     """One control: everything that is particular to its files and to what it does with them.
 
@@ -108,6 +125,8 @@ class Controller(ABC, Generic[Settings, Tables]):
     name: str
     #: True if a table is zero at the reference point by nature, so that a constant offset cannot be corrected.
     anchored: bool = False
+    #: True if tables may act in one direction of travel only, so that a reversal goes into them.
+    bidirectional: bool = False
 
     @abstractmethod
     def read_settings(self, machine: Machine) -> Settings:
@@ -143,8 +162,38 @@ class Controller(ABC, Generic[Settings, Tables]):
     def resolution_mm(self, settings: Settings) -> float:
         """Return the largest correction error that rounding to the format's quantum may cause on one axis, mm."""
 
+    def table_nodes_mm(self, machine: Machine, settings: Settings, tables: Tables) -> tuple[FloatArray, ...]:
+        """Return the positions of X, Y and Z at which parsed tables have a node, ascending, also outside the travel.
+
+        An axis over which there is no table has none. The default knows none at all.
+        """
+        return (np.zeros(0), np.zeros(0), np.zeros(0))
+
+    def with_reversal(self, machine: Machine, settings: Settings, tables: Tables, reversal: ReversalCurves) -> Tables:
+        """Return the tables with the reversal in them; only for controls that are ``bidirectional``."""
+        raise TypeError(f"{self.name} has no tables of one direction")
+
+    def backlash_parameters(
+        self, machine: Machine, settings: Settings, reversal: ReversalCurves
+    ) -> list[dict[str, str]]:
+        """Return the control's backlash parameters (name, value, meaning) for a reversal that no table holds."""
+        return []
+
+    def usage(self, machine: Machine, settings: Settings, tables: Tables) -> list[Usage]:
+        """Return how much of each limit of the control the tables use."""
+        return []
+
 
 AnyController = Controller[Any, Any]
+
+
+def nodes_by_axis(nodes_mm: Iterable[tuple[int, FloatArray]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the union of table nodes for X, Y and Z, ascending, from pairs (axis, positions in mm)."""
+    found: list[list[FloatArray]] = [[np.zeros(0)], [np.zeros(0)], [np.zeros(0)]]
+    for axis, positions in nodes_mm:
+        found[axis].append(np.asarray(positions, dtype=np.float64))
+    x, y, z = (np.unique(np.concatenate(parts).round(6)) for parts in found)
+    return x, y, z
 
 
 def coverage_violations(machine: Machine, axis: int, first_mm: float, last_mm: float, what: str) -> list[str]:

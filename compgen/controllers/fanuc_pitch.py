@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.controllers.base import Controller, SourceFile, Term
+from compgen.controllers.base import Controller, SourceFile, Term, nodes_by_axis
 from compgen.controllers.fanuc_pitch_context import pitch_context
 from compgen.controllers.fanuc_pitch_grid import pitch_grid
 from compgen.controllers.fanuc_pitch_settings import PitchSettings, read_pitch_settings
@@ -81,6 +81,11 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
     def violations(self, machine: Machine, settings: PitchSettings, tables: PitchTables) -> list[str]:
         """Return broken limits: change per section, 16 bits, point numbers, overlaps, interval, travel left out."""
         return pitch_violations(machine, settings, tables)
+
+    def table_nodes_mm(self, machine: Machine, settings: PitchSettings, tables: PitchTables) -> tuple[FloatArray, ...]:
+        """Return the section ends of each axis."""
+        blocks = ((axis, block) for axis, block in enumerate(tables.blocks) if block is not None)
+        return nodes_by_axis((axis, machine.reference_point_mm[axis] + block.curve_mm) for axis, block in blocks)
 
     def resolution_mm(self, settings: PitchSettings) -> float:
         """Return half a count: the cumulative curve is rounded to whole counts at every section end."""

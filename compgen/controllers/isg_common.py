@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controllers.base import Controller, SourceFile, Term, coverage_violations
+from compgen.controllers.base import Controller, SourceFile, Term, coverage_violations, nodes_by_axis
 from compgen.controllers.grids import curve_nodes_mm
 from compgen.controllers.isg_list import ListFile, base_name, chain_of, is_list_file, parse_list
 from compgen.controllers.isg_notes import notes
@@ -203,6 +203,12 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
     def resolution_mm(self, settings: IsgSettings) -> float:
         """Half a digit of three lengths, and of six angles and two squareness errors at the longest lever."""
         return 0.5 * (3 * 10.0**-LENGTH_DIGITS + 8 * 10.0**-ANGLE_DIGITS * settings.lever_mm)
+
+    def table_nodes_mm(self, machine: Machine, settings: IsgSettings, tables: IsgTables) -> tuple[FloatArray, ...]:
+        """Return the arguments of all parameters, by axis."""
+        return nodes_by_axis(
+            pair for item in tables.fields.values() for pair in zip(item.axes, item.nodes_mm, strict=True)
+        )
 
     def context(self, machine: Machine, settings: IsgSettings, tables: IsgTables) -> dict[str, Any]:
         """Return what the templates need: numbers, list entries, the sign in words, parameters and checks."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controllers.base import Controller, SourceFile, Term
+from compgen.controllers.base import Controller, SourceFile, Term, nodes_by_axis
 from compgen.controllers.grids import equidistant_grid
 from compgen.controllers.siemens_limits import largest_sums, set_violations
 from compgen.controllers.siemens_preflight import cec_parameters, cec_sign_statement, cec_warnings
@@ -27,6 +27,7 @@ from compgen.controllers.siemens_products import (
     folded_tables,
     sum_into_axes,
 )
+from compgen.controllers.siemens_reversal import backlash_rows, reversal_statement, with_reversal_tables
 from compgen.controllers.siemens_settings import take_axis_names, take_steps
 from compgen.controllers.siemens_syntax import (
     Assignment,
@@ -41,6 +42,7 @@ from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
 from compgen.errors import CompgenWarning
 
 #: Variables of the tables without ``$``, with the number of their indices (K3-2013, p. 248-249).
@@ -111,6 +113,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
     """SINUMERIK CEC: straightness, squareness, positioning, and angular errors as products of tables."""
 
     name = "siemens-cec"
+    bidirectional = True
 
     def read_settings(self, machine: Machine) -> CecSettings:
         """Check the settings; ``sign`` is mandatory."""
@@ -151,13 +154,32 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         """Return the tables with balanced folding, in whole units of the last decimal."""
         return CecTables(folded_tables(basis, values, flip=settings.subtracts, mode=settings.mult_mode))
 
+    def with_reversal(
+        self, machine: Machine, settings: CecSettings, tables: CecTables, reversal: ReversalCurves
+    ) -> CecTables:
+        """Return the tables with a pair DIRECTION 1 and -1 for each reversal."""
+        return CecTables(
+            with_reversal_tables(
+                machine,
+                tables.tables,
+                reversal,
+                subtracts=settings.subtracts,
+                max_points=settings.max_points,
+                step_mm=settings.step_mm,
+            )
+        )
+
     def context(self, machine: Machine, settings: CecSettings, tables: CecTables) -> dict[str, Any]:
         """Return tables, machine data and the sign with a number from the file."""
         sums = largest_sums(machine, tables.tables, settings.mult_mode)
+        both = {index: entry for index, entry in tables.tables.items() if entry.direction == 0}
+        mean_sums = largest_sums(machine, both, settings.mult_mode) if len(both) < len(tables.tables) else sums
         names, subtracts = settings.axis_names, settings.subtracts
         return {
-            "sign_statement": cec_sign_statement(names, subtracts, sums),
-            "parameters": cec_parameters(machine, names, tables.tables, settings.mult_mode, sums),
+            "sign_statement": cec_sign_statement(names, subtracts, mean_sums)
+            + reversal_statement(tables.tables, names),
+            "parameters": cec_parameters(machine, names, tables.tables, settings.mult_mode, sums)
+            + backlash_rows(tables.tables, names),
             "warnings": cec_warnings(machine, names, tables.tables, settings, sums),
             "sign": settings.sign,
             "mult_mode": settings.mult_mode,
@@ -216,6 +238,10 @@ class SiemensCec(Controller[CecSettings, CecTables]):
                     f"Z {place[2]:g}; MD32720 clips it at {settings.max_sum_mm[axis]:g} mm"
                 )
         return found
+
+    def table_nodes_mm(self, machine: Machine, settings: CecSettings, tables: CecTables) -> tuple[FloatArray, ...]:
+        """Return the nodes of all tables by their input axis."""
+        return nodes_by_axis((entry.input_axis, entry.table.nodes_mm) for entry in tables.tables.values())
 
     def resolution_mm(self, settings: CecSettings) -> float:
         """Half of the last decimal of every ordinary table and of every product that is too small to be written."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controllers.base import Controller, SourceFile, Term
+from compgen.controllers.base import Controller, SourceFile, Term, nodes_by_axis
 from compgen.controllers.grids import equidistant_grid
 from compgen.controllers.siemens_settings import take_axis_names, take_steps
 from compgen.controllers.siemens_syntax import (
@@ -32,6 +32,7 @@ from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
 
 #: Variables of the table without ``$``, with the number of their indices (K3-2013, p. 242).
 VARIABLES = {
@@ -210,6 +211,10 @@ class SiemensEec(Controller[EecSettings, EecTables]):
             what = f"the table of {settings.axis_names[axis]}"
             found += table_violations(machine, axis, table, settings.max_points, what)
         return found
+
+    def table_nodes_mm(self, machine: Machine, settings: EecSettings, tables: EecTables) -> tuple[FloatArray, ...]:
+        """Return the nodes of each axis."""
+        return nodes_by_axis((axis, table.nodes_mm) for axis, table in tables.tables.items())
 
     def resolution_mm(self, settings: EecSettings) -> float:
         """Half of the last decimal."""
