@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from compgen.controllers import AnyController, SourceFile, controller_named
-from compgen.controllers.grids import curve_nodes_mm
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.files import read_bytes, sha256_of
@@ -18,20 +17,13 @@ from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.points import Points
 from compgen.errors import InputError
-from compgen.export.synthesis import Projector, projector, wanted_correction
+from compgen.export.synthesis import Projector, wanted_correction
 from compgen.model.exact import exact_error
-from compgen.model.grid import VolumeGrid, volume_grid
 from compgen.model.volumetric import tool_of, volumetric_error
-from compgen.verify.components import components, rms
+from compgen.verify.judge import judge_of
 from compgen.verify.residuals import Residuals, residuals, without_rigid_motion
-from compgen.verify.scan import displacement_uncertainty, point_reasons, scan_lines
+from compgen.verify.safety import Safety, SafetyLimits, safety_of
 
-#: A component of the correction may miss the best possible one by this share of it ...
-COMPONENT_SHARE = 0.3
-#: ... or by this much, whichever is larger; the quantum of the format comes on top, and this many standard
-#: uncertainties of the errors (what smoothing may take away), up to COMPONENT_SHARE of the whole correction.
-COMPONENT_FLOOR_MM = 0.2 * MM_PER_UM
-COMPONENT_UNCERTAINTIES = 0.5
 #: Errors that stay uncorrected by less than this are not named.
 NAMED_FROM_MM = 0.1 * MM_PER_UM
 
@@ -107,6 +99,7 @@ class Verification:
     points: int
     files: tuple[tuple[str, str], ...]
     reasons: tuple[str, ...]
+    safety: Safety = field(repr=False)
     position_mm: FloatArray = field(repr=False)
     error_before_mm: FloatArray = field(repr=False)
     error_after_mm: FloatArray = field(repr=False)
@@ -124,7 +117,7 @@ class Verification:
     @property
     def notes(self) -> tuple[str, ...]:
         """What else the user should know of accepted tables."""
-        notes = []
+        notes = list(self.safety.warnings)
         if self.partial:
             share = 100.0 * self.after_rigid_removed.rms_um / max(self.before_rigid_removed.rms_um, 1e-12)
             notes.append(
@@ -153,11 +146,18 @@ class Verification:
             "after_rigid_motion_removed": self.after_rigid_removed.as_dict(),
             "unrepresentable_um": self.unrepresentable_um,
             "uncorrected_um": self.uncorrected_um,
+            "safety": self.safety.summary(),
             "files": [{"name": name, "sha256": digest} for name, digest in self.files],
         }
 
 
-def verify(machine: Machine, tables: ReadTables, errors: ErrorTable, points: Points | None = None) -> Verification:
+def verify(
+    machine: Machine,
+    tables: ReadTables,
+    errors: ErrorTable,
+    points: Points | None = None,
+    limits: SafetyLimits | None = None,
+) -> Verification:
     """Judge parsed tables against the errors of the machine.
 
     Parameters
@@ -167,26 +167,23 @@ def verify(machine: Machine, tables: ReadTables, errors: ErrorTable, points: Poi
     errors : usually the identified errors; the exact model moves with them.
     points : where the residuals are reported; default the grid of the nodes of curves and tables and the middles
         between them. The judgement itself is always made on that grid and on lines along the axes.
+    limits : for the steps of the tables, see :func:`compgen.verify.safety.safety_of`.
     """
     control = tables.controller
-    solver = projector(machine, control.basis(machine, tables.settings, errors), anchored=control.anchored)
-    nodes = _nodes(machine, errors, solver)
-    grid = volume_grid(machine, nodes)
-    where = points or Points(grid.position_mm)
+    judge = judge_of(machine, control, errors)
+    grid_mm, solver = judge.grid.position_mm, judge.solver
+    where = points or Points(grid_mm)
     before, after = _errors_before_after(machine, tables, errors, where)
     nominal = where.position_mm + tool_of(machine, where.tool_mm)
-    wanted = wanted_correction(machine, errors, grid.position_mm)
-    values = _best_values(machine, errors, solver)
-    best = solver.field(values, grid.position_mm)
-    rest = wanted - best
+    rest = wanted_correction(machine, errors, grid_mm) - judge.best_mm
     if control.anchored:
         rest = rest - rest.mean(axis=0)
-    correction = tables.correction(machine, Points(grid.position_mm))
+    on_grid, on_lines = (tables.correction(machine, Points(part)) for part in (grid_mm, judge.line_mm))
+    safety = safety_of(machine, control, tables.tables, lambda part: solver.field(judge.values, part), limits)
     reasons = [
         *control.violations(machine, tables.settings, tables.tables),
-        *_shrink_reasons(machine, tables, errors, Points(grid.position_mm)),
-        *_component_reasons(grid, correction, best, _slack(machine, tables, errors, best, grid.position_mm)),
-        *_scan_reasons(machine, tables, errors, solver, values, nodes),
+        *judge.reasons(on_grid, on_lines),
+        *safety.reasons,
     ]
     return Verification(
         controller=control.name,
@@ -199,6 +196,7 @@ def verify(machine: Machine, tables: ReadTables, errors: ErrorTable, points: Poi
         points=len(where),
         files=tables.files,
         reasons=tuple(dict.fromkeys(reasons)),
+        safety=safety,
         position_mm=where.position_mm,
         error_before_mm=before,
         error_after_mm=after,
@@ -213,80 +211,6 @@ def _errors_before_after(
     before = exact_error(machine, errors, points.position_mm, points.tool_mm)
     after = exact_error(machine, errors, points.position_mm + correction, points.tool_mm) + correction
     return before, after
-
-
-def _nodes(machine: Machine, errors: ErrorTable, solver: Projector) -> tuple[FloatArray, ...]:
-    """Return the positions of the curves and of the control's tables, by axis."""
-    return tuple(
-        np.unique(
-            np.concatenate(
-                [curve_nodes_mm(machine, errors, axis), *(t.nodes_mm for t in solver.basis if t.axis == axis)]
-            ).round(6)
-        )
-        for axis in range(3)
-    )
-
-
-def _best_values(machine: Machine, errors: ErrorTable, solver: Projector) -> FloatArray:
-    """Return all values of the best table within the control's basis, before rounding."""
-    start = np.concatenate([term.start for term in solver.basis])
-    return solver.project(wanted_correction(machine, errors, solver.position_mm), start)
-
-
-def _scan_reasons(
-    machine: Machine,
-    tables: ReadTables,
-    errors: ErrorTable,
-    solver: Projector,
-    values: FloatArray,
-    nodes_mm: tuple[FloatArray, ...],
-) -> list[str]:
-    """Name points on densely sampled lines along the axes where the correction misses the best possible one."""
-    position_mm = scan_lines(machine, nodes_mm)
-    correction_mm, best_mm = tables.correction(machine, Points(position_mm)), solver.field(values, position_mm)
-    u_mm = displacement_uncertainty(machine, errors, position_mm)
-    return point_reasons(position_mm, correction_mm, best_mm, u_mm, tables.controller.resolution_mm(tables.settings))
-
-
-def _slack(
-    machine: Machine, tables: ReadTables, errors: ErrorTable, best_mm: FloatArray, position_mm: FloatArray
-) -> FloatArray:
-    """What the quantum of the format and the uncertainty of the errors explain of a component, shape (3,), mm."""
-    u = COMPONENT_UNCERTAINTIES * displacement_uncertainty(machine, errors, position_mm)
-    most = COMPONENT_SHARE * np.std(best_mm, axis=0)
-    return np.asarray(tables.controller.resolution_mm(tables.settings) + np.minimum(u, most))
-
-
-def _component_reasons(
-    grid: VolumeGrid, correction_mm: FloatArray, best_mm: FloatArray, slack_mm: FloatArray
-) -> list[str]:
-    """Name every component of the correction that misses the best possible one by more than its share."""
-    miss, best, own = (components(grid, part) for part in (correction_mm - best_mm, best_mm, correction_mm))
-    reasons = []
-    for name in miss:
-        limit = max(COMPONENT_SHARE * rms(best[name]), COMPONENT_FLOOR_MM) + slack_mm["XYZ".index(name[0])]
-        if rms(miss[name]) > limit:
-            ratio = np.sum(own[name] * best[name]) / max(float(np.sum(best[name] ** 2)), 1e-30)
-            hint = "; its sign is reversed" if abs(ratio + 1) < 0.1 else ""
-            reasons.append(
-                f"correction {name}: {rms(own[name]) / MM_PER_UM:.2f} um rms in the table, "
-                f"{rms(best[name]) / MM_PER_UM:.2f} um rms needed, they differ by {rms(miss[name]) / MM_PER_UM:.2f} um{hint}"
-            )
-    return reasons
-
-
-def _shrink_reasons(machine: Machine, tables: ReadTables, errors: ErrorTable, points: Points) -> list[str]:
-    before, after = _errors_before_after(machine, tables, errors, points)
-    nominal = points.position_mm + tool_of(machine, None)
-    rms_before, rms_after = (
-        residuals(without_rigid_motion(nominal, error)).rms_um * MM_PER_UM for error in (before, after)
-    )
-    if rms_after <= rms_before + 1e-9 or rms_after <= tables.controller.resolution_mm(tables.settings):
-        return []
-    return [
-        f"the residual does not shrink: {rms_before / MM_PER_UM:.2f} um rms before, {rms_after / MM_PER_UM:.2f} um rms "
-        "after (rigid motion taken out)"
-    ]
 
 
 def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dict[str, float]:
