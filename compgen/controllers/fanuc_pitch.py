@@ -12,17 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.controllers.base import Controller, SourceFile, Term, nodes_by_axis
-from compgen.controllers.fanuc_pitch_context import pitch_context
+from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controllers.fanuc_pitch_context import backlash_rows, pitch_context
 from compgen.controllers.fanuc_pitch_grid import pitch_grid
 from compgen.controllers.fanuc_pitch_settings import PitchSettings, read_pitch_settings
-from compgen.controllers.fanuc_pitch_tables import PitchBlock, PitchTables, parse_pitch, pitch_violations
+from compgen.controllers.fanuc_pitch_tables import PitchBlock, PitchTables, parse_pitch, pitch_usage, pitch_violations
 from compgen.controllers.terms import one_dimensional_name, one_dimensional_terms
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
 
 
 class FanucPitch(Controller[PitchSettings, PitchTables]):
@@ -86,6 +87,16 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         """Return the section ends of each axis."""
         blocks = ((axis, block) for axis, block in enumerate(tables.blocks) if block is not None)
         return nodes_by_axis((axis, machine.reference_point_mm[axis] + block.curve_mm) for axis, block in blocks)
+
+    def backlash_parameters(
+        self, machine: Machine, settings: PitchSettings, reversal: ReversalCurves
+    ) -> list[dict[str, str]]:
+        """Return parameter 1851 of each axis with a reversal along itself."""
+        return backlash_rows(settings, reversal)
+
+    def usage(self, machine: Machine, settings: PitchSettings, tables: PitchTables) -> list[Usage]:
+        """Return change per section, point numbers and interval against their limits."""
+        return pitch_usage(settings, tables)
 
     def resolution_mm(self, settings: PitchSettings) -> float:
         """Return half a count: the cumulative curve is rounded to whole counts at every section end."""

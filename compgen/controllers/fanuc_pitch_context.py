@@ -12,6 +12,7 @@ from compgen.controllers.fanuc_pitch_tables import PARAMETERS, PitchBlock, Pitch
 from compgen.core.csvio import fixed
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.reversal import WORTH_MM, ReversalCurves
 
 MEANINGS = (
     "point number at the reference point",
@@ -158,3 +159,21 @@ def _check(machine: Machine, settings: PitchSettings, axis: int, block: PitchBlo
         "short_mm": float(block.interval_mm) - 2 * settings.count_mm,
         "short_counts": 2 * settings.sign,
     }
+
+
+def backlash_rows(settings: PitchSettings, reversal: ReversalCurves) -> list[dict[str, str]]:
+    """Return parameter 1851 for the mean reversal of each axis along itself, in detection units.
+
+    Source: parameter manuals B-63090EN p. 97, B-64120EN p. 116: added in the direction of movement, -9999 to +9999;
+    an axis that stops short (reversal value below zero) gets a positive value.
+    """
+    return [
+        {
+            "name": f"1851 ({AXES[axis]}, A{settings.axis_numbers[axis]})",
+            "value": str(round(-reversal.mean_mm(axis) / (settings.detection_unit_um * MM_PER_UM))),
+            "meaning": "backlash compensation in detection units: minus the mean reversal value; these tables act in both "
+            "directions alike. If a value was active while the machine was measured, add this one to it",
+        }
+        for axis in range(3)
+        if abs(reversal.mean_mm(axis)) >= WORTH_MM
+    ]

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.controllers.base import SourceFile, coverage_violations
+from compgen.controllers.base import SourceFile, Usage, coverage_violations
 from compgen.controllers.fanuc_pitch_settings import PitchSettings
 from compgen.controllers.fanuc_text import Record, axis_values, read_records, type_word
 from compgen.core.csvio import FloatArray
@@ -256,3 +256,19 @@ def _overlaps(tables: PitchTables) -> list[str]:
         for (a, a_first, a_last), (b, b_first, b_last) in combinations(spans, 2)
         if a_first <= b_last and b_first <= a_last
     ]
+
+
+def pitch_usage(settings: PitchSettings, tables: PitchTables) -> list[Usage]:
+    """Return the largest change over a section, the point numbers and the interval against their limits."""
+    found, used = [], 0
+    for axis, block in enumerate(tables.blocks):
+        if block is None:
+            continue
+        used += len(block.values)
+        step = int(np.max(np.abs(np.diff(block.curve)), initial=0))
+        found.append(Usage(f"change over a section of {AXES[axis]}", step, settings.increment_limit, "counts"))
+        if settings.max_feed_mm_min is not None:
+            least, own = settings.least_interval_mm, float(block.interval_mm)
+            found.append(Usage(f"shortest section at the feed, {AXES[axis]}", least, own, "mm"))
+    numbers = settings.last_number - settings.first_number + 1
+    return [*found, Usage("compensation points", used, numbers, "points")]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controllers.base import Controller, SourceFile, Term, coverage_violations, nodes_by_axis
+from compgen.controllers.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
 from compgen.controllers.grids import curve_nodes_mm
 from compgen.controllers.isg_list import ListFile, base_name, chain_of, is_list_file, parse_list
 from compgen.controllers.isg_notes import notes
@@ -199,6 +199,10 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
             if declared != self.file_format:
                 found.append(f"list file: {name} is declared {declared}, it is {self.file_format}")
         return found
+
+    def usage(self, machine: Machine, settings: IsgSettings, tables: IsgTables) -> list[Usage]:
+        """Return the records of the parameter files against what the control takes."""
+        return [Usage("records (max_records)", tables.records, settings.max_records, "records")]
 
     def resolution_mm(self, settings: IsgSettings) -> float:
         """Half a digit of three lengths, and of six angles and two squareness errors at the longest lever."""

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controllers.base import Controller, SourceFile, Term, nodes_by_axis
+from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controllers.grids import equidistant_grid
-from compgen.controllers.siemens_limits import largest_sums, set_violations
+from compgen.controllers.siemens_limits import cec_usage, largest_sums, set_violations
 from compgen.controllers.siemens_preflight import cec_parameters, cec_sign_statement, cec_warnings
 from compgen.controllers.siemens_products import (
     MM_DECIMALS,
@@ -242,6 +242,10 @@ class SiemensCec(Controller[CecSettings, CecTables]):
     def table_nodes_mm(self, machine: Machine, settings: CecSettings, tables: CecTables) -> tuple[FloatArray, ...]:
         """Return the nodes of all tables by their input axis."""
         return nodes_by_axis((entry.input_axis, entry.table.nodes_mm) for entry in tables.tables.values())
+
+    def usage(self, machine: Machine, settings: CecSettings, tables: CecTables) -> list[Usage]:
+        """Return nodes, tables, sums and their change against the limits; those not stated against usual defaults."""
+        return cec_usage(machine, tables.tables, settings)
 
     def resolution_mm(self, settings: CecSettings) -> float:
         """Half of the last decimal of every ordinary table and of every product that is too small to be written."""

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controllers.base import Controller, SourceFile, Term, nodes_by_axis
+from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.siemens_reversal import plain_backlash_rows
 from compgen.controllers.siemens_settings import take_axis_names, take_steps
 from compgen.controllers.siemens_syntax import (
     LinearTable,
@@ -215,6 +216,19 @@ class SiemensEec(Controller[EecSettings, EecTables]):
     def table_nodes_mm(self, machine: Machine, settings: EecSettings, tables: EecTables) -> tuple[FloatArray, ...]:
         """Return the nodes of each axis."""
         return nodes_by_axis((axis, table.nodes_mm) for axis, table in tables.tables.items())
+
+    def backlash_parameters(
+        self, machine: Machine, settings: EecSettings, reversal: ReversalCurves
+    ) -> list[dict[str, str]]:
+        """Return MD32450 of each axis with a reversal along itself."""
+        return plain_backlash_rows(reversal, settings.axis_names, settings.encoder)
+
+    def usage(self, machine: Machine, settings: EecSettings, tables: EecTables) -> list[Usage]:
+        """Return the nodes of each axis against what the control can hold."""
+        return [
+            Usage(f"nodes of {settings.axis_names[axis]}", len(table.values), settings.max_points, "nodes")
+            for axis, table in sorted(tables.tables.items())
+        ]
 
     def resolution_mm(self, settings: EecSettings) -> float:
         """Half of the last decimal."""

@@ -7,15 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
+from typing import Protocol
 
 import numpy as np
 
+from compgen.controllers.base import Usage
 from compgen.controllers.siemens_products import CecMap, CecTable, sum_into_axes
 from compgen.controllers.siemens_syntax import table_violations
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 
+#: Defaults of MD32720 (mm) and MD32730 (%) as far as they are known.
+DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT = 1.0, 10.0
 _MOST_POSITIONS = 81
 _MOST_ACROSS = 21
 
@@ -104,4 +108,44 @@ def _reference_violations(tables: CecMap, index: int, entry: CecTable, what: str
             found.append(f"{what}: MULT_BY_TABLE names table number {entry.multiplier}, which does not exist")
         elif other.table.modulo != entry.table.modulo:
             found.append(f"{what}: it and its multiplier {entry.multiplier - 1} are not both cyclic or both not")
+    return found
+
+
+class StatedLimits(Protocol):
+    """The settings that hold limits of the control."""
+
+    @property
+    def mult_mode(self) -> str:
+        """Reading of MULT_BY_TABLE."""
+
+    @property
+    def max_points(self) -> int:
+        """Nodes per table."""
+
+    @property
+    def tables_available(self) -> int | None:
+        """Number of tables that the control has."""
+
+    @property
+    def max_sum_mm(self) -> tuple[float, float, float] | None:
+        """MD32720."""
+
+    @property
+    def axis_names(self) -> tuple[str, str, str]:
+        """Names of X, Y, Z on the control."""
+
+
+def cec_usage(machine: Machine, tables: CecMap, limits: StatedLimits) -> list[Usage]:
+    """Return nodes of the longest table, number of tables, largest sums and their largest change against the limits."""
+    nodes = max(len(entry.table.values) for entry in tables.values())
+    found = [Usage("nodes of the longest table", nodes, limits.max_points, "nodes")]
+    if limits.tables_available is not None:
+        found.append(Usage("tables", max(tables) + 1, limits.tables_available, "tables"))
+    sums, slopes = largest_sums(machine, tables, limits.mult_mode), largest_slopes(machine, tables, limits.mult_mode)
+    for axis in sorted({entry.output_axis for entry in tables.values()}):
+        name, stated = limits.axis_names[axis], limits.max_sum_mm is not None
+        most_mm = DEFAULT_MAX_SUM_MM if limits.max_sum_mm is None else limits.max_sum_mm[axis]
+        percent = 100.0 * float(np.sum(slopes[axis]))
+        found.append(Usage(f"sum into {name} (MD32720)", abs(sums[axis][0]), most_mm, "mm", stated))
+        found.append(Usage(f"change of the sum of {name} (MD32730)", percent, DEFAULT_MAX_VELO_PERCENT, "%", False))
     return found

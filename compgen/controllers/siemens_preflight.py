@@ -7,15 +7,13 @@ from typing import Protocol
 
 import numpy as np
 
-from compgen.controllers.siemens_limits import largest_slopes
+from compgen.controllers.siemens_limits import DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT, largest_slopes
 from compgen.controllers.siemens_products import CecMap, sum_into_axes
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 
 Sums = Sequence[tuple[float, tuple[float, float, float]]]
 
-#: Defaults of MD32720 (mm) and MD32730 (%) as far as they are known.
-DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT = 1.0, 10.0
 #: SINUMERIK 828D (K3-2013, p. 264).
 _TABLES_OF_828D, _NODES_OF_828D = 8, 200
 

@@ -91,3 +91,21 @@ def backlash_rows(tables: CecMap, names: tuple[str, ...]) -> list[dict[str, str]
         }
         for axis in axes
     ]
+
+
+def plain_backlash_rows(reversal: ReversalCurves, names: tuple[str, ...], encoder: int) -> list[dict[str, str]]:
+    """Return MD32450 for the mean reversal of each axis along itself: positive where the tool stops short.
+
+    Source: MD32450 is positive if the encoder leads the machine part (SINUMERIK parameter manuals), the usual case;
+    then the position reached in positive direction is the smaller one, and the reversal value B is negative.
+    """
+    return [
+        {
+            "name": f"MD32450 $MA_BACKLASH[{encoder},{names[axis]}]",
+            "value": f"{-reversal.mean_mm(axis):.4f} mm",
+            "meaning": f"minus the mean reversal value of {AXES[axis]}; these tables act in both directions alike. If a "
+            "value was active while the machine was measured, add this one to it",
+        }
+        for axis in range(3)
+        if abs(reversal.mean_mm(axis)) >= WORTH_MM
+    ]
