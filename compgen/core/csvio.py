@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.core.csvparse import CsvFile, parse_any, parse_plain
 from compgen.core.files import read_text
 from compgen.core.text import nearest, one_line
 from compgen.errors import CompgenWarning, InputError
 
 FloatArray = NDArray[np.float64]
 _LARGEST_LABEL = 2.0**53
+_ROWS_AT_ONCE = 10_000
 
 
 @dataclass(frozen=True)
@@ -121,61 +123,33 @@ def read_csv(
     content = read_text(source)
     required, prefixes = list(required), tuple(prefixes)
     known = {*required, *optional}
-    header_line, header, rows, lines, metadata = _split(source, content)
-    if not header:
+    file = parse_plain(content) or parse_any(source, content)
+    if not file.header:
         raise InputError(f"is empty; expected a header line with {', '.join(required)}", file=source)
-    _check_header(source, header_line, header, required)
-    if not rows:
-        raise InputError("has a header but no rows", file=source, line=header_line)
-    for row, line in zip(rows, lines, strict=True):
-        if len(row) != len(header):
-            last = " (the last line: is the file truncated?)" if line == lines[-1] else ""
-            message = f"has {len(row)} fields, the header has {len(header)}{last}"
-            raise InputError(message, file=source, line=line)
-    _check_complete(source, content, rows, lines, metadata)
-    for name in header:
+    _check_header(source, file.header_line, file.header, required)
+    if not file.lines:
+        raise InputError("has a header but no rows", file=source, line=file.header_line)
+    if file.rows is not None:
+        _check_fields(source, file.header, file.rows, file.lines)
+    _check_complete(source, content, file)
+    for name in file.header:
         if not _is_allowed(name, known, prefixes):
             message = f"column {one_line(name)!r} is not known and left out; {nearest(name, known)}"
-            warnings.warn(f"{source}:{header_line}: {message}", CompgenWarning, stacklevel=3)
-    columns = {
-        name: [cell.strip() for cell in cells]
-        for name, cells in zip(header, zip(*rows, strict=True), strict=True)
-        if _is_allowed(name, known, prefixes)
-    }
-    return CsvTable(source, columns, lines, metadata)
+            warnings.warn(f"{source}:{file.header_line}: {message}", CompgenWarning, stacklevel=3)
+    kept = {k: name for k, name in enumerate(file.header) if _is_allowed(name, known, prefixes)}
+    return CsvTable(source, {name: file.column(k) for k, name in kept.items()}, file.lines, file.metadata)
 
 
 def _is_allowed(name: str, known: set[str], patterns: tuple[str, ...]) -> bool:
     return name in known or any(fnmatchcase(name, p if "*" in p else f"{p}*") for p in patterns)
 
 
-def _split(source: Path, content: str) -> tuple[int, list[str], list[list[str]], list[int], dict[str, str]]:
-    metadata: dict[str, str] = {}
-    numbers: list[int] = []
-    data: list[str] = []
-    for number, line in enumerate(re.split(r"\r\n|\r|\n", content), start=1):
-        stripped = line.strip()
-        if stripped.startswith("#"):
-            key, equals, value = stripped.lstrip("#").partition("=")
-            if equals:
-                metadata[key.strip()] = value.strip()
-        elif stripped:
-            numbers.append(number)
-            data.append(line)
-    if not data:
-        return 0, [], [], [], metadata
-    if "\0" in content:
-        raise InputError("holds NUL bytes; it is not a text file", file=source)
-    reader = csv.reader(data, strict=True, skipinitialspace=True)
-    try:
-        parsed = list(reader)
-    except csv.Error as error:
-        line = numbers[max(reader.line_num, 1) - 1]
-        raise InputError(f"is not readable as CSV: {error}", file=source, line=line) from error
-    if len(parsed) != len(data):
-        raise InputError("a quoted field runs over a line end; write each row on one line", file=source)
-    header = [name.strip() for name in parsed[0]]
-    return numbers[0], header, parsed[1:], numbers[1:], metadata
+def _check_fields(source: Path, header: list[str], rows: list[list[str]], lines: Sequence[int]) -> None:
+    for row, line in zip(rows, lines, strict=True):
+        if len(row) != len(header):
+            last = " (the last line: is the file truncated?)" if line == lines[-1] else ""
+            message = f"has {len(row)} fields, the header has {len(header)}{last}"
+            raise InputError(message, file=source, line=line)
 
 
 def _check_header(source: Path, line: int, header: list[str], required: list[str]) -> None:
@@ -190,25 +164,23 @@ def _check_header(source: Path, line: int, header: list[str], required: list[str
         raise InputError(message, file=source, line=line)
 
 
-def _check_complete(
-    source: Path, content: str, rows: list[list[str]], lines: list[int], metadata: dict[str, str]
-) -> None:
+def _check_complete(source: Path, content: str, file: CsvFile) -> None:
     """A file that was cut is refused: by what it declares, or by a shorter last number without line end.
 
     A file that declares its rows was written by a program and ends with a line end; one that does not may lack it.
     """
-    declared = metadata.get("rows")
-    if declared is not None and declared != str(len(rows)):
-        raise InputError(f"declares {one_line(declared)} rows but holds {len(rows)}: is it truncated?", file=source)
+    declared, count, last_line = file.metadata.get("rows"), len(file.lines), file.lines[-1]
+    if declared is not None and declared != str(count):
+        raise InputError(f"declares {one_line(declared)} rows but holds {count}: is it truncated?", file=source)
     if content.endswith(("\n", "\r")):
         return
     if declared is not None:
         message = "the last line has no line end: the file is truncated; if it is complete, end the line"
-        raise InputError(message, file=source, line=lines[-1])
-    *before, last = [len(row[-1].strip().partition(".")[2]) for row in rows]
+        raise InputError(message, file=source, line=last_line)
+    *before, last = [len(cell.partition(".")[2]) for cell in file.column(len(file.header) - 1)]
     if len(before) > 1 and last < min(before):
         message = "the last line has no line end and fewer decimals than the others: the file is truncated"
-        raise InputError(message, file=source, line=lines[-1])
+        raise InputError(message, file=source, line=last_line)
 
 
 def format_csv(
@@ -221,19 +193,30 @@ def format_csv(
     Numbers are written with ``decimals`` digits after the point (6 if not given), text as it is.
     """
     digits = decimals or {}
-    cells = [_cells(values, digits.get(name, 6)) for name, values in columns.items()]
-    rows = list(zip(*cells, strict=True))
-    comments = [
-        f"# {one_line(key)} = {one_line(value)}" for key, value in {**(metadata or {}), "rows": len(rows)}.items()
-    ]
-    body = [",".join(columns), *(",".join(row) for row in rows)]
-    return "\n".join([*comments, *body]) + "\n"
+    parts = [_template(values, digits.get(name, 6)) for name, values in columns.items()]
+    rows = max((len(cells) for _, cells in parts), default=0)
+    if any(len(cells) != rows for _, cells in parts):
+        raise ValueError(f"columns differ in length: {', '.join(f'{k} {len(v)}' for k, v in columns.items())}")
+    comments = [f"# {one_line(key)} = {one_line(value)}" for key, value in {**(metadata or {}), "rows": rows}.items()]
+    row = ",".join(template for template, _ in parts) + "\n"
+    text = ["\n".join([*comments, ",".join(columns)]), "\n"]
+    for start in range(0, rows, _ROWS_AT_ONCE):
+        block = [cells[start : start + _ROWS_AT_ONCE] for _, cells in parts]
+        text.append(row * len(block[0]) % tuple(chain.from_iterable(zip(*block, strict=True))))
+    return "".join(text)
 
 
-def _cells(values: Sequence[str] | FloatArray, digits: int) -> list[str]:
-    if isinstance(values, np.ndarray):
-        return [fixed(value, digits) for value in values.tolist()]
-    return [_quoted(str(value)) for value in values]
+def _template(values: Sequence[str] | FloatArray, digits: int) -> tuple[str, Sequence[str] | Sequence[float]]:
+    """Conversion of a column for the ``%`` operator, and what it converts."""
+    if not isinstance(values, np.ndarray):
+        return "%s", [_quoted(str(value)) for value in values]
+    numbers = np.array(values, dtype=np.float64)
+    if not np.isfinite(numbers).all():
+        return "%s", [fixed(value, digits) for value in numbers.tolist()]
+    for k in np.flatnonzero(np.signbit(numbers) & (numbers > -(10.0**-digits))):
+        if float(fixed(float(numbers[k]), digits)) == 0.0:
+            numbers[k] = 0.0  # no negative zero
+    return f"%.{digits}f", numbers.tolist()
 
 
 def _quoted(cell: str) -> str:
