@@ -16,7 +16,15 @@ from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_
 from compgen.controllers.fanuc_pitch_context import backlash_rows, pitch_context
 from compgen.controllers.fanuc_pitch_grid import pitch_grid
 from compgen.controllers.fanuc_pitch_settings import PitchSettings, read_pitch_settings
-from compgen.controllers.fanuc_pitch_tables import PitchBlock, PitchTables, parse_pitch, pitch_usage, pitch_violations
+from compgen.controllers.fanuc_pitch_tables import (
+    PitchBlock,
+    PitchTables,
+    Shortfall,
+    parse_pitch,
+    pitch_usage,
+    pitch_violations,
+)
+from compgen.controllers.integers import IntegerCurve, best_integers, section_weights
 from compgen.controllers.terms import one_dimensional_name, one_dimensional_terms
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
@@ -44,17 +52,22 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
     def build(
         self, machine: Machine, settings: PitchSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
     ) -> PitchTables:
-        """Round the cumulative curves to counts, difference them, and give the axes consecutive point numbers."""
+        """Find the best whole cumulative curves within the limit, and give the axes consecutive point numbers."""
         terms = {term.name: term for term in basis}
         blocks: list[PitchBlock | None] = [None, None, None]
+        shortfalls: list[Shortfall] = []
         free = settings.first_number
         for axis in range(3):
             name = one_dimensional_name(axis, axis)
             if name in terms:
-                reference_mm = machine.reference_point_mm[axis]
-                block = _block(settings, terms[name].nodes_mm - reference_mm, values[name], free)
+                nodes_mm = terms[name].nodes_mm
+                best = _best_counts(machine, settings, axis, nodes_mm, values[name])
+                block = _block(settings, nodes_mm - machine.reference_point_mm[axis], best.counts, free)
                 blocks[axis], free = block, block.last + 1
-        return PitchTables((blocks[0], blocks[1], blocks[2]))
+                if best.limited:
+                    sections = tuple(int(block.curve_numbers[k + 1]) for k in best.full_sections)
+                    shortfalls.append(Shortfall(axis, best.largest, sections))
+        return PitchTables((blocks[0], blocks[1], blocks[2]), shortfalls=tuple(shortfalls))
 
     def context(self, machine: Machine, settings: PitchSettings, tables: PitchTables) -> dict[str, Any]:
         """Return records, the plan point number -> value, the parameters to set and the statement of the sign."""
@@ -99,15 +112,27 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return pitch_usage(settings, tables)
 
     def resolution_mm(self, settings: PitchSettings) -> float:
-        """Return half a count: the cumulative curve is rounded to whole counts at every section end."""
+        """Return half a count: the bound of :mod:`compgen.controllers.integers` where the limit does not bind."""
         return 0.5 * settings.count_mm
 
 
-def _block(settings: PitchSettings, along_mm: FloatArray, values_mm: FloatArray, free: int) -> PitchBlock:
-    """Table of one axis from corrections (n,) at section ends (n,) from the reference point, numbers from ``free``."""
-    below = int(np.argmin(np.abs(along_mm)))
-    corrections = np.asarray(values_mm) - values_mm[below]
-    curve = np.rint(settings.sign * corrections / settings.count_mm).astype(np.int64)
+def _best_counts(
+    machine: Machine, settings: PitchSettings, axis: int, nodes_mm: FloatArray, values_mm: FloatArray
+) -> IntegerCurve:
+    """Return the best cumulative curve in counts at the section ends for corrections (n,), zero at the reference."""
+    below = _reference_node(nodes_mm - machine.reference_point_mm[axis])
+    wanted = settings.sign * (np.asarray(values_mm) - values_mm[below]) / settings.count_mm
+    sections = section_weights(nodes_mm, machine.axes[axis].range_mm)
+    return best_integers(wanted, sections, below, settings.increment_limit)
+
+
+def _reference_node(along_mm: FloatArray) -> int:
+    return int(np.argmin(np.abs(along_mm)))
+
+
+def _block(settings: PitchSettings, along_mm: FloatArray, curve: NDArray[np.int64], free: int) -> PitchBlock:
+    """Table of one axis from counts (n,) at section ends (n,) from the reference point, numbers from ``free``."""
+    below = _reference_node(along_mm)
     # The reference number itself is always kept, also where no travel lies on its negative side.
     steps = np.diff(curve, prepend=[0]) if below == 0 else np.diff(curve)
     interval = Decimal(repr(float(along_mm[-1] - along_mm[0]))) / (len(along_mm) - 1)

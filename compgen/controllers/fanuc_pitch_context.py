@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 
 from compgen.controllers.fanuc_pitch_settings import PitchSettings
-from compgen.controllers.fanuc_pitch_tables import PARAMETERS, PitchBlock, PitchTables
+from compgen.controllers.fanuc_pitch_tables import (
+    MOST_MISSED,
+    PARAMETERS,
+    PitchBlock,
+    PitchTables,
+    shortfall_text,
+)
 from compgen.core.csvio import fixed
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
@@ -31,7 +37,10 @@ def pitch_context(machine: Machine, settings: PitchSettings, tables: PitchTables
     return {
         "sign_statement": _sign_statement(settings),
         "parameters": _preflight_parameters(settings, present),
-        "warnings": _warnings(settings, present),
+        "warnings": [
+            *_warnings(settings, present),
+            *(shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts <= MOST_MISSED),
+        ],
         "tables": [_summary(machine, axis, block) for axis, block in present],
         "style": settings,
         "records": records,

@@ -8,7 +8,7 @@ A[n] = A[n-1] + v[n]; with total values A[n] is stored. One count is magnificati
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from itertools import combinations
 
@@ -20,12 +20,14 @@ from compgen.controllers.fanuc_pitch_settings import PitchSettings
 from compgen.controllers.fanuc_text import Record, axis_values, read_records, type_word
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
-from compgen.core.names import AXES
+from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import InputError
 
 REFERENCE, FARTHEST_NEGATIVE, FARTHEST_POSITIVE, MAGNIFICATION, INTERVAL = PARAMETERS = (3620, 3621, 3622, 3623, 3624)
 #: Total values travel as 16-bit numbers.
 MOST_TOTAL = 32767
+#: A table that misses by more counts than this because its steps are limited is not acceptable.
+MOST_MISSED = 1.0
 #: Largest compensation point number that is read at all; what the control takes is checked by the limits.
 MOST_NUMBER = 9999
 
@@ -69,11 +71,24 @@ class PitchBlock:
 
 
 @dataclass(frozen=True)
+class Shortfall:
+    """What the limit of the change per section costs an axis: how far the best table misses, and where it is full."""
+
+    axis: int
+    missed_counts: float
+    sections: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class PitchTables:
-    """Tables of X, Y, Z (None: the axis has none); ``others`` holds (axis number, first, last) of further axes."""
+    """Tables of X, Y, Z (None: the axis has none); ``others`` holds (axis number, first, last) of further axes.
+
+    ``shortfalls`` is known of tables that were built; tables read from text do not say what was wanted.
+    """
 
     blocks: tuple[PitchBlock | None, PitchBlock | None, PitchBlock | None]
     others: tuple[tuple[int, int, int], ...] = ()
+    shortfalls: tuple[Shortfall, ...] = field(default=(), compare=False)
 
 
 Parameters = dict[tuple[int, int], tuple[str, Record]]
@@ -212,7 +227,19 @@ def pitch_violations(machine: Machine, settings: PitchSettings, tables: PitchTab
             messages += _block_violations(settings, AXES[axis], block)
             first_mm, last_mm = machine.reference_point_mm[axis] + block.curve_mm[[0, -1]]
             messages += coverage_violations(machine, axis, first_mm, last_mm, f"the pitch table of {AXES[axis]}")
+    messages += [shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts > MOST_MISSED]
     return messages + _overlaps(tables)
+
+
+def shortfall_text(settings: PitchSettings, shortfall: Shortfall) -> str:
+    """Say that the limit of the change per section keeps a table from what was wanted, and what helps."""
+    numbers = ", ".join(map(str, shortfall.sections[:5])) + (", ..." if len(shortfall.sections) > 5 else "")
+    return (
+        f"{AXES[shortfall.axis]}: the wanted curve is too steep, the limit is {settings.increment_limit} counts per "
+        f"section: {len(shortfall.sections)} sections are full (points {numbers}), and even the best table misses by up "
+        f"to {shortfall.missed_counts * settings.count_mm / MM_PER_UM:.1f} um; a shorter interval or a larger "
+        f"magnification is needed"
+    )
 
 
 def _block_violations(settings: PitchSettings, name: str, block: PitchBlock) -> list[str]:
