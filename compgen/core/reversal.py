@@ -110,7 +110,9 @@ def _check_positions(table: CsvTable, name: str, rows: list[int], position_mm: F
     for row in rows:
         position = float(position_mm[row])
         if np.isnan(position) and len(rows) > 1:
-            message = f"is empty, and {name} has {len(rows)} rows; a constant has one row, a function a position in each"
+            message = (
+                f"is empty, and {name} has {len(rows)} rows; a constant has one row, a function a position in each"
+            )
             raise table.fail(row, "position_mm", message)
         first = seen.setdefault(position, row)
         if first != row:

@@ -9,10 +9,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from compgen.controllers import controller_named
+from compgen.controllers import AnyController, controller_named
 from compgen.core.error_table import ErrorTable, format_errors
 from compgen.core.files import OutputFolder, sha256_of
 from compgen.core.machine import Machine
+from compgen.core.names import MM_PER_UM
+from compgen.core.reversal import WORTH_MM, ReversalCurves, format_reversal, reversal_name
 from compgen.errors import InputError
 from compgen.export.render import Format, load_format, render, render_files
 from compgen.export.synthesis import synthesize
@@ -102,6 +104,7 @@ def export(
     templates: Path | None = None,
     allow_unverified: bool = False,
     provenance: Provenance | None = None,
+    reversal: ReversalCurves | None = None,
 ) -> Export:
     """Turn errors into the files of one control; nothing is written yet.
 
@@ -113,6 +116,8 @@ def export(
     templates : a folder of the user's own templates, searched before the shipped ones.
     allow_unverified : export formats that no public document fully describes.
     provenance : the input files, for the manifest and the headers.
+    reversal : what each axis does differently in its two directions; in tables of one direction where the control has
+        them, else as a parameter or a warning in the preflight list.
 
     Raises
     ------
@@ -125,8 +130,10 @@ def export(
     basis = control.basis(machine, settings, errors)
     values = synthesize(machine, errors, basis, anchored=control.anchored)
     tables = control.build(machine, settings, basis, values)
-    own = control.context(machine, settings, tables)
-    common = _common_context(machine, errors, controller, provenance or Provenance())
+    if reversal is not None and control.bidirectional:
+        tables = control.with_reversal(machine, settings, tables, reversal)
+    own = _with_backlash(control, machine, settings, control.context(machine, settings, tables), reversal)
+    common = _common_context(machine, errors, controller, provenance or Provenance(), reversal)
     files = render_files(card, {**common, **own}, templates)
     described = [{"name": name, "sha256": sha256_of(text.encode("ascii", "replace"))} for name, text in files.items()]
     violations = control.violations(machine, settings, tables)
@@ -135,8 +142,36 @@ def export(
     return Export(controller, files, {**manifest, "violations": violations}, preflight, violations, own["warnings"])
 
 
-def _common_context(machine: Machine, errors: ErrorTable, controller: str, provenance: Provenance) -> dict[str, Any]:
-    inputs = list(provenance.inputs) or [("errors", sha256_of(format_errors(errors).encode()))]
+def _with_backlash(
+    control: AnyController, machine: Machine, settings: Any, own: dict[str, Any], reversal: ReversalCurves | None
+) -> dict[str, Any]:
+    """Add the backlash parameters of a control without tables of one direction, and what they cannot hold."""
+    if reversal is None or control.bidirectional:
+        return own
+    parameters = control.backlash_parameters(machine, settings, reversal)
+    left = {
+        reversal_name(*key): value
+        for key, value in reversal.largest_mm.items()
+        if abs(value) >= WORTH_MM and (key[0] != key[1] or not parameters)
+    }
+    warnings = [
+        f"{name} is {value / MM_PER_UM:+.1f} um (reached in positive minus in negative direction); these tables act in both "
+        f"directions alike and do not hold it"
+        for name, value in left.items()
+    ]
+    return {**own, "parameters": [*own["parameters"], *parameters], "warnings": [*own["warnings"], *warnings]}
+
+
+def _common_context(
+    machine: Machine,
+    errors: ErrorTable,
+    controller: str,
+    provenance: Provenance,
+    reversal: ReversalCurves | None = None,
+) -> dict[str, Any]:
+    text = format_errors(errors)
+    inputs = list(provenance.inputs) or [("errors", sha256_of(text.encode()))]
+    both = text if reversal is None else text + format_reversal(reversal)
     return {
         "version": program_version(),
         "controller": controller,
@@ -145,7 +180,8 @@ def _common_context(machine: Machine, errors: ErrorTable, controller: str, prove
         "tool_offset_mm": [f"{value:g}" for value in machine.tool_offset_mm],
         "reference_point_mm": [f"{value:g}" for value in machine.reference_point_mm],
         "inputs": [name for name, _ in inputs],
-        "input_sha256": sha256_of(format_errors(errors).encode()),
+        "input_sha256": sha256_of(both.encode()),
+        "errors_sha256": sha256_of(text.encode()),
         "input_hashes": dict(inputs),
     }
 
@@ -169,7 +205,7 @@ def _manifest(
             "sha256": sha256_of(machine.source.read_bytes()) if machine.source and machine.source.is_file() else None,
         },
         "inputs": [{"name": name, "sha256": digest} for name, digest in common["input_hashes"].items()],
-        "errors_sha256": common["input_sha256"],
+        "errors_sha256": common["errors_sha256"],
         "settings": dict(machine.controller_settings(common["controller"]).data),
         "sign_statement": own["sign_statement"],
         "parameters": own["parameters"],

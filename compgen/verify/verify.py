@@ -16,12 +16,14 @@ from compgen.core.files import read_bytes, sha256_of
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
 from compgen.errors import InputError
 from compgen.export.synthesis import Projector, wanted_correction
 from compgen.model.exact import exact_error
 from compgen.model.volumetric import tool_of, volumetric_error
 from compgen.verify.judge import judge_of
 from compgen.verify.residuals import Residuals, residuals, without_rigid_motion
+from compgen.verify.reversal import in_both_directions, left_by_reversal, mean_correction, reversal_reasons
 from compgen.verify.safety import Safety, SafetyLimits, safety_of
 
 #: Errors that stay uncorrected by less than this are not named.
@@ -43,6 +45,12 @@ class ReadTables:
     def correction(self, machine: Machine, points: Points) -> FloatArray:
         """Return what the control adds to the command at each point, shape (n, 3), mm."""
         return np.asarray(self.controller.emulate(machine, self.settings, self.tables, points))
+
+    def mean_correction(self, machine: Machine, position_mm: FloatArray) -> FloatArray:
+        """Return what the control adds at positions (n, 3), the mean of both directions of travel, shape (n, 3), mm."""
+        if not self.controller.bidirectional:
+            return self.correction(machine, Points(position_mm))
+        return mean_correction(lambda points: self.correction(machine, points), position_mm)
 
 
 def read_tables(machine: Machine, paths: Sequence[str | Path] | str | Path, controller: str) -> ReadTables:
@@ -157,6 +165,7 @@ def verify(
     errors: ErrorTable,
     points: Points | None = None,
     limits: SafetyLimits | None = None,
+    reversal: ReversalCurves | None = None,
 ) -> Verification:
     """Judge parsed tables against the errors of the machine.
 
@@ -168,21 +177,26 @@ def verify(
     points : where the residuals are reported; default the grid of the nodes of curves and tables and the middles
         between them. The judgement itself is always made on that grid and on lines along the axes.
     limits : for the steps of the tables, see :func:`compgen.verify.safety.safety_of`.
+    reversal : what each axis does differently in its two directions, beside the errors (their mean); points that do
+        not say from where they were approached are then looked at from both sides.
     """
     control = tables.controller
     judge = judge_of(machine, control, errors)
     grid_mm, solver = judge.grid.position_mm, judge.solver
     where = points or Points(grid_mm)
-    before, after = _errors_before_after(machine, tables, errors, where)
+    if reversal is not None and where.approach is None:
+        where = in_both_directions(where)
+    before, after = _errors_before_after(machine, tables, errors, where, reversal)
     nominal = where.position_mm + tool_of(machine, where.tool_mm)
     rest = wanted_correction(machine, errors, grid_mm) - judge.best_mm
     if control.anchored:
         rest = rest - rest.mean(axis=0)
-    on_grid, on_lines = (tables.correction(machine, Points(part)) for part in (grid_mm, judge.line_mm))
+    on_grid, on_lines = (tables.mean_correction(machine, part) for part in (grid_mm, judge.line_mm))
     safety = safety_of(machine, control, tables.tables, lambda part: solver.field(judge.values, part), limits)
     reasons = [
         *control.violations(machine, tables.settings, tables.tables),
         *judge.reasons(on_grid, on_lines),
+        *_reversal_reasons(machine, tables, reversal),
         *safety.reasons,
     ]
     return Verification(
@@ -192,7 +206,10 @@ def verify(
         before_rigid_removed=residuals(without_rigid_motion(nominal, before)),
         after_rigid_removed=residuals(without_rigid_motion(nominal, after)),
         unrepresentable_um=float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM,
-        uncorrected_um=_uncorrected(machine, errors, solver),
+        uncorrected_um={
+            **_uncorrected(machine, errors, solver),
+            **left_by_reversal(reversal, corrected=control.bidirectional),
+        },
         points=len(where),
         files=tables.files,
         reasons=tuple(dict.fromkeys(reasons)),
@@ -204,13 +221,27 @@ def verify(
 
 
 def _errors_before_after(
-    machine: Machine, tables: ReadTables, errors: ErrorTable, points: Points
+    machine: Machine, tables: ReadTables, errors: ErrorTable, points: Points, reversal: ReversalCurves | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Exact errors of the tip without and with the correction; it is looked up at the commanded position."""
+    """Exact errors of the tip without and with the correction; it is looked up at the commanded position.
+
+    The reversal comes on top of both, by the direction in which each point was approached.
+    """
     correction = tables.correction(machine, points)
     before = exact_error(machine, errors, points.position_mm, points.tool_mm)
     after = exact_error(machine, errors, points.position_mm + correction, points.tool_mm) + correction
+    if reversal is not None and points.approach is not None:
+        moved = reversal.displacement(points.position_mm, points.approach)
+        return before + moved, after + moved
     return before, after
+
+
+def _reversal_reasons(machine: Machine, tables: ReadTables, reversal: ReversalCurves | None) -> list[str]:
+    control = tables.controller
+    if reversal is None or not control.bidirectional:
+        return []
+    resolution_mm = control.resolution_mm(tables.settings)
+    return reversal_reasons(machine, lambda points: tables.correction(machine, points), reversal, resolution_mm)
 
 
 def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dict[str, float]:
