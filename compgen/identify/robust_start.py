@@ -194,7 +194,7 @@ def _no_place(
         return ConvergenceError(
             f"the lengths do not fit the commanded positions: the readings of {len(bad)} of {len(lengths.stations)} "
             f"stations ({names}) fit no place, the worst {lengths.stations[worst]!r} with {misfit_mm[worst]:.3g} mm; "
-            "check axis order, signs and unit of x_mm, y_mm, z_mm"
+            "check axis order, signs and unit of x_mm, y_mm, z_mm, and the station labels"
         )
     return ConvergenceError(
         f"the readings of station {lengths.stations[worst]!r} fit no place: their misfit is "
