@@ -15,9 +15,11 @@ import numpy as np
 from compgen.controllers import controller_named
 from compgen.core.csvio import FloatArray, format_csv
 from compgen.core.deviations import format_deviations
-from compgen.core.error_table import ErrorTable, format_errors
+from compgen.core.error_table import Curve, ErrorTable, format_errors
 from compgen.core.files import OutputFolder, read_bytes, sha256_of
 from compgen.core.machine import Machine
+from compgen.core.names import AXES
+from compgen.core.reversal import WORTH_MM, ReversalCurves, format_reversal
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.export import REJECTED_PREFIX, Export, Provenance, export, usable_format
 from compgen.fit import FitOptions, FitResult, fit
@@ -29,6 +31,7 @@ from compgen.identify import (
     identify_measurement,
     read_measurement,
 )
+from compgen.identify.reversal import SIGNIFICANT
 from compgen.verify import Verification, read_tables, verify
 
 Progress = Callable[[str], None]
@@ -66,7 +69,8 @@ def provenance_of(*paths: str | Path | None) -> Provenance:
 def identification_files(result: Identification, provenance: Provenance) -> dict[str, str | bytes]:
     """Return the contents of ``identified.errors.csv`` and its covariance, ``stations.csv`` and ``identify.json``.
 
-    The two-step method adds ``measured.deviations.csv``; deviations as input give no stations.
+    Where a reversal was found ``identified.reversal.csv`` stands beside them. The two-step method adds
+    ``measured.deviations.csv``; deviations as input give no stations.
     """
     stations = result.stations
     columns: dict[str, Sequence[str] | FloatArray] = {
@@ -88,11 +92,31 @@ def identification_files(result: Identification, provenance: Provenance) -> dict
         files["stations.csv"] = format_csv(columns, {"machine": result.errors.metadata.get("machine", "")})
     if result.positions is not None:
         files["measured.deviations.csv"] = format_deviations(result.positions)
+    reversal = identified_reversal(result)
+    if reversal is not None:
+        files["identified.reversal.csv"] = format_reversal(reversal)
     return {
         **_errors_files(result),
         **files,
         "identify.json": json.dumps(summary, indent=2) + "\n",
     }
+
+
+def identified_reversal(result: Identification) -> ReversalCurves | None:
+    """Return the reversals that are far beyond their uncertainty and worth a table; None if there is none.
+
+    They belong to curves that are the means of both directions, so none is returned where the readings were not
+    brought to that mean.
+    """
+    if result.reversal is None or not result.reversal.removed:
+        return None
+    curves = {}
+    for name, axis in result.reversal.axes.items():
+        for component, (value, u) in enumerate(zip(axis.vector_mm, axis.u_mm, strict=True)):
+            if abs(value) > SIGNIFICANT * u and abs(value) >= WORTH_MM:
+                key = (AXES.index(name), component)
+                curves[key] = Curve(np.zeros(1), np.array([value]), np.array([u]))
+    return ReversalCurves(curves, {"machine": result.errors.metadata.get("machine", "")}) if curves else None
 
 
 def _errors_files(result: Identification) -> dict[str, str | bytes]:
@@ -134,10 +158,13 @@ def export_and_verify(
     """
     OutputFolder(folder)
     exported = export(machine, fitted, controller, **export_options)
-    return _write_result(exported, _read_back(machine, exported, identified), folder)
+    reversal: ReversalCurves | None = export_options.get("reversal")
+    return _write_result(exported, _read_back(machine, exported, identified, reversal), folder)
 
 
-def _read_back(machine: Machine, exported: Export, identified: ErrorTable) -> Verification:
+def _read_back(
+    machine: Machine, exported: Export, identified: ErrorTable, reversal: ReversalCurves | None = None
+) -> Verification:
     """Verify what stands in the files after they were written; InputError if they cannot be read."""
     with tempfile.TemporaryDirectory(prefix="compgen-") as staging:
         written = exported.write(staging, accepted=True)
@@ -147,7 +174,7 @@ def _read_back(machine: Machine, exported: Export, identified: ErrorTable) -> Ve
             name = Path(error.file).name if error.file else None
             message = f"the rendered file cannot be read back, so its template is wrong: {error.message}"
             raise InputError(message, file=name, line=error.line) from error
-        return verify(machine, tables, identified)
+        return verify(machine, tables, identified, reversal=reversal)
 
 
 def _write_result(exported: Export, verification: Verification, folder: str | Path) -> ControllerResult:
@@ -212,6 +239,7 @@ def run(
         identification = identify_measurement(machine, measurement, identify_options)
     progress("fitting smooth curves")
     fitted = fit(machine, identification.errors, fit_options or FitOptions())
+    reversal = identified_reversal(identification)
     checked: dict[str, tuple[Export, Verification]] = {}
     for name in targets:
         progress(f"exporting, reading back and verifying: {name}")
@@ -222,8 +250,9 @@ def run(
             templates=templates,
             allow_unverified=allow_unverified,
             provenance=provenance,
+            reversal=reversal,
         )
-        checked[name] = exported, _read_back(machine, exported, identification.errors)
+        checked[name] = exported, _read_back(machine, exported, identification.errors, reversal)
     write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted)})
     results = [_write_result(*checked[name], target) for name, target in targets.items()]
     return RunResult(identification, fitted, tuple(results))

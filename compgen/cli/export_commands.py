@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from compgen.cli.common import (
+    Command,
     controller_option,
     json_option,
     machine_argument,
@@ -20,10 +21,21 @@ from compgen.core.error_table import read_errors
 from compgen.core.files import OutputFolder, write_file
 from compgen.core.machine import Machine
 from compgen.core.points import format_points, read_points
+from compgen.core.reversal import read_reversal
 from compgen.export import export
 from compgen.pipeline import provenance_of, write_all
 from compgen.report.text import verification_table
 from compgen.verify import read_tables, residuals, verify
+
+REVERSAL_HELP = (
+    "*.reversal.csv (um): what each axis does differently in its two directions; becomes tables of one direction."
+)
+
+
+def reversal_option(command: Command) -> Command:
+    """Add --reversal FILE."""
+    kind = click.Path(path_type=Path)
+    return click.option("--reversal", metavar="FILE", type=kind, help=REVERSAL_HELP)(command)
 
 
 @click.command("export")
@@ -33,6 +45,7 @@ from compgen.verify import read_tables, residuals, verify
 @out_option
 @click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
+@reversal_option
 @json_option
 def export_command(
     machine: Machine,
@@ -41,6 +54,7 @@ def export_command(
     out: Path,
     templates: Path | None,
     allow_unverified: bool,
+    reversal: Path | None,
     as_json: bool,
 ) -> int:
     """Export errors to the files of a control, with manifest.json and preflight.md.
@@ -59,7 +73,8 @@ def export_command(
         controller,
         templates=templates,
         allow_unverified=allow_unverified,
-        provenance=provenance_of(machine.source, errors),
+        provenance=provenance_of(machine.source, errors, reversal),
+        reversal=read_reversal(reversal) if reversal else None,
     )
     paths = exported.write(out)
     for text in exported.warnings:
@@ -114,6 +129,7 @@ def read_command(
 )
 @click.option("--points", type=click.Path(path_type=Path), help="*.points.csv (mm); default: a grid over the volume.")
 @out_option
+@reversal_option
 @json_option
 def verify_command(
     machine: Machine,
@@ -122,6 +138,7 @@ def verify_command(
     errors: Path,
     points: Path | None,
     out: Path,
+    reversal: Path | None,
     as_json: bool,
 ) -> int:
     """Verify controller files against the errors of the machine: the exact model before, and after the tables act.
@@ -134,7 +151,8 @@ def verify_command(
     """
     OutputFolder(out)
     where = read_points(points) if points else None
-    result = verify(machine, read_tables(machine, tables, controller), read_errors(errors), where)
+    both = read_reversal(reversal) if reversal else None
+    result = verify(machine, read_tables(machine, tables, controller), read_errors(errors), where, reversal=both)
     write_all(out, {"result.json": json.dumps(result.summary(), indent=2) + "\n"})
     if as_json:
         print_json(result.summary())
