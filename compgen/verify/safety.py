@@ -26,7 +26,7 @@ SPIKE_FLOOR_UM = 10.0
 #: Slope up to this many times the steepest one of the best table counts as explained.
 SLOPE_SHARE = 2.0
 #: A correction at the reference point beyond this is worth a warning, um: the axes move when the table is switched on.
-REFERENCE_UM = 5.0
+REFERENCE_UM = 20.0
 #: How far outside the last node the emulator is asked what it does there, mm.
 OUTSIDE_MM = 1.0
 #: Positions along the travel where a control does not say where its tables have their nodes.

@@ -1,0 +1,197 @@
+"""Double compensation: a table was active while the machine was measured, and its effect is taken out.
+
+With the correction c of the active table the machine that was commanded to p stood where the bare one stands at the
+command q = p + c(p). So readings are identified at q. Errors M that were identified without regard to the table, and
+those of the bare machine P, belong together by
+
+    e(q; P) + c(p) = e(p; M)
+
+with the exact error e; this is solved for P by least squares over the volume, repeated until nothing changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from compgen.controllers.base import Monomial, Term
+from compgen.controllers.grids import curve_nodes_mm
+from compgen.core.csvio import FloatArray
+from compgen.core.deviations import Deviations
+from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.lengths import Lengths
+from compgen.core.machine import Axis, Machine
+from compgen.core.names import MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.core.points import Points
+from compgen.errors import ConvergenceError, InputError
+from compgen.export.synthesis import Projector, projector
+from compgen.identify.travel import check_travel
+from compgen.model.exact import exact_error
+from compgen.model.observability import modelled_errors
+from compgen.model.volumetric import coefficients
+from compgen.verify.verify import ReadTables, read_tables
+
+Measurement = Lengths | Deviations
+
+#: Beyond this a correction is no compensation but a wrong table or a wrong unit, mm.
+LARGEST_CORRECTION_MM = 20.0
+#: The fixed point is reached when the errors move the tool by less than this, mm.
+CONVERGED_MM = 1e-9
+MOST_PASSES = 30
+
+
+@dataclass(frozen=True)
+class ActiveTables:
+    """Tables that were active while the machine was measured; ``controller`` is the control that they belong to."""
+
+    tables: ReadTables
+
+    @property
+    def controller(self) -> str:
+        """Name of the control."""
+        return self.tables.controller.name
+
+    def correction(self, machine: Machine, points: Points) -> FloatArray:
+        """Return what they added to the commands, shape (n, 3), mm; InputError for what cannot be a compensation."""
+        added = self.tables.correction(machine, points)
+        largest = float(np.max(np.abs(added), initial=0.0))
+        if largest > LARGEST_CORRECTION_MM:
+            raise InputError(
+                f"the active tables move an axis by {largest:g} mm, which is no compensation; is it the right control, "
+                "file and unit?"
+            )
+        return added
+
+    def summary(self, machine: Machine, points: Points) -> dict[str, object]:
+        """Return what goes into reports: control, files, and the largest correction at the measured points, um."""
+        return {
+            "controller": self.controller,
+            "files": [{"name": name, "sha256": digest} for name, digest in self.tables.files],
+            "largest_correction_um": float(np.max(np.abs(self.correction(machine, points)))) / MM_PER_UM,
+        }
+
+
+def read_active(machine: Machine, paths: Sequence[str | Path], controller: str) -> ActiveTables:
+    """Parse tables that were active while the machine was measured; InputError as :func:`read_tables` has it."""
+    return ActiveTables(read_tables(machine, paths, controller))
+
+
+def without_active(
+    machine: Machine, measurement: Measurement, active: ActiveTables
+) -> tuple[Machine, Measurement, dict[str, object]]:
+    """Return machine, measurement and report as if the bare machine had been measured; exact, nothing is fitted.
+
+    The commanded positions become p + c(p), what the axes were really told; deviations then count from there. The
+    travel of the returned machine is wider where a corrected position lies outside; its nodes and thereby the curves
+    stay.
+    """
+    _check_within(machine, measurement)
+    points = Points(measurement.position_mm, measurement.tool_mm, measurement.approach)
+    added = active.correction(machine, points)
+    shifted = measurement.position_mm + added
+    report = active.summary(machine, points)
+    if isinstance(measurement, Deviations):
+        moved = replace(measurement, position_mm=shifted, deviation_mm=measurement.deviation_mm - added)
+        return _widened(machine, shifted), moved, report
+    return _widened(machine, shifted), replace(measurement, position_mm=shifted), report
+
+
+def _check_within(machine: Machine, measurement: Lengths | Deviations) -> None:
+    """Commanded positions outside the travel are refused before the tables widen it."""
+    check_travel(machine, measurement.position_mm, measurement.origin)
+
+
+def _widened(machine: Machine, position_mm: FloatArray) -> Machine:
+    axes: list[Axis] = []
+    for k, axis in enumerate(machine.axes):
+        low, high = axis.range_mm
+        ends = (min(low, float(position_mm[:, k].min())), max(high, float(position_mm[:, k].max())))
+        axes.append(replace(axis, range_mm=ends))
+    return replace(machine, axes=(axes[0], axes[1], axes[2]))
+
+
+def bare_errors(
+    machine: Machine, errors: ErrorTable, active: ActiveTables, *, keep_nodes: bool = False
+) -> tuple[ErrorTable, float]:
+    """Return the errors of the bare machine from errors that were identified while tables were active.
+
+    Parameters
+    ----------
+    machine : the machine.
+    errors : of the machine with its active tables, mm and rad.
+    active : these tables.
+    keep_nodes : True to give the curves the nodes of the active tables as well, so that nothing of a finer table is
+        lost; the default keeps to where the machine was measured.
+
+    Returns
+    -------
+    The errors, with the uncertainties of ``errors`` (a table's numbers are exact), and the largest displacement in um
+    that no error of the model can express, such as a correction that belongs to no axis pair of the chain. The frame
+    stays: what the table moved at the reference point stands in the curves as a constant.
+    """
+    nodes = [curve_nodes_mm(machine, errors, axis) for axis in range(3)]
+    if keep_nodes:
+        control = active.tables.controller
+        own = control.table_nodes_mm(machine, active.tables.settings, active.tables.tables)
+        nodes = [
+            np.unique(np.concatenate([a, _within(machine, k, b)]))
+            for k, (a, b) in enumerate(zip(nodes, own, strict=True))
+        ]
+    solver = projector(machine, _model_terms(machine, errors, nodes), anchored=False)
+    position_mm = solver.position_mm
+    added = active.correction(machine, Points(position_mm))
+    wanted = exact_error(machine, errors, position_mm) - added
+    values = np.concatenate([term.start for term in solver.basis])
+    for _ in range(MOST_PASSES):
+        found = _table(machine, errors, solver, values)
+        rest = wanted - exact_error(machine, found, position_mm + added)
+        change = solver.project_all(-rest[None])[0]
+        values = values + change
+        if np.max(np.abs(solver.field(change))) < CONVERGED_MM:
+            return found, float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM
+    raise ConvergenceError("the effect of the active tables cannot be taken out: the iteration does not settle")
+
+
+def _within(machine: Machine, axis: int, nodes_mm: FloatArray) -> FloatArray:
+    low, high = machine.axes[axis].range_mm
+    return np.asarray(nodes_mm[(nodes_mm >= low) & (nodes_mm <= high)])
+
+
+def _model_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatArray]) -> list[Term]:
+    """One term per error of the machine's model; values are the errors, carriers minus the columns of C."""
+    carriers: dict[str, list[Monomial]] = {}
+    for part in coefficients(machine.chain, machine.squareness_reference):
+        carriers.setdefault(part.error, []).append(Monomial(part.output, -part.sign, part.lever))
+    terms = []
+    for name in dict.fromkeys([*modelled_errors(machine), *errors.names]):
+        carrier = tuple(carriers[name])
+        if name in SQUARENESS_NAMES:
+            start = np.array([errors.squareness.get(name, (0.0, 0.0))[0]])
+            terms.append(Term(name, None, np.zeros(1), carrier, start))
+            continue
+        error = error_named(name)
+        nodes = nodes_mm[error.axis]
+        start = errors.curves[name].at(nodes) if name in errors.curves else np.zeros(len(nodes))
+        at_mm = machine.axes[error.axis].range_mm if error.is_straightness else None
+        keep_mm = at_mm or (machine.reference_point_mm[error.axis],)
+        terms.append(Term(name, error.axis, nodes, carrier, start, keep_mm=keep_mm))
+    return terms
+
+
+def _table(machine: Machine, errors: ErrorTable, solver: Projector, values: FloatArray) -> ErrorTable:
+    """Return term values as errors; uncertainties and metadata are those of ``errors``."""
+    curves, squareness = {}, {}
+    for term, numbers in zip(solver.basis, solver.by_name(values).values(), strict=True):
+        if term.axis is None:
+            squareness[term.name] = (float(numbers[0]), errors.squareness.get(term.name, (0.0, np.nan))[1])
+            continue
+        old = errors.curves.get(term.name)
+        u = np.full(len(numbers), np.nan) if old is None else np.interp(term.nodes_mm, old.position_mm, old.u)
+        curves[term.name] = Curve(term.nodes_mm, numbers, u)
+    return ErrorTable(curves, squareness, errors.metadata)
+
+
+__all__ = ["ActiveTables", "bare_errors", "read_active", "without_active"]
