@@ -98,6 +98,14 @@ def _row(rows: Any, at: Any, share: Any) -> Row:
 
 
 @_inline
+def _store(flat: Any, at: Any, row: Row) -> None:
+    flat[at] = row[0]
+    flat[at + np.uint64(1)] = row[1]
+    flat[at + np.uint64(2)] = row[2]
+    flat[at + np.uint64(3)] = row[3]
+
+
+@_inline
 def _plus(a: Row, b: Row) -> Row:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
 
@@ -158,10 +166,7 @@ def field_kernel(
         flat, end = out.reshape(out.size), len(position) - 1
         for i in range(end):  # four numbers at once; the next point overwrites the fourth
             at, total = np.uint64(3 * i), at_point(axes, position, tool, i)
-            flat[at] = total[0]
-            flat[at + np.uint64(1)] = total[1]
-            flat[at + np.uint64(2)] = total[2]
-            flat[at + np.uint64(3)] = total[3]
+            _store(flat, at, total)
         if end >= 0:
             total = at_point(axes, position, tool, end)
             out[end, 0], out[end, 1], out[end, 2] = total[0], total[1], total[2]
@@ -182,33 +187,58 @@ def _row_along_z(x: Any, along_x: Any, y: Any, along_y: Any) -> Any:
     )
 
 
+@_inline
+def _four(values: Any, at: Any) -> Row:
+    return values[at], values[at + np.uint64(1)], values[at + np.uint64(2)], values[at + np.uint64(3)]
+
+
+@_inline
+def _times(a: Row, b: Row) -> Row:
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2], a[3] * b[3]
+
+
 @lru_cache(maxsize=2)
 def grid_kernel(tilted: bool) -> Callable[..., None]:
     """Kernel ``(x, y, z, along_x, along_y, along_z, out)`` of E = C P on a grid.
 
-    ``tilted``: the Z axis has errors whose lever is y, so that a row along z also depends on y by more than a line.
+    A row along z is written as 3 nz numbers, twelve (four points) at a time: constant and slope repeat every three.
+    ``tilted``: the Z axis has errors whose lever is y, so that such a row also depends on y by more than a line.
     """
 
+    @_inline
+    def four_of_row(constant: Any, slope: Any, height: Any, own: Any, y: Any, side: Any, lane: Any, at: Any) -> Row:
+        total = _plus(_four(constant, lane), _times(_four(slope, lane), _four(height, at)))
+        total = _plus(total, _four(own, at))
+        return _plus_times(total, y, _four(side, at)) if tilted else total
+
     def kernel(x: Any, y: Any, z: Any, along_x: Any, along_y: Any, along_z: Any, out: Any) -> None:
-        row, side = np.empty((len(z), 3)), np.empty((len(z), 3))
+        constant, slope, flat, start = np.empty(12), np.empty(12), out.reshape(out.size), np.uint64(0)
+        height, own, side = np.repeat(z, 3), np.empty(3 * len(z)), np.empty(3 * len(z))
+        length, three, four, eight = np.uint64(3 * len(z)), np.uint64(3), np.uint64(4), np.uint64(8)
         for k in range(len(z)):
-            side[k, 0], side[k, 1], side[k, 2] = along_z[k, 2, 0], along_z[k, 2, 1], along_z[k, 2, 2]
+            for o in range(3):
+                side[3 * k + o] = along_z[k, 2, o]
         for i in range(len(x)):
             for k in range(len(z)):
                 for o in range(3):
-                    row[k, o] = along_z[k, 0, o] + z[k] * along_z[k, 3, o] + x[i] * along_z[k, 1, o]
+                    own[3 * k + o] = along_z[k, 0, o] + z[k] * along_z[k, 3, o] + x[i] * along_z[k, 1, o]
             for j in range(len(y)):
                 p0, p1, p2, q0, q1, q2 = _row_along_z(x[i], along_x[i], y[j], along_y[j])
-                if tilted:
-                    for k in range(len(z)):
-                        out[i, j, k, 0] = p0 + z[k] * q0 + row[k, 0] + y[j] * side[k, 0]
-                        out[i, j, k, 1] = p1 + z[k] * q1 + row[k, 1] + y[j] * side[k, 1]
-                        out[i, j, k, 2] = p2 + z[k] * q2 + row[k, 2] + y[j] * side[k, 2]
-                else:
-                    for k in range(len(z)):
-                        out[i, j, k, 0] = p0 + z[k] * q0 + row[k, 0]
-                        out[i, j, k, 1] = p1 + z[k] * q1 + row[k, 1]
-                        out[i, j, k, 2] = p2 + z[k] * q2 + row[k, 2]
+                for k in range(0, 12, 3):
+                    constant[k], constant[k + 1], constant[k + 2] = p0, p1, p2
+                    slope[k], slope[k + 1], slope[k + 2] = q0, q1, q2
+                at = np.uint64(0)
+                while at + eight + four <= length:
+                    for lane in (np.uint64(0), four, eight):
+                        some = four_of_row(constant, slope, height, own, y[j], side, lane, at + lane)
+                        _store(flat, start + at + lane, some)
+                    at += eight + four
+                while at < length:
+                    for o in range(three):
+                        value = constant[o] + slope[o] * height[at + o] + own[at + o]
+                        flat[start + at + o] = value + y[j] * side[at + o] if tilted else value
+                    at += three
+                start += length
 
     levels = types.Array(types.float64, 1, "C", readonly=True)
     values = types.Array(types.float64, 3, "C", readonly=True)
