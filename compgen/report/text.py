@@ -24,7 +24,11 @@ def identification_table(result: Identification) -> Group:
     """Return the summary of an identification."""
     lengths = result.method != "deviations"
     used = f"{int(result.accepted.sum())} of {len(result.accepted)} "
-    used += f"lengths used, {len(result.stations)} stations" if lengths else "components of measured positions used"
+    used += (
+        f"lengths used, {len({item.station for item in result.stations})} stations"
+        if lengths
+        else "components of measured positions used"
+    )
     stated = f"{result.u_length_um:g} um" + (f" + {result.u_length_um_per_m:g} um/m" if lengths else "")
     lines = [
         f"{used}, rank {result.rank} of {result.unknowns} unknowns, method {result.method}",
