@@ -20,7 +20,7 @@ from compgen.identify.parameters import ErrorParameters
 from compgen.identify.result import Identification
 from compgen.identify.reversal import Reversal, Stops, approach_signs, estimate_reversal, stop_cells
 from compgen.identify.state import IntArray, State
-from compgen.identify.whiteness import Whiteness, check_whiteness, warn_of_residuals, warn_of_weakness
+from compgen.identify.whiteness import Whiteness, check_whiteness, warn_of_misfit, warn_of_weakness
 from compgen.model.volumetric import tool_of
 
 ROUNDS = 3
@@ -97,14 +97,20 @@ def _stops(machine: Machine, lengths: Lengths, difference_mm: FloatArray, adjust
 def _tested(
     machine: Machine, used: Lengths, found: Identification, conditions: Conditions, reversal: Reversal | None
 ) -> Identification:
-    """Add the tests of the residuals and what was corrected; warn where the residuals are not as they should be."""
-    whiteness = Whiteness({}, 1.0, {}, ())
-    if (adjustment := found.adjustment) is not None:
+    """Add what was corrected, and the tests of the residuals, which are made when somebody looks at them."""
+    adjustment = found.adjustment
+    if adjustment is not None:
+        if adjustment.held_weight is None:  # known stations bring their own uncertainty in
+            typical = adjustment.sigma_mm / float(np.sqrt(max(adjustment.weight.mean(), 1e-12)))
+            warn_of_weakness(found.worst_u, typical)
+        warn_of_misfit(found.reduced_chi_square, found.u_source)
+
+    def tests() -> Whiteness:
+        if adjustment is None:
+            return Whiteness({}, 1.0, {}, ())
         sigma = adjustment.sigma_mm / found.u_scale / np.sqrt(np.where(found.accepted, adjustment.weight, 1.0))
         standardised = np.where(found.accepted, found.residual_mm / sigma, np.nan)
         _, distance = _sight(machine, used, adjustment.state.stations_mm)
-        whiteness = check_whiteness(used, adjustment.group, standardised, distance, found.unknowns)
-        if adjustment.held_weight is None:  # known stations bring their own uncertainty in
-            warn_of_weakness(found.worst_u, float(np.median(sigma)) * found.u_scale)
-        warn_of_residuals(whiteness, found.reduced_chi_square, found.u_source)
-    return replace(found, whiteness=whiteness, reversal=reversal, corrections=conditions.notes)
+        return check_whiteness(used, adjustment.group, standardised, distance, found.unknowns)
+
+    return replace(found, residual_tests=tests, reversal=reversal, corrections=conditions.notes)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from compgen.identify.parameters import ErrorParameters
 from compgen.identify.reversal import Reversal
 from compgen.identify.segments import Segment
 from compgen.identify.systematic import Systematic
-from compgen.identify.whiteness import Whiteness
+from compgen.identify.whiteness import Whiteness, warn_of_residuals
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Identification:
     rejected : readings that were not used, with the reason.
     segments : beam breaks: runs of readings with a dead length of their own, or rejected together.
     reversal : mean difference between the directions of approach; None if no stop was approached from both sides.
-    whiteness : tests of the residuals; None if none was made.
+    residual_tests : makes the tests behind ``whiteness``.
     corrections : what was taken out of the readings (temperature of the scales, wavelength).
     rank, unknowns, condition, iterations : of the least-squares problem.
     worst_u : largest standard uncertainty by unit ("um", "urad") with its error.
@@ -94,12 +95,21 @@ class Identification:
     adjustment: Adjustment | None = None
     segments: tuple[Segment, ...] = ()
     reversal: Reversal | None = None
-    whiteness: Whiteness | None = None
+    residual_tests: Callable[[], Whiteness] | None = field(default=None, repr=False)
     corrections: Mapping[str, Any] = field(default_factory=dict)
     systematic: Systematic | None = None
     method: str = "joint"
     steps: Mapping[str, Any] = field(default_factory=dict)
     positions: Deviations | None = None
+
+    @cached_property
+    def whiteness(self) -> Whiteness | None:
+        """Tests of the residuals, made at the first look, with a CompgenWarning if one fires; None if there are none."""
+        if self.residual_tests is None:
+            return None
+        found = self.residual_tests()
+        warn_of_residuals(found, self.reduced_chi_square, self.u_source)
+        return found
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``identify.json``."""

@@ -223,8 +223,8 @@ def warn_of_weakness(worst: Mapping[str, tuple[float, str]], sigma_mm: float) ->
             return
 
 
-def warn_of_residuals(whiteness: Whiteness, reduced_chi_square: float, u_source: str) -> None:
-    """Warn of residuals that are too large for the model to be right, or else of those that are not white."""
+def warn_of_misfit(reduced_chi_square: float, u_source: str) -> None:
+    """Warn of residuals that are too large for the model to be right."""
     if reduced_chi_square > LARGEST_CHI_SQUARE[u_source]:
         warnings.warn(
             f"the model does not describe the readings: the residuals are {np.sqrt(reduced_chi_square):.0f} times their "
@@ -233,6 +233,10 @@ def warn_of_residuals(whiteness: Whiteness, reduced_chi_square: float, u_source:
             CompgenWarning,
             stacklevel=4,
         )
-    elif whiteness.messages:
+
+
+def warn_of_residuals(whiteness: Whiteness, reduced_chi_square: float, u_source: str) -> None:
+    """Warn of residuals that are not white, unless they are too large for the model to be right at all."""
+    if whiteness.messages and reduced_chi_square <= LARGEST_CHI_SQUARE[u_source]:
         more = f"; and {len(whiteness.messages) - 1} more in identify.json" if len(whiteness.messages) > 1 else ""
         warnings.warn(f"the residuals are not white: {whiteness.messages[0]}{more}", CompgenWarning, stacklevel=4)
