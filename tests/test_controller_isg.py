@@ -30,7 +30,8 @@ TRAVELS = ((-300.0, 500.0), (-150.0, 700.5), (-420.0, 80.0))
 
 
 def machine_with(chain="WXYFZT", reference="X", tool=(3.0, -40.0, -155.0), travels=TRAVELS, **controls):
-    """An asymmetric machine; ``controls`` are settings for both formats."""
+    """An asymmetric machine; ``controls`` are settings for both formats. All nodes of the curves are kept."""
+    controls = {"loss_um": 1e-9, **controls}
     sections = {name: tomlio.Section(controls, path=None, name=f"controllers.{name}") for name in BOTH}
     x, y, z = (Axis(travel, np.linspace(*travel, 5)) for travel in travels)
     return Machine("lopsided", Chain(chain), (x, y, z), reference, tool, (10.0, 20.0, -30.0), controllers=sections)

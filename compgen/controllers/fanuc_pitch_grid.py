@@ -7,7 +7,7 @@ from decimal import ROUND_CEILING, Decimal
 import numpy as np
 
 from compgen.controllers.fanuc_pitch_settings import PitchSettings
-from compgen.controllers.grids import NEGLIGIBLE_LOSS_MM, Grid, curve_nodes_mm, equidistant_grid
+from compgen.controllers.grids import Grid, common_step, curve_nodes_mm, equidistant_grid, nearly_best, worth_mm
 from compgen.controllers.terms import one_dimensional_terms
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
@@ -22,9 +22,9 @@ NEGLIGIBLE_COUNTS = 0.05
 def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, axis: int) -> Grid:
     """Return the section ends of an axis, the reference point among them.
 
-    The user's interval is taken as it is. Otherwise sections get shorter until linear interpolation of the wanted
-    correction loses nothing that matters and every increment, with a margin, stays within the limit (one count with a
-    staircase), as far as the point numbers of this axis and the least interval permit.
+    The user's interval is taken as it is. Otherwise the fewest sections are taken with which linear interpolation of
+    the wanted correction loses nothing that matters and every increment, with a margin, stays within the limit (one
+    count with a staircase), as far as the point numbers of this axis and the least interval permit.
     """
     most = max(3, (settings.last_number - settings.first_number + 1) // 3)
     asked_mm = settings.interval_mm[axis]
@@ -32,17 +32,35 @@ def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, ax
         return equidistant_grid(machine, errors, axis, most=most, step_mm=asked_mm, anchor=True)
     nodes_mm = curve_nodes_mm(machine, errors, axis, most)
     wanted_mm = _wanted_mm(machine, errors, axis, nodes_mm)
-    best: Grid | None = None
-    for intervals in range(min(len(nodes_mm) - 1, most - 2), most):
-        step_mm = _step_mm(machine, settings, axis, intervals)
-        grid = equidistant_grid(machine, errors, axis, most=most, step_mm=step_mm, anchor=True)
-        if best is not None and (grid.count > most or grid.step == best.step):
-            continue
-        best = grid
-        if _is_enough(settings, grid.nodes_mm, nodes_mm, wanted_mm):
-            break
-    assert best is not None  # the range above is never empty
-    return best
+    loss_mm = max(worth_mm(errors, axis, settings.loss_mm), NEGLIGIBLE_COUNTS * settings.count_mm)
+    flat: list[tuple[float, Grid]] = []
+    grids = _grids(machine, settings, errors, axis, most)
+    for grid in grids:
+        at_ends_mm = _extended(grid.nodes_mm, nodes_mm, wanted_mm)
+        if _is_flat(settings, at_ends_mm):
+            lost_mm = float(np.max(np.abs(np.interp(nodes_mm, grid.nodes_mm, at_ends_mm) - wanted_mm)))
+            flat.append((lost_mm, grid))
+            if lost_mm <= loss_mm:
+                return grid
+    return nearly_best(flat) or grids[-1]
+
+
+def _grids(machine: Machine, settings: PitchSettings, errors: ErrorTable, axis: int, most: int) -> list[Grid]:
+    """Possible section ends by their number; the widest sections alone if none keeps within ``most``."""
+    common = common_step(machine, errors, axis, anchor=True)
+    steps = {_step_mm(machine, settings, axis, intervals) for intervals in range(1, most)}
+    parts = [common / part for part in range(1, 11)]
+    steps |= {
+        float(step) for step in parts if step >= settings.least_interval_mm and step % settings.interval_quantum_mm == 0
+    }
+    count_most = machine.axes[axis].length_mm / most
+    grids = [
+        equidistant_grid(machine, errors, axis, most=most, step_mm=step, anchor=True)
+        for step in steps
+        if step > count_most
+    ]
+    grids = sorted(grids, key=lambda grid: (grid.count, grid.step))
+    return [grid for grid in grids if grid.count <= most] or grids[:1]
 
 
 def _wanted_mm(machine: Machine, errors: ErrorTable, axis: int, nodes_mm: FloatArray) -> FloatArray:
@@ -59,13 +77,9 @@ def _step_mm(machine: Machine, settings: PitchSettings, axis: int, intervals: in
     return float(max(Decimal(1), steps.to_integral_value(rounding=ROUND_CEILING)) * quantum)
 
 
-def _is_enough(settings: PitchSettings, ends_mm: FloatArray, nodes_mm: FloatArray, wanted_mm: FloatArray) -> bool:
-    """Whether sections with these ends hold the wanted correction (n,) at nodes (n,)."""
-    at_ends_mm = _extended(ends_mm, nodes_mm, wanted_mm)
-    loss_mm = float(np.max(np.abs(np.interp(nodes_mm, ends_mm, at_ends_mm) - wanted_mm)))
+def _is_flat(settings: PitchSettings, at_ends_mm: FloatArray) -> bool:
+    """Whether the increments of a correction at the section ends (n,), with a margin, stay within the limit."""
     largest = float(np.max(np.abs(np.diff(at_ends_mm)))) / settings.count_mm
-    if loss_mm > max(NEGLIGIBLE_LOSS_MM, NEGLIGIBLE_COUNTS * settings.count_mm):
-        return False
     if settings.interpolation == "staircase":
         return largest <= 1.0
     return STEEPER * largest + 1.0 <= settings.increment_limit

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any, Literal
 
+from compgen.controllers.grids import take_loss_mm
 from compgen.core import tomlio
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
@@ -27,6 +28,7 @@ class PitchSettings:
     interpolation : what the control does inside a section; ``staircase`` puts the whole value out at its beginning.
     interval_mm : section length per axis, None: chosen.
     max_feed_mm_min : fastest feed; the section must be at least feed / 7500 long. None: not checked.
+    loss_mm : loss by interpolation between section ends that is worth no shorter sections.
     increment_limit : largest magnitude of the change over a section, in counts.
     first_number, last_number : compensation point numbers that may be used. Number 0 is left out by default: axes
         without a table have 3620 ... 3622 = 0 and would take part in its value.
@@ -42,6 +44,7 @@ class PitchSettings:
     interpolation: Literal["linear", "staircase"]
     interval_mm: tuple[float | None, float | None, float | None]
     max_feed_mm_min: float | None
+    loss_mm: float
     increment_limit: int
     first_number: int
     last_number: int
@@ -92,6 +95,7 @@ def read_pitch_settings(machine: Machine) -> PitchSettings:
         interval_mm=_per_axis(section.section("interval_mm", required=False), tomlio.positive, (None, None, None)),
         max_feed_mm_min=section.take("max_feed_mm_min", tomlio.positive, None),
         increment_limit=section.take("increment_limit", tomlio.whole(1, 127), 7),
+        loss_mm=take_loss_mm(section),
         first_number=section.take("first_number", tomlio.whole(0, 9999), 1),
         last_number=section.take("last_number", tomlio.whole(0, 9999), 1023),
         q_word=section.take("q_word", tomlio.flag, False),

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
-from compgen.controllers.grids import curve_nodes_mm
+from compgen.controllers.grids import uneven_nodes_mm
 from compgen.controllers.isg_list import ListFile, base_name, chain_of, is_list_file, parse_list
 from compgen.controllers.isg_notes import notes
 from compgen.controllers.isg_parameters import (
@@ -103,8 +103,9 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         return read_isg_settings(machine, self.name, self.tool_position)
 
     def basis(self, machine: Machine, settings: IsgSettings, errors: ErrorTable) -> list[Term]:
-        """Return one term per error; the control evaluates E = C P itself."""
-        return error_terms(machine, errors, [curve_nodes_mm(machine, errors, axis) for axis in range(3)])
+        """Return one term per error, with nodes where the curves need them; the control evaluates E = C P itself."""
+        nodes = [uneven_nodes_mm(machine, errors, axis, loss_mm=settings.loss_mm) for axis in range(3)]
+        return error_terms(machine, errors, nodes)
 
     def build(
         self, machine: Machine, settings: IsgSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]

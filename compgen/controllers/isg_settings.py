@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 
+from compgen.controllers.grids import take_loss_mm
 from compgen.controllers.isg_list import Direction, ListFile, axis_letters, chain_text
 from compgen.controllers.isg_parameters import MOST_LINES, Field
 from compgen.core import tomlio
@@ -28,6 +29,7 @@ class IsgSettings:
     use_axis_offsets, max_records, path : as the control has them; ``path`` is the folder on the control.
     write_tool_position : whether the CSV file gives the tool offset as P0X, P0Y, P0Z.
     lever_mm : longest lever arm of an angle on this machine.
+    loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
     """
 
     logical_axes: tuple[int, int, int]
@@ -39,6 +41,7 @@ class IsgSettings:
     path: str
     write_tool_position: bool
     lever_mm: float
+    loss_mm: float
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,7 @@ def read_isg_settings(machine: Machine, name: str, tool_position: bool) -> IsgSe
         path=section.take("path", _folder, ""),
         write_tool_position=tool_position and section.take("write_tool_position", tomlio.flag, False),
         lever_mm=float(np.max(np.maximum(np.abs(machine.lower_mm), np.abs(machine.upper_mm)) + tool)),
+        loss_mm=take_loss_mm(section),
     )
     section.finish()
     return settings

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
-from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.grids import equidistant_grid, take_loss_mm
 from compgen.controllers.siemens_limits import cec_usage, largest_sums, set_violations
 from compgen.controllers.siemens_preflight import cec_parameters, cec_sign_statement, cec_warnings
 from compgen.controllers.siemens_products import (
@@ -81,6 +81,7 @@ class CecSettings:
     axis_names : names of X, Y, Z on the control.
     axis_style : ``"paren"`` writes (AX1), ``"quote"`` writes "AX1".
     step_mm : node distances that the user asks for, or None.
+    loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
     max_points : nodes that the control can hold per table.
     tables_available : tables that the control has, or None if that is not stated.
     max_sum_mm : MD32720 of X, Y, Z in mm, or None if that is not stated.
@@ -92,6 +93,7 @@ class CecSettings:
     axis_names: tuple[str, str, str]
     axis_style: str
     step_mm: tuple[float | None, ...]
+    loss_mm: float
     max_points: int
     tables_available: int | None
     max_sum_mm: tuple[float, float, float] | None
@@ -128,6 +130,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
             axis_names=take_axis_names(section),
             axis_style=section.take("axis_style", tomlio.choice("paren", "quote"), "paren"),
             step_mm=take_steps(section, machine, max_points),
+            loss_mm=take_loss_mm(section),
             max_points=max_points,
             tables_available=section.take("tables_available", tomlio.whole(1, 1000), None),
             max_sum_mm=section.take("max_sum_mm", _max_sum, None),
@@ -138,7 +141,14 @@ class SiemensCec(Controller[CecSettings, CecTables]):
     def basis(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> list[Term]:
         """Return nine tables output over axis, and the products with levers that count from the reference point."""
         nodes = [
-            equidistant_grid(machine, errors, axis, most=settings.max_points, step_mm=settings.step_mm[axis]).nodes_mm
+            equidistant_grid(
+                machine,
+                errors,
+                axis,
+                most=settings.max_points,
+                step_mm=settings.step_mm[axis],
+                loss_mm=settings.loss_mm,
+            ).nodes_mm
             for axis in range(3)
         ]
         pairs = [(output, axis) for output in range(3) for axis in range(3)]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
-from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.grids import equidistant_grid, take_loss_mm
 from compgen.controllers.siemens_reversal import plain_backlash_rows
 from compgen.controllers.siemens_settings import take_axis_names, take_steps
 from compgen.controllers.siemens_syntax import (
@@ -56,6 +56,7 @@ class EecSettings:
     encoder : 0 for measuring system 1, 1 for measuring system 2.
     axis_names : names of X, Y, Z on the control.
     step_mm : node distances that the user asks for, or None.
+    loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
     max_points : nodes that the control can hold per axis and measuring system.
     decimals : digits after the point of the values in mm.
     """
@@ -63,6 +64,7 @@ class EecSettings:
     encoder: int
     axis_names: tuple[str, str, str]
     step_mm: tuple[float | None, ...]
+    loss_mm: float
     max_points: int
     decimals: int
 
@@ -88,6 +90,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
             encoder=section.take("encoder", tomlio.whole(0, 1), 0),
             axis_names=take_axis_names(section),
             step_mm=take_steps(section, machine, max_points),
+            loss_mm=take_loss_mm(section),
             max_points=max_points,
             decimals=section.take("decimals", tomlio.whole(3, 9), 6),
         )
@@ -98,7 +101,14 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node."""
         nodes = [
             equidistant_grid(
-                machine, errors, axis, most=settings.max_points, step_mm=settings.step_mm[axis], anchor=True
+                machine,
+                errors,
+                axis,
+                most=settings.max_points,
+                step_mm=settings.step_mm[axis],
+                anchor=True,
+                loss_mm=settings.loss_mm,
+                output=axis,
             ).nodes_mm
             for axis in range(3)
         ]

@@ -12,12 +12,12 @@ import numpy as np
 
 from compgen.core import tomlio
 from compgen.core.csvio import FloatArray
+from compgen.core.emphasis import Emphasis, Vector3, take_emphasis
 from compgen.core.names import AXES, ERROR_NAMES
 from compgen.core.text import nearest
 from compgen.errors import InputError
 from compgen.resources import data_folder
 
-Vector3 = tuple[float, float, float]
 Reference = Literal["X", "Y"]
 CurveBasis = Literal["linear", "cubic"]
 ErrorSelection = Literal["observable", 17, 21] | tuple[str, ...]
@@ -74,7 +74,8 @@ class Machine:
     """A three-axis machine; ``axes`` holds X, Y, Z in that order, ``errors`` what its model contains.
 
     ``errors`` is ``"observable"``, 17, 21 or a tuple of names (resolved by :func:`compgen.model.modelled_errors`).
-    ``controllers`` keeps the raw settings of each control; the control itself checks them.
+    ``controllers`` keeps the raw settings of each control; the control itself checks them. ``emphasis`` says where
+    tables have to be best that cannot be good everywhere.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Machine:
     curves: CurveBasis = "linear"
     controllers: Mapping[str, tomlio.Section] = field(default_factory=dict)
     source: Path | None = None
+    emphasis: Emphasis = Emphasis()
 
     @property
     def lower_mm(self) -> FloatArray:
@@ -129,6 +131,7 @@ def read_machine(path: str | Path) -> Machine:
                 f"{axis_name} = {reference_mm:g} mm lies outside the travel {low:g} ... {high:g} mm; the "
                 f"position-dependent errors are zero there, so it must lie within the travel; set reference_point_mm",
             )
+    emphasis = take_emphasis(root, [axis.range_mm for axis in axes])
     root.finish()
     return Machine(
         name=name,
@@ -141,6 +144,7 @@ def read_machine(path: str | Path) -> Machine:
         curves=cast(CurveBasis, curves),
         controllers=controllers,
         source=Path(path),
+        emphasis=emphasis,
     )
 
 

@@ -15,6 +15,7 @@ from scipy.sparse import block_diag, coo_array, csr_array, hstack
 
 from compgen.controllers.base import Term
 from compgen.core.csvio import FloatArray
+from compgen.core.emphasis import Vector3
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.errors import ConvergenceError
@@ -49,14 +50,17 @@ def wanted_correction(
 class Projector:
     """Least squares of a basis over sample points, with the normal matrix factorised once.
 
-    ``transform`` (parameters, free) builds in the zeros at the reference point; ``offsets`` is 3 when a constant per
-    axis is fitted beside the tables because the control cannot express it. ``design`` (3 n, free + offsets) is sparse.
+    ``position_mm`` (n, 3) with ``weight`` (n,) and ``sample_tool_mm`` (3,) or (n, 3) are the sample; elsewhere the tool
+    is ``tool_mm``. ``transform`` (parameters, free) builds in the zeros at the reference point; ``offsets`` is 3 when a
+    constant per axis is fitted beside the tables because the control cannot express it. ``design`` (3 n, free +
+    offsets) is sparse.
     """
 
     basis: tuple[Term, ...]
     position_mm: FloatArray
     weight: FloatArray
     tool_mm: FloatArray
+    sample_tool_mm: FloatArray
     transform: csr_array
     offsets: int
     design: csr_array
@@ -78,8 +82,9 @@ class Projector:
 
     def field(self, values: FloatArray, position_mm: FloatArray | None = None) -> FloatArray:
         """Return the correction field of table values at the sample points or at others, shape (n, 3), mm."""
-        points = self.position_mm if position_mm is None else position_mm
-        return basis_field(self.basis, values, points, self.tool_mm)
+        if position_mm is None:
+            return basis_field(self.basis, values, self.position_mm, self.sample_tool_mm)
+        return basis_field(self.basis, values, position_mm, self.tool_mm)
 
     def by_name(self, values: FloatArray) -> dict[str, FloatArray]:
         """Split a vector of all table values by term."""
@@ -119,22 +124,28 @@ def _design(basis: Sequence[Term], position_mm: FloatArray, tool_mm: FloatArray)
     return coo_array((np.concatenate(entries), where), shape=(3 * len(points), first)).tocsr()
 
 
-def projector(machine: Machine, basis: Sequence[Term], *, anchored: bool) -> Projector:
+def projector(
+    machine: Machine, basis: Sequence[Term], *, anchored: bool, tools_mm: Sequence[Vector3] = ()
+) -> Projector:
     """Factorise the least-squares problem of a basis over the machine's volume.
 
     Parameters
     ----------
-    machine : its travel is sampled at the tables' nodes and between them, with its own tool offset.
+    machine : its travel is sampled at the tables' nodes and between them, its work zone by its weight.
     basis : the control's terms.
     anchored : True if a constant offset per axis is no part of what the control can do.
+    tools_mm : every point is sampled with each of these tool offsets; by default with the machine's own.
     """
     nodes = tuple(
         np.unique(np.concatenate([[low, high], *(term.nodes_mm for term in basis if term.axis == axis)]))
         for axis, (low, high) in enumerate(item.range_mm for item in machine.axes)
     )
-    sample = volume_sample(machine, nodes)
-    position_mm, weight = sample.position_mm, sample.weight
-    tool_mm = tool_of(machine, None)
+    sample = volume_sample(machine, nodes, cuts_mm=[machine.emphasis.ends_mm(axis) for axis in range(3)])
+    position_mm, weight = sample.position_mm, sample.weight * machine.emphasis.weight(sample.position_mm)
+    tool_mm = own_tool_mm = tool_of(machine, None)
+    if tools_mm:
+        tool_mm = np.repeat(np.array(tools_mm, dtype=np.float64), len(position_mm), axis=0)
+        position_mm, weight = np.tile(position_mm, (len(tools_mm), 1)), np.tile(weight, len(tools_mm))
     transform = _transform(machine, basis)
     offsets = 3 if anchored else 0
     size = transform.shape[1] + offsets
@@ -151,7 +162,8 @@ def projector(machine: Machine, basis: Sequence[Term], *, anchored: bool) -> Pro
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
     regular[: transform.shape[1], : transform.shape[1]] += KEEP * rows.T @ rows
     factor = cho_factor(normal * scale[:, None] * scale + regular, lower=True)
-    return Projector(tuple(basis), position_mm, weight, tool_mm, transform, offsets, design, factor, scale)
+    sampled = (position_mm, weight, own_tool_mm, tool_mm)
+    return Projector(tuple(basis), *sampled, transform, offsets, design, factor, scale)
 
 
 def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
@@ -197,8 +209,18 @@ def _keep_rows(basis: Sequence[Term]) -> FloatArray:
 
 
 def synthesize(machine: Machine, errors: ErrorTable, basis: Sequence[Term], *, anchored: bool) -> dict[str, FloatArray]:
-    """Return the table values by term that come closest to the wanted correction over the volume."""
+    """Return the table values by term that come closest to the wanted correction over the volume.
+
+    The machine's work zone and tools (``machine.emphasis``) say what counts more.
+    """
     solver = projector(machine, basis, anchored=anchored)
-    wanted = wanted_correction(machine, errors, solver.position_mm)
-    start = np.concatenate([term.start for term in basis])
-    return solver.by_name(solver.project(wanted, start))
+    return solver.by_name(best_values(machine, errors, solver))
+
+
+def best_values(machine: Machine, errors: ErrorTable, solver: Projector) -> FloatArray:
+    """Return all values (parameters,) of the best tables, over the tools of ``machine.emphasis`` if it has some."""
+    if machine.emphasis.tools_mm:
+        solver = projector(machine, solver.basis, anchored=bool(solver.offsets), tools_mm=machine.emphasis.tools_mm)
+    wanted = wanted_correction(machine, errors, solver.position_mm, solver.sample_tool_mm)
+    start = np.concatenate([term.start for term in solver.basis])
+    return solver.project(wanted, start)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,13 +64,22 @@ def volume_grid(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int = 
     return VolumeGrid((levels[0], levels[1], levels[2]))
 
 
-def volume_sample(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int = MOST_POINTS) -> VolumeSample:
+def volume_sample(
+    machine: Machine,
+    nodes_mm: tuple[FloatArray, ...],
+    most: int = MOST_POINTS,
+    cuts_mm: Sequence[Sequence[float]] = ((), (), ()),
+) -> VolumeSample:
     """Return points that determine tables with the given nodes over the volume: the full grid where it is not too large.
 
     Otherwise three grids, one for each axis: its own levels by Gauss-Legendre points of the other two. On each of them
     a function of one axis is orthogonal to functions of the others, as it is over the volume; a random sample is not,
     and would turn what the tables cannot hold into ragged values.
+
+    ``cuts_mm`` are positions of each axis where weights that are put on later jump; they are levels, and the
+    Gauss-Legendre points fill each part between them.
     """
+    nodes_mm = tuple(np.append(nodes, cuts) for nodes, cuts in zip(nodes_mm, cuts_mm, strict=True))
     levels = [
         levels_between(np.asarray(nodes), *axis.range_mm) for nodes, axis in zip(nodes_mm, machine.axes, strict=True)
     ]
@@ -79,7 +89,7 @@ def volume_sample(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int 
     positions, weights = [], []
     for axis in range(3):
         count = int(np.clip(np.sqrt(most / len(levels[axis])), LEAST_ACROSS, MOST_ACROSS))
-        sides = [_gauss_legendre(machine.axes[k].range_mm, count) for k in range(3)]
+        sides = [_gauss_legendre(machine.axes[k].range_mm, cuts_mm[k], count) for k in range(3)]
         sides[axis] = (levels[axis], np.full(len(levels[axis]), 1.0 / len(levels[axis])))
         grid = VolumeGrid((sides[0][0], sides[1][0], sides[2][0]))
         positions.append(grid.position_mm)
@@ -88,8 +98,11 @@ def volume_sample(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int 
     return VolumeSample(np.concatenate(positions), joined * (len(joined) / joined.sum()))
 
 
-def _gauss_legendre(range_mm: tuple[float, float], count: int) -> tuple[FloatArray, FloatArray]:
-    """Points within a range and their weights, which sum to 1."""
-    points, weights = np.polynomial.legendre.leggauss(count)
-    low, high = range_mm
-    return 0.5 * (low + high) + 0.5 * (high - low) * points, 0.5 * weights
+def _gauss_legendre(
+    range_mm: tuple[float, float], cuts_mm: Sequence[float], count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Points within the parts of a range, about ``count`` in all, and their weights, which sum to 1."""
+    ends = np.unique(np.clip([*range_mm, *cuts_mm], *range_mm))
+    points, weights = np.polynomial.legendre.leggauss(max(LEAST_ACROSS, count // (len(ends) - 1)))
+    middle, half = 0.5 * (ends[1:] + ends[:-1])[:, None], 0.5 * np.diff(ends)[:, None]
+    return (middle + half * points).ravel(), (half * weights).ravel() / (ends[-1] - ends[0])

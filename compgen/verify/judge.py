@@ -15,7 +15,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
-from compgen.export.synthesis import Projector, projector, wanted_correction
+from compgen.export.synthesis import Projector, best_values, projector
 from compgen.model.exact import exact_error
 from compgen.model.grid import VolumeGrid, volume_grid
 from compgen.model.volumetric import tool_of
@@ -102,8 +102,7 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable) -> Ju
     """Prepare the judgement for the tables of one control on a machine with these errors."""
     settings = control.read_settings(machine)
     solver = projector(machine, control.basis(machine, settings, errors), anchored=control.anchored)
-    start = np.concatenate([term.start for term in solver.basis])
-    values = solver.project(wanted_correction(machine, errors, solver.position_mm), start)
+    values = best_values(machine, errors, solver)
     nodes = _nodes(machine, errors, solver)
     grid = volume_grid(machine, nodes)
     line_mm = scan_lines(machine, nodes)
