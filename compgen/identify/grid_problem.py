@@ -13,7 +13,8 @@ the data become arrays over (station, x, y, z) in which a missing reading has we
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -158,6 +159,8 @@ class GridProblem:
     cell : for each reading (tool, index into the flattened (groups, n_out, n_mid * n_in)).
     reading_mm, reading_weight : the readings before merging.
     scatter : weighted square sum of the readings about their means, half of it is part of the cost.
+    single : whether no cell holds more than one reading.
+    memo : geometry at the state that was looked at last; it does not depend on the weights.
     """
 
     parameters: ErrorParameters
@@ -172,6 +175,8 @@ class GridProblem:
     reading_mm: FloatArray
     reading_weight: FloatArray
     scatter: float
+    single: bool
+    memo: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def stations(self) -> int:
@@ -191,6 +196,11 @@ class GridProblem:
     def weighted(self, weight: FloatArray) -> GridProblem:
         """Return the same problem with other weights of the readings."""
         shape = self.tools[0].weight.shape
+        if self.single and len(self.tools) == 1:
+            cells = np.zeros(self.tools[0].weight.size)
+            cells[self.cell[1]] = weight
+            tools: tuple[ToolData, ...] = (replace(self.tools[0], weight=cells.reshape(shape)),)
+            return replace(self, tools=tools, reading_weight=weight)
         tools, scatter = _merge(self.tools, shape, self.cell, self.reading_mm, weight)
         return replace(self, tools=tools, reading_weight=weight, scatter=scatter)
 
@@ -198,9 +208,8 @@ class GridProblem:
         """Half the weighted sum of squares with the exact model, and its exact gradient (size,)."""
         cost = 0.5 * self.scatter
         gradient = np.zeros(self.size)
-        bodies = _bodies(self, state)
-        for data in self.tools:
-            tips = _tips(bodies, data.tool_mm)
+        bodies, places = self._geometry(state)
+        for data, tips in zip(self.tools, places, strict=True):
             cost += self._backward(state, data, bodies, tips, gradient)
         return cost, gradient
 
@@ -254,13 +263,19 @@ class GridProblem:
             force += sight.sum(axis=0)
         return cost
 
+    def _geometry(self, state: State) -> tuple[list[_Body], list[list[FloatArray]]]:
+        """Bodies of the chain, and by tool the points after each body; kept for the next question about ``state``."""
+        if self.memo.get("state") is not state:
+            bodies = _bodies(self, state)
+            self.memo.update(state=state, geometry=(bodies, [_tips(bodies, data.tool_mm) for data in self.tools]))
+        bodies, places = self.memo["geometry"]
+        return bodies, places
+
     def predicted(self, state: State) -> list[FloatArray]:
         """Model readings by tool, each (groups, n_out, n_mid * n_in), mm."""
-        bodies = _bodies(self, state)
         found = []
-        for data in self.tools:
-            tip = _tips(bodies, data.tool_mm)[-1]
-            sight = tip[None] - state.stations_mm[self.station_of][:, None, :, None]
+        for tips in self._geometry(state)[1]:
+            sight = tips[-1][None] - state.stations_mm[self.station_of][:, None, :, None]
             found.append(_lengths(sight) - state.dead_length_mm[:, None, None])
         return found
 
@@ -270,8 +285,8 @@ class GridProblem:
 
     def distances(self, state: State) -> FloatArray:
         """Distance from the station of every reading, shape (n,), mm."""
-        still = State(state.errors, state.stations_mm, np.zeros(self.groups))
-        return self._at_readings(self.predicted(still))
+        parts = [part + state.dead_length_mm[:, None, None] for part in self.predicted(state)]
+        return self._at_readings(parts)
 
     def _at_readings(self, parts: Sequence[FloatArray]) -> FloatArray:
         tool, cell = self.cell
@@ -282,9 +297,8 @@ class GridProblem:
     def normal_matrix(self, state: State) -> FloatArray:
         """J^T W J (size, size) with C in place of the exact derivative."""
         matrix = np.zeros((self.size, self.size))
-        bodies = _bodies(self, state)
-        for data in self.tools:
-            _add_normal(self, data, _tips(bodies, data.tool_mm)[-1], state, matrix)
+        for data, tips in zip(self.tools, self._geometry(state)[1], strict=True):
+            _add_normal(self, data, tips[-1], state, matrix)
         first, second = self.parameters.size, self.parameters.size + 3 * self.stations
         matrix[first:, :first] = matrix[:first, first:].T
         matrix[second:, first:second] = matrix[first:second, second:].T
@@ -696,6 +710,7 @@ def grid_problem(
     cell = (tool.astype(np.int64), index.astype(np.int64))
     weight = np.ones(count)
     merged, scatter = _merge(empty, shape, cell, reading_mm, weight)
+    single = len(tools) == 1 and int(np.bincount(cell[1]).max()) == 1
     return GridProblem(
         parameters=parameters,
         order=order,  # type: ignore[arg-type]
@@ -709,4 +724,5 @@ def grid_problem(
         reading_mm=reading_mm,
         reading_weight=weight,
         scatter=scatter,
+        single=single,
     )
