@@ -55,6 +55,32 @@ class Emphasis:
                 inside &= (position_mm[:, axis] >= part[0] - 1e-9) & (position_mm[:, axis] <= part[1] + 1e-9)
         return np.where(inside, self.zone_weight, 1.0)
 
+    def summary(self) -> dict[str, Any]:
+        """Return what stands in ``manifest.json``."""
+        zone = {letter: list(part) for letter, part in zip(AXES, self.zone_mm, strict=True) if part is not None}
+        return {
+            "work_zone_mm": zone if self.has_zone else None,
+            "zone_weight": self.zone_weight if self.has_zone else None,
+            "tools_mm": [list(tool) for tool in self.tools_mm],
+        }
+
+    @property
+    def notes(self) -> list[str]:
+        """What the user of the tables should know."""
+        notes = []
+        if self.has_zone:
+            parts = [
+                f"{letter} {part[0]:g} ... {part[1]:g} mm"
+                for letter, part in zip(AXES, self.zone_mm, strict=True)
+                if part
+            ]
+            weight = f"{self.zone_weight:g} times as much as the rest"
+            notes.append(f"The tables are made for the work zone {', '.join(parts)}, which counts {weight}.")
+        if self.tools_mm:
+            tools = "; ".join(", ".join(f"{value:g}" for value in tool) for tool in self.tools_mm)
+            notes.append(f"The tables are made for the tool offsets (x, y, z in mm) {tools}, which count alike.")
+        return notes
+
 
 def take_emphasis(root: tomlio.Section, travel_mm: Sequence[Interval]) -> Emphasis:
     """Take ``work_zone_mm``, ``zone_weight`` and ``tools_mm`` from a machine file."""

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from compgen.controllers import AnyController, controller_named
+from compgen.controllers import AnyController, SourceFile, controller_named
 from compgen.core.error_table import ErrorTable, format_errors
 from compgen.core.files import OutputFolder, sha256_of
 from compgen.core.machine import Machine
@@ -133,13 +133,33 @@ def export(
     if reversal is not None and control.bidirectional:
         tables = control.with_reversal(machine, settings, tables, reversal)
     own = _with_backlash(control, machine, settings, control.context(machine, settings, tables), reversal)
-    common = _common_context(machine, errors, controller, provenance or Provenance(), reversal)
+    own = {**own, "warnings": [*own["warnings"], *machine.emphasis.notes]}
+    common = export_context(machine, errors, controller, provenance or Provenance(), reversal)
     files = render_files(card, {**common, **own}, templates)
     described = [{"name": name, "sha256": sha256_of(text.encode("ascii", "replace"))} for name, text in files.items()]
     violations = control.violations(machine, settings, tables)
     preflight = render(card, "preflight.md.j2", {**common, **own, "files": described}, templates)
     manifest = _manifest(common, card, own, described, machine)
     return Export(controller, files, {**manifest, "violations": violations}, preflight, violations, own["warnings"])
+
+
+def rerender(
+    machine: Machine,
+    controller: str,
+    files: Mapping[str, str],
+    common: Mapping[str, Any],
+    *,
+    templates: Path | None = None,
+) -> dict[str, str]:
+    """Parse the texts of controller files by name, and render what was read: the same texts, byte for byte.
+
+    ``common`` is what the headers say and no table does, e.g. from :func:`export_context`.
+    """
+    control = controller_named(controller)
+    settings = control.read_settings(machine)
+    tables = control.parse(machine, settings, [SourceFile(Path(name), text) for name, text in files.items()])
+    context = {**common, **control.context(machine, settings, tables)}
+    return render_files(load_format(controller, templates), context, templates)
 
 
 def _with_backlash(
@@ -162,13 +182,14 @@ def _with_backlash(
     return {**own, "parameters": [*own["parameters"], *parameters], "warnings": [*own["warnings"], *warnings]}
 
 
-def _common_context(
+def export_context(
     machine: Machine,
     errors: ErrorTable,
     controller: str,
     provenance: Provenance,
     reversal: ReversalCurves | None = None,
 ) -> dict[str, Any]:
+    """Return what every file and list says beside the tables: machine, version, inputs and their hashes."""
     text = format_errors(errors)
     inputs = list(provenance.inputs) or [("errors", sha256_of(text.encode()))]
     both = text if reversal is None else text + format_reversal(reversal)
@@ -201,6 +222,7 @@ def _manifest(
             "squareness_reference": machine.squareness_reference,
             "tool_offset_mm": list(machine.tool_offset_mm),
             "reference_point_mm": list(machine.reference_point_mm),
+            **machine.emphasis.summary(),
             "file": str(machine.source) if machine.source else None,
             "sha256": sha256_of(machine.source.read_bytes()) if machine.source and machine.source.is_file() else None,
         },
