@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -31,10 +31,21 @@ from compgen.identify import (
     identify_measurement,
     read_measurement,
 )
+from compgen.identify.measurement import Measurement
 from compgen.identify.reversal import SIGNIFICANT
 from compgen.verify import Verification, read_tables, verify
+from compgen.verify.active import ActiveTables, without_active
+from compgen.verify.check_program import check_files
+from compgen.verify.safety import SafetyLimits
 
 Progress = Callable[[str], None]
+
+
+class Checks(TypedDict, total=False):
+    """What :func:`run` may be told about safety, see there."""
+
+    active: ActiveTables | None
+    limits: SafetyLimits | None
 
 
 @dataclass(frozen=True)
@@ -149,6 +160,8 @@ def export_and_verify(
     identified: ErrorTable,
     controller: str,
     folder: str | Path,
+    *,
+    limits: SafetyLimits | None = None,
     **export_options: Any,
 ) -> ControllerResult:
     """Export, write to a temporary folder, read the bytes back from there, verify, and only then write to ``folder``.
@@ -159,11 +172,17 @@ def export_and_verify(
     OutputFolder(folder)
     exported = export(machine, fitted, controller, **export_options)
     reversal: ReversalCurves | None = export_options.get("reversal")
-    return _write_result(exported, _read_back(machine, exported, identified, reversal), folder)
+    verification = _read_back(machine, exported, identified, reversal, limits)
+    beside = check_files(machine, exported, identified, export_options.get("templates"))
+    return _write_result(exported, verification, beside, folder)
 
 
 def _read_back(
-    machine: Machine, exported: Export, identified: ErrorTable, reversal: ReversalCurves | None = None
+    machine: Machine,
+    exported: Export,
+    identified: ErrorTable,
+    reversal: ReversalCurves | None = None,
+    limits: SafetyLimits | None = None,
 ) -> Verification:
     """Verify what stands in the files after they were written; InputError if they cannot be read."""
     with tempfile.TemporaryDirectory(prefix="compgen-") as staging:
@@ -174,13 +193,32 @@ def _read_back(
             name = Path(error.file).name if error.file else None
             message = f"the rendered file cannot be read back, so its template is wrong: {error.message}"
             raise InputError(message, file=name, line=error.line) from error
-        return verify(machine, tables, identified, reversal=reversal)
+        return verify(machine, tables, identified, reversal=reversal, limits=limits)
 
 
-def _write_result(exported: Export, verification: Verification, folder: str | Path) -> ControllerResult:
+def identify_bare(
+    machine: Machine,
+    measurement: Measurement,
+    options: IdentifyOptions | None = None,
+    active: ActiveTables | None = None,
+) -> Identification:
+    """Identify the machine without the tables that were active while it was measured, if there were any.
+
+    What was taken out stands in ``corrections["active_tables"]`` of the result.
+    """
+    if active is None:
+        return identify_measurement(machine, measurement, options)
+    wider, moved, report = without_active(machine, measurement, active)
+    result = identify_measurement(wider, moved, options)
+    return replace(result, corrections={**result.corrections, "active_tables": report})
+
+
+def _write_result(
+    exported: Export, verification: Verification, beside: Mapping[str, str], folder: str | Path
+) -> ControllerResult:
     prefix = "" if verification.accepted else REJECTED_PREFIX
     verification = replace(verification, files=tuple((prefix + name, digest) for name, digest in verification.files))
-    result = {"result.json": json.dumps(verification.summary(), indent=2) + "\n"}
+    result = {**beside, "result.json": json.dumps(verification.summary(), indent=2) + "\n"}
     paths = exported.write(folder, accepted=verification.accepted, beside=result)
     return ControllerResult(exported, verification, tuple(paths))
 
@@ -211,6 +249,7 @@ def run(
     templates: Path | None = None,
     allow_unverified: bool = False,
     progress: Progress = lambda _: None,
+    **checks: Unpack[Checks],
 ) -> RunResult:
     """Run the whole chain and write everything to ``folder``, after the last step that may find bad input.
 
@@ -223,6 +262,8 @@ def run(
     folder : output folder.
     identify_options, fit_options, templates, allow_unverified : handed to the stages.
     progress : is told the name of each stage as it begins.
+    checks : ``active``, tables that were active while the machine was measured (the new ones take their place), and
+        ``limits`` for the steps of the tables.
     """
     targets = {name: Path(folder) / name if len(set(controllers)) > 1 else Path(folder) for name in controllers}
     if not targets:
@@ -236,11 +277,11 @@ def run(
     provenance = provenance_of(machine.source, *measurements)
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):
-        identification = identify_measurement(machine, measurement, identify_options)
+        identification = identify_bare(machine, measurement, identify_options, checks.get("active"))
     progress("fitting smooth curves")
     fitted = fit(machine, identification.errors, fit_options or FitOptions())
     reversal = identified_reversal(identification)
-    checked: dict[str, tuple[Export, Verification]] = {}
+    checked: dict[str, tuple[Export, Verification, Mapping[str, str]]] = {}
     for name in targets:
         progress(f"exporting, reading back and verifying: {name}")
         exported = export(
@@ -252,7 +293,8 @@ def run(
             provenance=provenance,
             reversal=reversal,
         )
-        checked[name] = exported, _read_back(machine, exported, identification.errors, reversal)
+        verification = _read_back(machine, exported, identification.errors, reversal, checks.get("limits"))
+        checked[name] = exported, verification, check_files(machine, exported, identification.errors, templates)
     write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted)})
     results = [_write_result(*checked[name], target) for name, target in targets.items()]
     return RunResult(identification, fitted, tuple(results))

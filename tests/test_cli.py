@@ -108,6 +108,8 @@ def test_run_writes_everything_and_exits_with_0(call, small_machine_file, small_
     code, stdout, stderr = call("run", small_machine_file, small_lengths_file, "--controller", "isg-csv", "--out", out)
     assert (code, stderr) == (0, "")
     assert sorted(path.name for path in out.iterdir()) == [
+        "check-program.md",
+        "check-program.nc",
         "fit.json",
         "fitted.errors.csv",
         "identified.covariance.npz",
@@ -494,10 +496,12 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
         "read": (small_machine_file, tables / "volcomp0.csv", *files, "--points", points_file, "--out", out / "c.csv"),
         "predict": (small_machine_file, errors_file, "--points", points_file, "--out", out / "e.csv"),
         "plan": (small_machine_file, "--stations", stations, "--grid", "--out", out),
+        "diff": (small_machine_file, tables / "volcomp0.csv", "--against", tables / "volcomp0.csv", *files, "--out", out),
+        "merge": (small_machine_file, tables / "volcomp0.csv", *files, "--errors", errors_file, "--out", out),
     }
 
 
-WRITING = ["run", "identify", "fit", "export", "verify", "simulate", "read", "predict", "plan"]
+WRITING = ["run", "identify", "fit", "export", "verify", "simulate", "read", "predict", "plan", "diff", "merge"]
 
 
 def test_every_command_that_writes_is_among_these():

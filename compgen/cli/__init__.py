@@ -12,6 +12,7 @@ from compgen.cli import (
     listing_commands,
     plan_commands,
     run_commands,
+    safety_commands,
     simulate_commands,
 )
 from compgen.cli.common import run_command
@@ -32,7 +33,16 @@ def cli() -> None:
     """
 
 
-for module in (run_commands, simulate_commands, identify_commands, plan_commands, export_commands, listing_commands):
+MODULES = (
+    run_commands,
+    simulate_commands,
+    identify_commands,
+    plan_commands,
+    export_commands,
+    safety_commands,
+    listing_commands,
+)
+for module in MODULES:
     for command in module.COMMANDS:
         cli.add_command(command)
 

@@ -17,7 +17,8 @@ from compgen.cli.common import (
     stderr,
     stdout,
 )
-from compgen.core.error_table import read_errors
+from compgen.cli.safety_options import active_options, limits_option
+from compgen.core.error_table import format_errors, read_errors
 from compgen.core.files import OutputFolder, write_file
 from compgen.core.machine import Machine
 from compgen.core.points import format_points, read_points
@@ -26,6 +27,9 @@ from compgen.export import export
 from compgen.pipeline import provenance_of, write_all
 from compgen.report.text import verification_table
 from compgen.verify import read_tables, residuals, verify
+from compgen.verify.active import ActiveTables, bare_errors
+from compgen.verify.check_program import check_files
+from compgen.verify.safety import SafetyLimits
 
 REVERSAL_HELP = (
     "*.reversal.csv (um): what each axis does differently in its two directions; becomes tables of one direction."
@@ -46,6 +50,7 @@ def reversal_option(command: Command) -> Command:
 @click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
 @reversal_option
+@active_options()
 @json_option
 def export_command(
     machine: Machine,
@@ -55,28 +60,35 @@ def export_command(
     templates: Path | None,
     allow_unverified: bool,
     reversal: Path | None,
+    active: ActiveTables | None,
     as_json: bool,
 ) -> int:
     """Export errors to the files of a control, with manifest.json and preflight.md.
 
     ERRORS is an *.errors.csv file (um, urad), usually the fitted one. Files that break a limit of the control are
-    written as NOT-ACCEPTED-... (exit code 1).
+    written as NOT-ACCEPTED-... (exit code 1). check-program.md says what to read at five positions of the machine.
+    With --active ERRORS are those of the machine with its old tables; bare.errors.csv gets those without.
 
     \b
     Example:
       compgen export zha-gantry fitted/fitted.errors.csv --controller siemens-cec --out tables/
     """
     OutputFolder(out)
+    table, beside = read_errors(errors), {}
+    if active is not None:
+        table, lost_um = bare_errors(machine, table, active)
+        beside["bare.errors.csv"] = format_errors(table, {"active_tables_removed": active.names, "lost_um": lost_um})
     exported = export(
         machine,
-        read_errors(errors),
+        table,
         controller,
         templates=templates,
         allow_unverified=allow_unverified,
-        provenance=provenance_of(machine.source, errors, reversal),
+        provenance=provenance_of(machine.source, errors, reversal, *(active.paths if active else ())),
         reversal=read_reversal(reversal) if reversal else None,
     )
-    paths = exported.write(out)
+    beside |= check_files(machine, exported, table, templates)
+    paths = exported.write(out, beside=beside)
     for text in exported.warnings:
         stderr.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
     for text in exported.violations:
@@ -130,6 +142,7 @@ def read_command(
 @click.option("--points", type=click.Path(path_type=Path), help="*.points.csv (mm); default: a grid over the volume.")
 @out_option
 @reversal_option
+@limits_option
 @json_option
 def verify_command(
     machine: Machine,
@@ -139,6 +152,7 @@ def verify_command(
     points: Path | None,
     out: Path,
     reversal: Path | None,
+    limits: SafetyLimits,
     as_json: bool,
 ) -> int:
     """Verify controller files against the errors of the machine: the exact model before, and after the tables act.
@@ -152,7 +166,8 @@ def verify_command(
     OutputFolder(out)
     where = read_points(points) if points else None
     both = read_reversal(reversal) if reversal else None
-    result = verify(machine, read_tables(machine, tables, controller), read_errors(errors), where, reversal=both)
+    parsed, table = read_tables(machine, tables, controller), read_errors(errors)
+    result = verify(machine, parsed, table, where, reversal=both, limits=limits)
     write_all(out, {"result.json": json.dumps(result.summary(), indent=2) + "\n"})
     if as_json:
         print_json(result.summary())

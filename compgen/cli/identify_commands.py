@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.cli.safety_options import active_options
 from compgen.core.error_table import read_errors
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
@@ -19,13 +20,13 @@ from compgen.identify import (
     IdentifyOptions,
     SystematicInputs,
     describe,
-    identify_measurement,
     read_measurement,
     read_stations,
 )
 from compgen.identify.noise import METHODS
-from compgen.pipeline import failure_reported, fit_files, identification_files, provenance_of, write_all
+from compgen.pipeline import failure_reported, fit_files, identification_files, identify_bare, provenance_of, write_all
 from compgen.report.text import fit_table, identification_table
+from compgen.verify.active import ActiveTables
 
 #: Options --u-... and the fields of SystematicInputs that they fill.
 SYSTEMATIC_OPTIONS = (
@@ -128,6 +129,7 @@ def fit_options(smoothness: float | None) -> FitOptions:
 @instrument_options
 @systematic_options
 @method_options
+@active_options("--controller")
 @json_option
 def identify_command(
     machine: Machine,
@@ -139,6 +141,7 @@ def identify_command(
     keep_all: bool,
     systematic: SystematicInputs,
     choices: Mapping[str, Any],
+    active: ActiveTables | None,
     as_json: bool,
 ) -> int:
     """Identify error curves, squareness and stations from tracer lengths, or errors from measured positions.
@@ -167,7 +170,7 @@ def identify_command(
         show(f"identifying: {describe(measurement)}")
         options = identify_options(u_length_um, u_length_um_per_m, keep_all, systematic, choices)
         with failure_reported(out):
-            result = identify_measurement(machine, measurement, options)
+            result = identify_bare(machine, measurement, options, active)
     write_all(out, identification_files(result, provenance_of(machine.source, *measurements)))
     if as_json:
         print_json(result.summary())

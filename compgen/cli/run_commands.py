@@ -25,10 +25,13 @@ from compgen.cli.identify_commands import (
     smoothness_option,
     systematic_options,
 )
+from compgen.cli.safety_options import active_options, limits_option
 from compgen.core.machine import Machine
 from compgen.identify import SystematicInputs
 from compgen.pipeline import run
 from compgen.report.text import identification_table, run_json, verification_table
+from compgen.verify.active import ActiveTables
+from compgen.verify.safety import SafetyLimits
 
 
 @click.command("run")
@@ -42,6 +45,8 @@ from compgen.report.text import identification_table, run_json, verification_tab
 @smoothness_option
 @click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
+@active_options()
+@limits_option
 @json_option
 def run_command(
     machine: Machine,
@@ -56,6 +61,8 @@ def run_command(
     smoothness: float | None,
     templates: Path | None,
     allow_unverified: bool,
+    active: ActiveTables | None,
+    limits: SafetyLimits,
     as_json: bool,
 ) -> int:
     """Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.
@@ -77,6 +84,8 @@ def run_command(
             fit_options=fit_options(smoothness),
             templates=templates,
             allow_unverified=allow_unverified,
+            active=active,
+            limits=limits,
             progress=show,
         )
     if as_json:

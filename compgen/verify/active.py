@@ -48,6 +48,12 @@ class ActiveTables:
     """Tables that were active while the machine was measured; ``controller`` is the control that they belong to."""
 
     tables: ReadTables
+    paths: tuple[Path, ...] = ()
+
+    @property
+    def names(self) -> str:
+        """Names of the files, for the comments of a file."""
+        return ", ".join(name for name, _ in self.tables.files)
 
     @property
     def controller(self) -> str:
@@ -76,7 +82,7 @@ class ActiveTables:
 
 def read_active(machine: Machine, paths: Sequence[str | Path], controller: str) -> ActiveTables:
     """Parse tables that were active while the machine was measured; InputError as :func:`read_tables` has it."""
-    return ActiveTables(read_tables(machine, paths, controller))
+    return ActiveTables(read_tables(machine, paths, controller), tuple(Path(path) for path in paths))
 
 
 def without_active(
