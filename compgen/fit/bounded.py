@@ -1,18 +1,17 @@
-"""The same fit with bounds on magnitude and slope: a quadratic program in the unknowns of the smoother.
+"""One bounded curve by a general solver: where the banded method does not apply, or did not pass its check.
 
-minimise x^T A x / 2 - x^T Z^T W y   subject to   -1 <= G x <= 1
+minimise x^T A x / 2 - x^T g   subject to   lower <= G x <= upper
 
-with the rows of G the node values over their bound and the slopes over theirs. The zero curve satisfies every bound,
-so the program always has a solution. It is written for cvxpy as a quadratic form of the banded A (a sum of squares
-would add a variable per second difference and slow the solver down a hundredfold). The solver's result serves to find
-the active bounds; with these as equations the system is solved directly, and the Karush-Kuhn-Tucker conditions
-(every bound kept, every multiplier of the right sign) prove that it is the optimum. Where the active bounds depend on
-one another, so that their multipliers are not unique, the solver's own curve is taken if its duality gap is closed.
+in the unknowns of the smoother, with g = Z^T W y. The zero curve satisfies every bound, so the program always has a
+solution. The solver's result serves to find the active bounds; with these as equations the system is solved directly,
+and the Karush-Kuhn-Tucker conditions (every bound kept, every multiplier of the right sign) prove that it is the
+optimum. Where the active bounds depend on one another, so that their multipliers are not unique, the solver's own curve
+is taken if its duality gap is closed.
 """
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -22,26 +21,17 @@ import scipy.sparse as sp
 
 from compgen.core.csvio import FloatArray
 from compgen.errors import ConvergenceError
+from compgen.fit.bounds import KEPT, Rows
 from compgen.fit.smooth import Smoother
 
-#: Bounds are kept to this fraction of them.
-KEPT = 1e-9
 _SIGN = 1e-9
 #: Largest duality gap, as a fraction of what the bounds cost, of a solution whose active rows depend on one another.
 _GAP = 1e-8
-_SOLVERS: tuple[tuple[str, dict[str, float]], ...] = (
-    ("OSQP", {"eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000}),
-    ("CLARABEL", {}),
-    ("CLARABEL", {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-12}),
-)
 
 
 @dataclass(frozen=True)
 class Bounded:
-    """A fit within bounds: ``curve`` (n,), the ``active`` rows of the constraints (-1, 0, 1 per row) and the solver.
-
-    Rows count the n node values first, then the n - 1 slopes.
-    """
+    """A fit within bounds: ``curve`` (n,), the ``active`` rows of the constraints (-1, 0, 1 per row) and the solver."""
 
     curve: FloatArray
     active: FloatArray
@@ -49,34 +39,26 @@ class Bounded:
 
 
 @dataclass(frozen=True)
+class _Program:
+    """The program with unknowns scaled to 1 on the diagonal of A, and only the rows that have a limit."""
+
+    quadratic: sp.csc_array
+    linear: FloatArray
+    matrix: sp.csc_array
+    lower: FloatArray
+    upper: FloatArray
+
+
+@dataclass(frozen=True)
 class _Start:
-    """A general solver's curve (n,), made to keep its bounds, its multipliers (rows,) and the active rows (-1, 0, 1)."""
+    """A general solver's curve (n,), made to keep its bounds, and its multipliers (rows,), positive at upper limits."""
 
     curve: FloatArray
     multiplier: FloatArray
-    active: FloatArray
 
 
-def constraint_rows(position_mm: FloatArray, smoother: Smoother, largest: float, steepest: float) -> sp.csr_array:
-    """Rows (2 n - 1, n) of G in the smoother's unknowns: value/largest, slope/steepest; a bound of inf gives zeros."""
-    n = len(position_mm)
-    turn: Any = sp.csr_array(smoother.expand(np.eye(n)))
-    per_step = 1 / (np.diff(position_mm) * steepest)
-    bands = np.stack([np.append(-per_step, 0.0), np.append(0.0, per_step)])  # indexed by column
-    slope: Any = sp.dia_array((bands, [0, 1]), shape=(n - 1, n))
-    rows = sp.csr_array(sp.vstack([turn / largest, slope @ turn]))
-    rows.eliminate_zeros()
-    return rows
-
-
-def is_within(position_mm: FloatArray, curve: FloatArray, largest: float, steepest: float) -> bool:
-    """Whether a curve (n,) keeps its bounds at every node and between them."""
-    slope = np.abs(np.diff(curve) / np.diff(position_mm))
-    return bool(np.abs(curve).max() <= largest and slope.max(initial=0.0) <= steepest)
-
-
-def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: sp.csr_array) -> Bounded:
-    """Solve the program for data (n,); ``rows`` from :func:`constraint_rows`.
+def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: Rows) -> Bounded:
+    """Solve the program for data (n,); ``rows`` from :func:`compgen.fit.bounds.constraint_rows`.
 
     Raises
     ------
@@ -84,77 +66,109 @@ def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: sp.csr_array
         when no solver's result passes the optimality conditions.
     """
     free = smoother.solve(mu, y[:, None])[:, 0]
-    for solver, settings in _SOLVERS:
-        start = _start(smoother, mu, y, rows, solver, settings)
-        if start is not None:
-            found = _active_set(smoother, mu, free, rows, start.active)
-            if found is None and _gap(smoother, mu, free, rows, start) <= _GAP:
-                found = start.curve, start.active
-            if found is not None:
-                return Bounded(*found, f"cvxpy+{solver}")
+    for solver, call in SOLVERS.items():
+        start = _start(smoother, mu, y, rows, call)
+        if start is None:
+            continue
+        found = _active_set(smoother, mu, free, rows, _touched(start.multiplier))
+        if found is None and _is_optimal(smoother, mu, free, rows, start):
+            found = start.curve, _touched(start.multiplier)
+        if found is not None:
+            return Bounded(*found, solver)
     raise ConvergenceError(
         "the bounded fit found no optimum that passes its check; loosen the bounds or the smoothness"
     )
 
 
-def _quadratic(smoother: Smoother, mu: float) -> sp.csc_array:
-    n = len(smoother.weight)
-    band = mu * smoother.penalty
-    band[0] += smoother.free_weight
-    lower: Any = sp.dia_array((band, -np.arange(len(band))), shape=(n, n))
-    middle: Any = sp.dia_array((band[:1], [0]), shape=(n, n))
-    return sp.csc_array(lower + lower.T - middle)
+def _touched(multiplier: FloatArray) -> FloatArray:
+    return np.where(np.abs(multiplier) > 1e-6 * np.abs(multiplier).max(initial=0.0), np.sign(multiplier), 0.0)
 
 
 def _start(
-    smoother: Smoother, mu: float, y: FloatArray, rows: sp.csr_array, solver: str, settings: dict[str, float]
+    smoother: Smoother,
+    mu: float,
+    y: FloatArray,
+    rows: Rows,
+    call: Callable[[_Program], tuple[FloatArray, FloatArray] | None],
 ) -> _Start | None:
     """Ask a general solver; None if it fails."""
-    cp: Any = import_module("cvxpy")  # takes more than a second: only when a bound is active
-
-    quadratic = _quadratic(smoother, mu)
+    quadratic = smoother.matrix(mu)
     scale = 1 / np.sqrt(quadratic.diagonal())
-    stretch: Any = sp.dia_array((scale[None, :], [0]), shape=quadratic.shape)
-    scaled = stretch @ quadratic @ stretch
-    linear = scale * smoother.gather((smoother.weight * y)[:, None])[:, 0]
-    used = np.flatnonzero(np.diff(rows.indptr))
-    x = cp.Variable(len(y))
-    values = sp.csr_array(rows[used] @ stretch) @ x
-    limits = [values <= 1, values >= -1]
-    problem = cp.Problem(cp.Minimize(0.5 * cp.quad_form(x, cp.psd_wrap(scaled)) - linear @ x), limits)
-    try:
-        with warnings.catch_warnings():  # an inaccurate solution is no harm: the active rows are checked afterwards
-            warnings.simplefilter("ignore")
-            problem.solve(solver=solver, **settings)
-    except cp.error.SolverError:
+    stretch: Any = sp.diags_array(scale)
+    used = np.flatnonzero(np.isfinite(rows.lower) | np.isfinite(rows.upper))
+    program = _Program(
+        sp.csc_array(stretch @ quadratic @ stretch),
+        -scale * smoother.load(y[:, None])[:, 0],
+        sp.csc_array(rows.matrix[used] @ stretch),
+        rows.lower[used],
+        rows.upper[used],
+    )
+    found = call(program)
+    if found is None or not np.isfinite(found[0]).all():
         return None
-    if problem.status not in ("optimal", "optimal_inaccurate"):
-        return None
-    upper, lower = (np.asarray(limit.dual_value) for limit in limits)
-    multiplier = np.zeros(rows.shape[0])
-    multiplier[used] = np.maximum(upper, 0.0) - np.maximum(lower, 0.0)
-    curve = smoother.expand((scale * x.value)[:, None])[:, 0]
-    curve = curve / max(1.0, float(np.abs(rows @ curve).max()))  # the bounds allow every smaller multiple of a curve
-    active = np.where(np.abs(multiplier) > 1e-6 * np.abs(multiplier).max(), np.sign(multiplier), 0.0)
-    return _Start(curve, multiplier, active)
+    multiplier = np.zeros(rows.matrix.shape[0])
+    multiplier[used] = found[1]
+    curve = smoother.expand((scale * found[0])[:, None])[:, 0]
+    values = np.asarray(rows.matrix @ curve)
+    limit = np.where(values > 0, rows.upper, -rows.lower)
+    share = np.where((limit > 0) & np.isfinite(limit), np.abs(values) / np.where(limit > 0, limit, 1.0), 0.0)
+    return _Start(
+        curve / max(1.0, float(share.max())), multiplier
+    )  # every smaller multiple of a curve keeps bounds too
 
 
-def _gap(smoother: Smoother, mu: float, free: FloatArray, rows: sp.csr_array, start: _Start) -> float:
-    """Duality gap over the cost of the bounds: how far, at most, the start is from the optimum.
+def _osqp(program: _Program) -> tuple[FloatArray, FloatArray] | None:
+    osqp: Any = import_module("osqp")
+    solver = osqp.OSQP()
+    upper = sp.csc_matrix(sp.triu(program.quadratic))
+    settings = {"eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000, "verbose": False}
+    solver.setup(upper, program.linear, sp.csc_matrix(program.matrix), program.lower, program.upper, **settings)
+    result = solver.solve(raise_error=False)
+    return (result.x, result.y) if result.info.status in ("solved", "solved inaccurate") else None
+
+
+def _clarabel(program: _Program) -> tuple[FloatArray, FloatArray] | None:
+    clarabel: Any = import_module("clarabel")
+    high, low = np.isfinite(program.upper), np.isfinite(program.lower)
+    matrix = sp.csc_matrix(sp.vstack([program.matrix[high], -program.matrix[low]]))
+    limit = np.concatenate([program.upper[high], -program.lower[low]])
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
+    quadratic = sp.csc_matrix(sp.triu(program.quadratic))
+    cones = [clarabel.NonnegativeConeT(len(limit))]
+    result = clarabel.DefaultSolver(quadratic, program.linear, matrix, limit, cones, settings).solve()
+    if "Solved" not in str(result.status):
+        return None
+    dual, multiplier = np.array(result.z), np.zeros(len(high))
+    multiplier[high] += dual[: int(high.sum())]
+    multiplier[low] -= dual[int(high.sum()) :]
+    return np.array(result.x), multiplier
+
+
+#: General solvers in the order in which they are asked.
+SOLVERS: dict[str, Callable[[_Program], tuple[FloatArray, FloatArray] | None]] = {"OSQP": _osqp, "Clarabel": _clarabel}
+
+
+def _is_optimal(smoother: Smoother, mu: float, free: FloatArray, rows: Rows, start: _Start) -> bool:
+    """Whether the start keeps its bounds and its duality gap is closed.
 
     With e = x - free, cost e^T A e / 2 and the dual value for multipliers v (both against the free optimum), half the
     squared distance to the optimum in the norm of A is at most their difference (A is the program's only curvature).
     """
-    e = start.curve - free
+    if np.abs(rows.excess(start.curve)).max(initial=0.0) > KEPT:
+        return False
+    e, v = start.curve - free, start.multiplier
     cost = 0.5 * float(e @ smoother.apply(mu, e[:, None])[:, 0])
-    pull = np.asarray(rows.T @ start.multiplier)
+    pull = np.asarray(rows.matrix.T @ v)
     reach = smoother.inverse(mu, pull[:, None])[:, 0]
-    value = float(pull @ free - np.abs(start.multiplier).sum() - 0.5 * pull @ reach)
-    return (cost - value) / cost
+    limit = np.where(v > 0, rows.upper, rows.lower)
+    value = float(pull @ free - np.sum(np.where(v != 0, v * limit, 0.0)) - 0.5 * pull @ reach)
+    return cost - value <= _GAP * cost
 
 
 def _active_set(
-    smoother: Smoother, mu: float, free: FloatArray, rows: sp.csr_array, active: FloatArray
+    smoother: Smoother, mu: float, free: FloatArray, rows: Rows, active: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """Curve and active rows that satisfy the optimality conditions, from a guess of the active rows; None if not found.
 
@@ -163,22 +177,29 @@ def _active_set(
     active = active.copy()
     for _ in range(20 + 4 * len(free)):
         picked = np.flatnonzero(active)
-        curve, multiplier = _equalities(smoother, mu, free, rows[picked].toarray() * active[picked, None])
+        sign = active[picked]
+        target = np.where(sign > 0, rows.upper[picked], -rows.lower[picked])
+        if not np.isfinite(target).all():
+            return None
+        signed = rows.matrix[picked].toarray() * sign[:, None]
+        curve, multiplier = _equalities(smoother, mu, free, signed, target)
         if len(picked) and multiplier.min() < -_SIGN * np.abs(multiplier).max():
             active[picked[np.argmin(multiplier)]] = 0.0
             continue
-        values = np.asarray(rows @ curve)
-        if np.abs(values).max() <= 1.0 + KEPT:
+        excess = rows.excess(curve)
+        worst = int(np.argmax(np.abs(excess)))
+        if abs(excess[worst]) <= KEPT:
             return curve, active
-        worst = int(np.argmax(np.abs(values)))
         if active[worst] != 0:
             return None
-        active[worst] = np.sign(values[worst])
+        active[worst] = np.sign(excess[worst])
     return None
 
 
-def _equalities(smoother: Smoother, mu: float, free: FloatArray, signed: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Curve (n,) with the ``signed`` rows (k, n) at 1, and their multipliers (k,) times the root of their reach.
+def _equalities(
+    smoother: Smoother, mu: float, free: FloatArray, signed: FloatArray, target: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Curve (n,) with the ``signed`` rows (k, n) at ``target`` (k,), and their multipliers times the root of their reach.
 
     Solved by the Schur complement of A, each row scaled to 1 on its diagonal, and refined against what is left.
     """
@@ -190,7 +211,7 @@ def _equalities(smoother: Smoother, mu: float, free: FloatArray, signed: FloatAr
     scaled, spread = schur * scale * scale[:, None], reach * scale
     curve, multiplier = free, np.zeros(len(signed))
     for _ in range(3):
-        more = np.linalg.lstsq(scaled, scale * (signed @ curve - 1.0), rcond=1e-13)[0]
+        more = np.linalg.lstsq(scaled, scale * (signed @ curve - target), rcond=1e-13)[0]
         curve = smoother.expand((curve - spread @ more)[:, None])[:, 0]
         multiplier = multiplier + more
     return curve, multiplier

@@ -1,8 +1,9 @@
-"""The fit of one curve, in um or urad: weights, smoothness, solution, bounds, uncertainty, report."""
+"""One curve from preparation to report, in um or urad: weights, smoothness, uncertainty; many are solved together."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +11,14 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve
 from compgen.core.names import error_named
-from compgen.fit.bounded import constraint_rows, fit_bounded, is_within
+from compgen.fit.bounds import Bounds
+from compgen.fit.correlated import CorrelatedSmoother, propagated
 from compgen.fit.held import HeldCurve
 from compgen.fit.options import FitOptions
-from compgen.fit.result import ActiveBound, CurveReport
+from compgen.fit.result import CurveReport
 from compgen.fit.smooth import Smoother
+from compgen.fit.solve import Solution, solve_curves, solve_general
+from compgen.fit.stacked import CurveProblem
 from compgen.fit.weight import Method, choose
 
 #: An uncertainty counts at least this fraction of the curve's median one, and this much (um, urad): exact data.
@@ -24,14 +28,41 @@ _LEAST_LEFT = 0.5
 
 
 @dataclass(frozen=True)
-class _Solved:
-    """A curve (n,) in um or urad with the weight and method that gave it."""
+class Prepared:
+    """One curve ready to be fitted, everything in um or urad (``unit`` in mm or rad).
 
-    curve: FloatArray
+    ``y`` (n,) is the zeroed input, ``u0`` the scale of its uncertainty (None: unknown), ``smoother`` holds weights and
+    zeros, ``trust`` (n,) the share of each node's weight that a robust loss leaves, ``covariance`` (n, n) that of the
+    input if it is used.
+    """
+
+    name: str
+    held: HeldCurve
+    unit: float
+    y: FloatArray
+    u0: float | None
+    smoother: Smoother
+    bounds: Bounds
+    trust: FloatArray
+    covariance: FloatArray | None = None
+
+    def problem(self, mu: float) -> CurveProblem:
+        """Return the curve as a problem to be solved at a given smoothness."""
+        nodes = tuple(row[0][0] for row in self.held.rows if len(row) == 1)
+        return CurveProblem(self.held.position_mm, self.y, self.smoother.weight, nodes, mu, self.bounds)
+
+    @property
+    def simple(self) -> bool:
+        """Whether nodes are independent and the curve is held at whole nodes."""
+        return self.covariance is None and all(other is None for _, other, _ in self.smoother.steps)
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """Smoothness and how it was found."""
+
     mu: float
     method: Method
-    active: tuple[ActiveBound, ...] = ()
-    solver: str = "direct"
 
 
 def weights(held: HeldCurve, unit: float) -> tuple[FloatArray, float | None]:
@@ -45,106 +76,110 @@ def weights(held: HeldCurve, unit: float) -> tuple[FloatArray, float | None]:
     u = held.u[free] / unit
     if not np.isfinite(u).all() or not u.size:
         return weight, None
-    positive = u[u > 0]
-    least = max(_LEAST, _LEAST_FRACTION * float(np.median(positive))) if positive.size else _LEAST
-    u = np.maximum(u, least)
+    u = np.maximum(u, _least(u))
     u0 = float(1 / np.sqrt(np.mean(1 / u**2)))
     weight[free] = (u0 / u) ** 2
     return weight, u0
 
 
-def fit_curve(name: str, held: HeldCurve, options: FitOptions) -> tuple[Curve, CurveReport]:
-    """Fit one held curve; returns it in mm or rad with its uncertainty, and the report.
+def _least(u: FloatArray) -> float:
+    positive = u[u > 0]
+    return max(_LEAST, _LEAST_FRACTION * float(np.median(positive))) if positive.size else _LEAST
 
-    The uncertainty is that of the input (nodes independent) carried linearly through the zeroing and the smoother
-    without bounds; it does not hold the smoothing bias, which the report states.
-    """
+
+def prepare(name: str, held: HeldCurve, options: FitOptions, trust: FloatArray | None = None) -> Prepared:
+    """Set up the smoother of one held curve; ``trust`` (n,) in (0, 1] divides the variance of each node."""
     unit = error_named(name).si_per_unit
+    share = np.ones(len(held.value)) if trust is None else trust
     weight, u0 = weights(held, unit)
-    smoother = Smoother.build(held.position_mm, weight, held.rows)
-    y = held.value / unit
-    solved = _solve(name, held, smoother, u0, options)
-    bias = smoother.solve(solved.mu, solved.curve[:, None])[:, 0] - solved.curve
-    u = propagate(smoother, solved.mu, held)
-    curve = Curve(held.position_mm, solved.curve * unit + 0.0, u)
-    return curve, _report(name, smoother, y, u0, solved, bias, held.position_mm)
+    smoother = Smoother.build(held.position_mm, weight * share, held.rows)
+    covariance = None
+    if held.covariance is not None and u0 is not None and smoother.unknowns:
+        covariance = held.covariance / unit**2 / np.sqrt(share[:, None] * share)
+        smoother = CorrelatedSmoother.of(smoother, _zeroed_covariance(held, covariance) / u0**2)
+    bounds = options.bounds(name).in_unit(unit)
+    return Prepared(name, held, unit, held.value / unit, u0, smoother, bounds, share, covariance)
 
 
-def _solve(name: str, held: HeldCurve, smoother: Smoother, u0: float | None, options: FitOptions) -> _Solved:
-    unit = error_named(name).si_per_unit
-    y = held.value / unit
-    method: Method = "REML" if u0 is not None else "GCV"
+def _zeroed_covariance(held: HeldCurve, covariance: FloatArray) -> FloatArray:
+    """Covariance (n, n) after zeroing, with the least variance that counts added, so that it has an inverse."""
+    zeroed = held.zeroing @ covariance @ held.zeroing.T
+    return np.asarray(zeroed + _least(np.sqrt(np.diag(covariance))) ** 2 * np.eye(len(zeroed)))
+
+
+def smoothness(prepared: Prepared, options: FitOptions) -> Weighted:
+    """Return the given smoothness, or the one that the data ask for."""
     if options.smoothness is not None:
-        mu, method = min(options.smoothness, smoother.largest_mu), "given"
+        return Weighted(min(options.smoothness, prepared.smoother.largest_mu), "given")
+    method: Method = "REML" if prepared.u0 is not None else "GCV"
+    return Weighted(choose(prepared.smoother, prepared.y, prepared.u0), method)
+
+
+def solve(prepared: Sequence[Prepared], mu: Sequence[float]) -> list[Solution]:
+    """Fit curves at given smoothness within their bounds, the simple ones together."""
+    simple = [k for k, item in enumerate(prepared) if item.simple]
+    found = dict(zip(simple, solve_curves([prepared[k].problem(mu[k]) for k in simple]) if simple else [], strict=True))
+    return [
+        found[k] if k in found else solve_general(item.problem(mu[k]), item.smoother) for k, item in enumerate(prepared)
+    ]
+
+
+def finish(prepared: Prepared, weighted: Weighted, solution: Solution) -> tuple[Curve, CurveReport]:
+    """Return the fitted curve in mm or rad with its uncertainty, and the report.
+
+    The uncertainty is that of the input carried linearly through the zeroing and the smoother without bounds; it does
+    not hold the smoothing bias, which the report states.
+    """
+    smoother, held = prepared.smoother, prepared.held
+    bias = smoother.solve(weighted.mu, solution.curve[:, None])[:, 0] - solution.curve
+    if prepared.covariance is not None:
+        u = propagated(smoother, weighted.mu, held, prepared.covariance) * prepared.unit
     else:
-        mu = choose(smoother, y, u0)
-    curve = smoother.solve(mu, y[:, None])[:, 0]
-    largest, steepest = (limit / unit for limit in options.limits(name))
-    if is_within(held.position_mm, curve, largest, steepest):
-        return _Solved(curve, mu, method)
-    rows = constraint_rows(held.position_mm, smoother, largest, steepest)
-    bounded = fit_bounded(smoother, mu, y, rows)
-    return _Solved(bounded.curve, mu, method, _active(held.position_mm, bounded.active), bounded.solver)
+        u = propagate(smoother, weighted.mu, held, prepared.trust)
+    curve = Curve(held.position_mm, solution.curve * prepared.unit + 0.0, u)
+    return curve, _report(prepared, weighted, solution, bias)
 
 
-def _active(position_mm: FloatArray, rows: FloatArray) -> tuple[ActiveBound, ...]:
-    n = len(position_mm)
-    nodes = [ActiveBound("max_abs", *[float(position_mm[k])] * 2) for k in np.flatnonzero(rows[:n])]
-    slopes = np.flatnonzero(rows[n:])
-    return (*nodes, *(ActiveBound("max_slope", float(position_mm[k]), float(position_mm[k + 1])) for k in slopes))
-
-
-def propagate(smoother: Smoother, mu: float, held: HeldCurve) -> FloatArray:
+def propagate(smoother: Smoother, mu: float, held: HeldCurve, trust: FloatArray) -> FloatArray:
     """Standard uncertainty (n,) of the fitted curve in mm or rad: sqrt of the diagonal of (S G) U^2 (S G)^T.
 
-    G takes the line or constant out that zeroing removed (G = 1 where nothing was removed), U holds the input's u.
-    An unknown u counts only where the fit uses it; if it does, the result is nan.
+    G takes the line or constant out that zeroing removed (G = 1 where nothing was removed), U holds the input's u over
+    the root of ``trust`` (n,). An unknown u counts only where the fit uses it; if it does, the result is nan.
     """
     if np.isnan(held.u).all():
         return np.where(smoother.expand(np.ones((len(held.u), 1)))[:, 0] == 0, 0.0, np.nan)
-    shapes = held.shapes * held.moved
-    smooth_shapes = smoother.solve(mu, shapes)
-    functional = np.zeros((len(held.rows), len(held.value)))
-    for k, row in enumerate(held.rows):
-        for node, factor in row:
-            functional[k, node] += factor
-    variance = np.zeros(len(held.value))
+    smooth_shapes = smoother.solve(mu, held.shapes * held.moved)
+    functional, variance = held.functional, held.u**2 / trust
+    total = np.zeros(len(held.value))
     for picked, columns in smoother.columns(mu):
         gain = columns - smooth_shapes @ functional[:, picked]
-        used = np.where(gain != 0, gain**2 * held.u[picked] ** 2, 0.0)
-        variance += used.sum(axis=1)
-    return np.asarray(np.sqrt(variance))
+        total += np.where(gain != 0, gain**2 * variance[picked], 0.0).sum(axis=1)
+    return np.asarray(np.sqrt(total))
 
 
-def _report(
-    name: str,
-    smoother: Smoother,
-    y: FloatArray,
-    u0: float | None,
-    solved: _Solved,
-    bias: FloatArray,
-    position_mm: FloatArray,
-) -> CurveReport:
-    residual = y - solved.curve
-    used = smoother.degrees_of_freedom(solved.mu)
-    left = smoother.residual_degrees(solved.mu)
-    noise2 = float(np.sum(smoother.weight * residual**2)) / left if left >= _LEAST_LEFT else math.nan
+def _report(prepared: Prepared, weighted: Weighted, solution: Solution, bias: FloatArray) -> CurveReport:
+    smoother, residual = prepared.smoother, prepared.y - solution.curve
+    left = smoother.residual_degrees(weighted.mu)
+    noise2 = smoother.misfit(residual) / left if left >= _LEAST_LEFT else math.nan
+    distrusted = np.flatnonzero(prepared.trust < 1)
     return CurveReport(
-        error=name,
-        unit=error_named(name).unit,
-        smoothness=solved.mu,
-        method=solved.method,
-        half_gain_mm=half_gain_mm(solved.mu, position_mm),
-        degrees_of_freedom=used,
+        error=prepared.name,
+        unit=error_named(prepared.name).unit,
+        smoothness=weighted.mu,
+        method=weighted.method,
+        half_gain_mm=half_gain_mm(weighted.mu, prepared.held.position_mm),
+        degrees_of_freedom=smoother.degrees_of_freedom(weighted.mu),
         free_nodes=smoother.unknowns,
         rms_residual=float(np.sqrt(np.mean(residual**2))),
-        reduced_chi_square=noise2 / u0**2 if u0 is not None else math.nan,
+        reduced_chi_square=noise2 / prepared.u0**2 if prepared.u0 is not None else math.nan,
         noise=math.sqrt(noise2),
         smoothing_bias_max=float(np.abs(bias).max()),
         smoothing_bias_rms=float(np.sqrt(np.mean(bias**2))),
         smoothing_bias=bias,
-        active_bounds=solved.active,
-        solver=solved.solver,
+        active_bounds=solution.active,
+        solver=solution.solver,
+        correlated=prepared.covariance is not None,
+        distrusted_mm=tuple(float(prepared.held.position_mm[k]) for k in distrusted),
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import ERROR_NAMES, SQUARENESS_NAMES
@@ -34,13 +35,14 @@ class Zeroed:
         return ErrorTable(curves, self.squareness, metadata or {})
 
 
-def zero_ends(machine: Machine, errors: ErrorTable) -> Zeroed:
+def zero_ends(machine: Machine, errors: ErrorTable, covariance: Mapping[str, FloatArray] | None = None) -> Zeroed:
     """Bring every curve to zero where it has to be; E stays the same over the travel up to a rigid motion.
 
     Parameters
     ----------
     machine : its travel, reference point, chain, tool offset and squareness reference count.
     errors : curves that end within the travel are extended to its ends by their end values, with a warning.
+    covariance : covariance (n, n) of the nodes by error name, mm and rad; other curves have independent nodes.
 
     Raises
     ------
@@ -48,7 +50,8 @@ def zero_ends(machine: Machine, errors: ErrorTable) -> Zeroed:
         for a value that is not finite, or when a squareness error that has to take up a part is not in the
         machine's model.
     """
-    curves = {name: hold(machine, name, curve) for name, curve in errors.curves.items()}
+    known = covariance or {}
+    curves = {name: hold(machine, name, curve, known.get(name)) for name, curve in errors.curves.items()}
     change, variance = decompose(machine, curves)
     kept = {*modelled_errors(machine), *errors.squareness}
     for name, value in change.squareness.items():

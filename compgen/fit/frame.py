@@ -97,6 +97,14 @@ def target_basis(machine: Machine) -> FloatArray:
     return np.stack([column.ravel() for column in columns], axis=1)
 
 
+def _gained(held: HeldCurve, shares: FloatArray) -> FloatArray:
+    """Variance (9,) that shares (k, 9) of the held functionals hand on; an unknown u counts only where it has a share."""
+    gains = shares.T @ held.functional
+    if held.covariance is not None:
+        return np.asarray(np.einsum("ij,jk,ik->i", gains, held.covariance, gains))
+    return np.asarray(np.where(gains != 0, gains**2 * held.u**2, 0.0).sum(axis=1))
+
+
 def decompose(machine: Machine, curves: Mapping[str, HeldCurve]) -> tuple[FrameChange, dict[str, float]]:
     """Split the field that the curves lost into squareness and rigid motion; also the variance that squareness gains."""
     basis = target_basis(machine)
@@ -105,15 +113,15 @@ def decompose(machine: Machine, curves: Mapping[str, HeldCurve]) -> tuple[FrameC
     for name, held in curves.items():
         if error_named(name).kind == "angular":
             turn[error_named(name).direction] += held.removed[0]
-        for field, row, removed in zip(removed_fields(machine, name, held), held.rows, held.removed, strict=True):
+        shares = []
+        for field, removed in zip(removed_fields(machine, name, held), held.removed, strict=True):
             parts = inverse @ field.ravel()
             if np.abs(basis @ parts - field.ravel()).max() > 1e-9 * np.abs(field).max():
                 raise InputError("leaves a field that neither squareness nor a rigid motion can take up", field=name)
             parts[np.abs(parts) < 1e-13 * np.abs(parts).max()] = 0.0
             total += parts * removed
-            if abs(removed) > NOTHING:
-                u2 = sum((factor * held.u[node]) ** 2 for node, factor in row)
-                variance += np.where(parts != 0, parts**2 * u2, 0.0)
+            shares.append(parts * (abs(removed) > NOTHING))
+        variance += _gained(held, np.array(shares))
     change = FrameChange(
         translation_mm=(float(total[6]), float(total[7]), float(total[8])),
         rotation_rad=(float(total[3]), float(total[4]), float(total[5])),

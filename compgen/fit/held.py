@@ -28,7 +28,8 @@ class HeldCurve:
 
     ``position_mm``, ``value``, ``u`` have shape (n,), in mm or rad; ``u`` is the uncertainty of the input.
     ``rows`` are the k functionals (zero for ``value``); ``removed`` (k,) is what they gave before and ``shapes`` (n, k)
-    the curves that were taken out per unit of it: value = input - shapes @ removed.
+    the curves that were taken out per unit of it: value = input - shapes @ removed. ``covariance`` (n, n) is that of the
+    input, None for independent nodes.
     """
 
     position_mm: FloatArray
@@ -37,6 +38,21 @@ class HeldCurve:
     rows: tuple[Row, ...]
     shapes: FloatArray
     removed: FloatArray
+    covariance: FloatArray | None = None
+
+    @property
+    def functional(self) -> FloatArray:
+        """The functionals as a matrix (k, n)."""
+        matrix = np.zeros((len(self.rows), len(self.value)))
+        for k, row in enumerate(self.rows):
+            for node, factor in row:
+                matrix[k, node] += factor
+        return matrix
+
+    @property
+    def zeroing(self) -> FloatArray:
+        """Matrix (n, n) that takes out of a curve what was taken out of this one; 1 where nothing was."""
+        return np.eye(len(self.value)) - (self.shapes * self.moved) @ self.functional
 
     @property
     def moved(self) -> FloatArray:
@@ -84,8 +100,11 @@ def _extend(machine: Machine, name: str, curve: Curve) -> Curve:
     return Curve(position, np.pad(curve.value, pad, "edge"), np.pad(curve.u, pad, "edge"))
 
 
-def hold(machine: Machine, name: str, given: Curve) -> HeldCurve:
-    """Bring one curve to zero at its held points, in mm or rad; InputError for values that are not finite."""
+def hold(machine: Machine, name: str, given: Curve, covariance: FloatArray | None = None) -> HeldCurve:
+    """Bring one curve to zero at its held points, in mm or rad; InputError for values that are not finite.
+
+    ``covariance`` (n, n) of the given nodes takes the place of their uncertainties.
+    """
     if not (np.isfinite(given.value).all() and np.isfinite(given.position_mm).all()):
         raise InputError("holds a value or position that is not finite; remove that node", field=name)
     if np.any(given.u < 0) or np.any(np.isinf(given.u)):
@@ -99,7 +118,10 @@ def hold(machine: Machine, name: str, given: Curve) -> HeldCurve:
     for row in rows:
         if len(row) == 1:
             value[row[0][0]] = 0.0
-    return HeldCurve(position, value, curve.u, rows, shapes, removed)
+    if covariance is not None:
+        at = np.abs(position[:, None] - given.position_mm).argmin(axis=1)  # nodes that were added repeat the ends
+        covariance = covariance[np.ix_(at, at)]
+    return HeldCurve(position, value, curve.u, rows, shapes, removed, covariance)
 
 
 def end_lines(position_mm: FloatArray, rows: tuple[Row, ...]) -> list[tuple[float, float]]:

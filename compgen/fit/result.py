@@ -14,7 +14,10 @@ from compgen.fit.weight import Method
 
 @dataclass(frozen=True)
 class ActiveBound:
-    """A bound that the fitted curve touches: ``max_abs`` at one node, ``max_slope`` between two; positions in mm."""
+    """A bound that the fitted curve touches, positions in mm.
+
+    ``max_abs`` at one node, ``max_slope`` and ``monotone`` between two, ``max_curvature`` over three.
+    """
 
     bound: str
     from_mm: float
@@ -39,7 +42,10 @@ class CurveReport:
     smoothing_bias_max, smoothing_bias_rms : how much the smoothing flattens a curve like the fitted one, S c - c.
     smoothing_bias : the same per position, shape (n,).
     active_bounds : where the curve touches a bound.
-    solver : ``direct``, or ``cvxpy+OSQP`` (``cvxpy+CLARABEL`` where that fails) when a bound is active.
+    solver : ``direct``; ``interior point`` when a bound is active (``OSQP`` or ``Clarabel`` where that does not apply or
+        fails); ``cvxpy`` with constraints of your own.
+    correlated : whether the covariance of the nodes was used.
+    distrusted_mm : nodes that a robust loss gave less than their weight.
     """
 
     error: str
@@ -57,6 +63,8 @@ class CurveReport:
     smoothing_bias: FloatArray = field(repr=False, compare=False)
     active_bounds: tuple[ActiveBound, ...] = ()
     solver: str = "direct"
+    correlated: bool = False
+    distrusted_mm: tuple[float, ...] = ()
 
     def to_dict(self) -> dict[str, object]:
         """Return plain values for JSON; unknown numbers are None."""

@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.linalg import cho_solve_banded, cholesky_banded, eigvals_banded
 
 from compgen.core.csvio import FloatArray
@@ -209,7 +211,24 @@ class Smoother:
 
     def solve(self, mu: float, y: FloatArray) -> FloatArray:
         """Fitted curves (n, k) for data (n, k)."""
-        return self.inverse(mu, self.gather(self.weight[:, None] * y))
+        return self.inverse(mu, self.load(y))
+
+    def load(self, y: FloatArray) -> FloatArray:
+        """Z^T W y, the right-hand side for data (n, k)."""
+        return self.gather(self.weight[:, None] * y)
+
+    def misfit(self, residual: FloatArray) -> float:
+        """Weighted square sum of residuals (n,)."""
+        return float(np.sum(self.weight * residual**2))
+
+    def matrix(self, mu: float) -> sp.csc_array:
+        """A (n, n) with 1 on the diagonal of eliminated unknowns."""
+        n = len(self.weight)
+        band = mu * self.penalty
+        band[0] += self.free_weight
+        lower: Any = sp.dia_array((band, -np.arange(len(band))), shape=(n, n))
+        middle: Any = sp.dia_array((band[:1], [0]), shape=(n, n))
+        return sp.csc_array(lower + lower.T - middle)
 
     def columns(self, mu: float) -> Iterator[tuple[slice, FloatArray]]:
         """Yield the smoother's matrix S (c = S y) in blocks of columns: (which, (n, block))."""

@@ -32,7 +32,7 @@ def reml_criterion(smoother: Smoother, y: FloatArray, u0: float) -> Callable[[fl
 
     def value(mu: float) -> float:
         c = smoother.solve(mu, y[:, None])
-        misfit = np.sum(smoother.weight * (y - c[:, 0]) ** 2) + mu * np.sum(smoother.bend(c) ** 2)
+        misfit = smoother.misfit(y - c[:, 0]) + mu * np.sum(smoother.bend(c) ** 2)
         return float(np.sum(np.log1p(mu * smoother.eigenvalues)) - smoother.rank * np.log(mu) + misfit / u0**2)
 
     return value
@@ -42,9 +42,9 @@ def gcv_criterion(smoother: Smoother, y: FloatArray) -> Callable[[float], float]
     """V of the module's page as a function of mu, for data (n,)."""
 
     def value(mu: float) -> float:
-        residual = y - smoother.solve(mu, y[:, None])[:, 0]
+        misfit = smoother.misfit(y - smoother.solve(mu, y[:, None])[:, 0])
         left = np.sum(mu * smoother.eigenvalues / (1 + mu * smoother.eigenvalues))
-        return float(smoother.unknowns * np.sum(smoother.weight * residual**2) / left**2)
+        return float(smoother.unknowns * misfit / left**2)
 
     return value
 

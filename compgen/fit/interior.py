@@ -1,0 +1,204 @@
+"""Bounded curves, many at once: a primal-dual interior point method on the banded system of all of them.
+
+minimise c^T A c / 2 - c^T W y   subject to   lower <= G c <= upper
+
+Rows of G act on one node (value), two (slope) or three (curvature), so that the Newton matrix A + G^T diag G keeps the
+half-bandwidth 2 of A and a step costs O(N) (Mehrotra 1992, SIAM J. Optim. 2, 575). Every curve has its own step length
+and stops by itself. The method finds which bounds are active; ``polish.py`` turns that into the exact optimum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpbtrf, dpbtrs
+
+from compgen.core.csvio import FloatArray
+from compgen.fit.bounds import Bounds, slope_limits
+from compgen.fit.stacked import Stack, band_of, curvature_rows, gather, spread, steps, windows
+
+_STEPS = 60
+#: A curve is done when its complementarity is below this share of what the bounds cost.
+_CLOSED = 1e-9
+_TINY = np.finfo(float).tiny
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class RowStack:
+    """Rows of all bounds of a stack: ``rows`` (B, 3, N) over ``limit`` (2, B, N): G c <= upper, -G c <= -lower.
+
+    ``kinds`` (B,) says what each of the B sets of rows bounds: 0 values, 1 slopes, 2 curvatures. A limit that is not
+    there is inf.
+    """
+
+    kinds: tuple[int, ...]
+    rows: FloatArray
+    limit: FloatArray
+
+    @property
+    def there(self) -> BoolArray:
+        """Which limits exist, (2, B, N)."""
+        return np.isfinite(self.limit)
+
+    def values(self, c: FloatArray) -> FloatArray:
+        """G c and -G c: (2, B, N)."""
+        inner = gather(self.rows, c)
+        return np.stack([inner, -inner])
+
+    def transposed(self, v: FloatArray) -> FloatArray:
+        """G^T (v[0] - v[1]) for row values (2, B, N): (N,)."""
+        total = v[0] - v[1]
+        return np.asarray(sum(spread(rows, value) for rows, value in zip(self.rows, total, strict=True)))
+
+    def add_band(self, band: FloatArray, v: FloatArray) -> None:
+        """Add G^T diag(v[0] + v[1]) G to a lower band (3, N)."""
+        more = np.empty_like(band)
+        for rows, value in zip(self.rows, v[0] + v[1], strict=True):
+            band_of(rows * np.sqrt(value), more)
+            band += more
+
+
+def row_stack(stack: Stack, bounds: Sequence[Bounds], curve: FloatArray) -> RowStack:
+    """Build the rows; ``curve`` (N,), the one without bounds, gives the scale of slopes that have only a direction."""
+    step = steps(stack)
+    limits = np.array([bound.limits for bound in bounds]).T
+    steepest = np.maximum(stack.largest(np.abs(stack.slopes(curve))), _TINY)
+    scaled = [slope_limits(bound, float(typical)) for bound, typical in zip(bounds, steepest, strict=True)]
+    made = [
+        _rows(stack, 0, _values(step), limits[0], (-np.ones(len(bounds)), np.ones(len(bounds)))),
+        _rows(stack, 1, _slopes(step), np.array([item[0] for item in scaled]), _ends(scaled)),
+        _rows(stack, 2, curvature_rows(step), limits[2], (-np.ones(len(bounds)), np.ones(len(bounds)))),
+    ]
+    used = [kind for kind, (_, limit) in enumerate(made) if np.isfinite(limit).any()]
+    return RowStack(
+        tuple(used), np.stack([made[kind][0] for kind in used]), np.stack([made[kind][1] for kind in used], axis=1)
+    )
+
+
+def _ends(scaled: list[tuple[float, float, float]]) -> tuple[FloatArray, FloatArray]:
+    return np.array([item[1] for item in scaled]), np.array([item[2] for item in scaled])
+
+
+def _values(step: FloatArray) -> FloatArray:
+    rows = np.zeros((3, len(step)))
+    rows[0] = 1.0
+    return rows
+
+
+def _slopes(step: FloatArray) -> FloatArray:
+    return np.stack([-1 / step, 1 / step, np.zeros(len(step))])
+
+
+def _rows(
+    stack: Stack, kind: int, rows: FloatArray, scale: FloatArray, ends: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Rows (3, N) over their bound, and limits (2, N); rows that act on held nodes only have none."""
+    scaled = rows * windows(stack.free) / stack.of_each(scale)
+    limit = np.stack([stack.of_each(ends[1]), stack.of_each(-ends[0])])
+    limit[:, ~scaled.any(axis=0)] = math.inf
+    return scaled, limit
+
+
+@dataclass
+class _Iterate:
+    """Curves (N,), slacks and multipliers (2, B, N); entries without limit have slack 1 and multiplier 0."""
+
+    c: FloatArray
+    slack: FloatArray
+    multiplier: FloatArray
+
+
+def interior(stack: Stack, rows: RowStack, free_curve: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Curves (N,), multipliers (2, B, N) near the optimum, and which curves (k,) came there.
+
+    ``free_curve`` (N,) is the solution without bounds.
+    """
+    there = rows.there
+    count = np.maximum(_sum(stack, there.astype(float)), 1.0)
+    now = _begin(stack, rows, free_curve, there, count)
+    done, failed = np.zeros(len(stack.starts), bool), np.zeros(len(stack.starts), bool)
+    for _ in range(_STEPS):
+        gap = _sum(stack, now.slack * now.multiplier)
+        cost = 0.5 * stack.total((now.c - free_curve) * stack.apply(now.c - free_curve))
+        broken = stack.largest(np.where(there, rows.values(now.c) - rows.limit, 0.0).max(axis=(0, 1)))
+        done |= (gap <= _CLOSED * np.maximum(cost, _TINY)) & (broken <= 1e-6)
+        if (done | failed).all():
+            break
+        bad = _step(stack, rows, now, there, gap / count, ~(done | failed))
+        failed[bad] = True
+    return now.c, now.multiplier, done
+
+
+def _sum(stack: Stack, values: FloatArray) -> FloatArray:
+    return stack.total(values.sum(axis=(0, 1)))
+
+
+def _begin(stack: Stack, rows: RowStack, free_curve: FloatArray, there: BoolArray, count: FloatArray) -> _Iterate:
+    """Start at the free curve, shrunk to half of the bounds that it breaks; monotone rows begin with open slack."""
+    values = rows.values(free_curve)
+    bounded = there & (rows.limit > 0)
+    over = stack.largest(np.where(bounded, values / np.where(bounded, rows.limit, 1.0), 0.0).max(axis=(0, 1)))
+    c = free_curve * stack.of_each(np.minimum(1.0, 0.5 / np.maximum(over, 0.5)))
+    slack = np.where(there, np.maximum(rows.limit - rows.values(c), 0.3), 1.0)
+    away = c - free_curve
+    cost = stack.total(away * stack.apply(away)) + 1e-6 * stack.total(free_curve * stack.pull) + _TINY
+    level = stack.of_each(cost / count)
+    return _Iterate(c, slack, np.where(there, level / slack, 0.0))
+
+
+def _step(
+    stack: Stack, rows: RowStack, now: _Iterate, there: BoolArray, mean: FloatArray, moving: BoolArray
+) -> list[int]:
+    """One predictor and corrector step of the ``moving`` curves, in place; returns curves whose matrix broke down."""
+    weight = now.multiplier / now.slack
+    band = stack.band()
+    rows.add_band(band, weight)
+    factor, bad = _factor(stack, band)
+    dual = stack.pull - stack.apply(now.c) - rows.transposed(now.multiplier)
+    primal = np.where(there, rows.limit - rows.values(now.c) - now.slack, 0.0)
+
+    def towards(target: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        push = (target - now.multiplier * primal) / now.slack
+        dc = stack.free * dpbtrs(factor, dual - rows.transposed(push), lower=1)[0].ravel()
+        moved = rows.values(dc)
+        return dc, primal - np.where(there, moved, 0.0), push + weight * moved
+
+    full = now.slack * now.multiplier
+    dc, ds, dz = towards(-full)
+    length = _length(stack, now, ds, dz)
+    reach = stack.of_each(length)
+    after = _sum(stack, (now.slack + reach * ds) * (now.multiplier + reach * dz))
+    share = (after / np.maximum(_sum(stack, full), _TINY)) ** 3
+    centre = stack.of_each(np.clip(share, 1e-10, 1.0) * mean)
+    dc, ds, dz = towards(np.where(there, centre - full - ds * dz, 0.0))
+    sure = np.where(moving, np.minimum(1.0, 0.995 * _length(stack, now, ds, dz)), 0.0)
+    sure[bad] = 0.0
+    reach = stack.of_each(sure)
+    now.c = now.c + reach * dc
+    now.slack = now.slack + reach * ds
+    now.multiplier = now.multiplier + reach * dz
+    return bad
+
+
+def _length(stack: Stack, now: _Iterate, ds: FloatArray, dz: FloatArray) -> FloatArray:
+    """Longest step (k,) that keeps slacks and multipliers from becoming negative; inf becomes large."""
+    fastest = np.maximum(-ds / now.slack, -dz / np.maximum(now.multiplier, _TINY)).max(axis=(0, 1))
+    return np.asarray(1.0 / np.maximum(stack.largest(fastest), 1e-3))
+
+
+def _factor(stack: Stack, band: FloatArray) -> tuple[FloatArray, list[int]]:
+    """Cholesky factor; a curve whose block is not positive definite is replaced by 1 and named."""
+    bad: list[int] = []
+    while True:
+        factor, info = dpbtrf(band, lower=1)
+        if info == 0:
+            return factor, bad
+        curve = int(np.searchsorted(stack.starts, info - 1, side="right")) - 1
+        bad.append(curve)
+        block = slice(stack.starts[curve], stack.starts[curve] + stack.sizes[curve])
+        band[0, block], band[1:, block] = 1.0, 0.0
