@@ -15,8 +15,8 @@ test: lint
 	$(BIN)/python -m pytest -n 2 -ra
 
 lint: .venv/ready-dev
-	$(BIN)/ruff check compgen tests examples docs
-	$(BIN)/ruff format --check compgen tests examples docs
+	$(BIN)/ruff check compgen tests examples docs benchmarks
+	$(BIN)/ruff format --check compgen tests examples docs benchmarks
 	$(BIN)/mypy
 
 .venv/bin/python:
