@@ -279,7 +279,8 @@ def run(
     with failure_reported(folder):
         identification = identify_bare(machine, measurement, identify_options, checks.get("active"))
     progress("fitting smooth curves")
-    fitted = fit(machine, identification.errors, fit_options or FitOptions())
+    known = None if identification.adjustment is None else covariance.joint_covariance(identification)
+    fitted = fit(machine, identification.errors, fit_options or FitOptions(), covariance=known)
     reversal = identified_reversal(identification)
     checked: dict[str, tuple[Export, Verification, Mapping[str, str]]] = {}
     for name in targets:

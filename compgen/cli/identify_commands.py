@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.cli.fit_options import covariance_of, covariance_options, fitting_options
 from compgen.cli.safety_options import active_options
 from compgen.core.error_table import read_errors
 from compgen.core.files import OutputFolder
@@ -99,12 +100,6 @@ def method_options(command: Command) -> Command:
     return chosen(decorated)  # type: ignore[no-any-return]
 
 
-def smoothness_option(command: Command) -> Command:
-    """Add --smoothness."""
-    text = "Dimensionless weight of the second differences (0 keeps the data); default: chosen from the data."
-    return click.option("--smoothness", type=float, help=text)(command)
-
-
 def identify_options(
     u_length_um: float | None,
     u_length_um_per_m: float | None,
@@ -114,11 +109,6 @@ def identify_options(
 ) -> IdentifyOptions:
     """Return the options of the stage; ``choices`` as :func:`method_options` gives them."""
     return IdentifyOptions(u_length_um, u_length_um_per_m, reject=not keep_all, systematic=systematic, **choices)
-
-
-def fit_options(smoothness: float | None) -> FitOptions:
-    """Return the options of the stage."""
-    return FitOptions(smoothness=smoothness)
 
 
 @click.command("identify")
@@ -183,19 +173,31 @@ def identify_command(
 @machine_argument
 @click.argument("errors", type=click.Path(path_type=Path))
 @out_option
-@smoothness_option
+@fitting_options
+@covariance_options
 @json_option
-def fit_command(machine: Machine, errors: Path, out: Path, smoothness: float | None, as_json: bool) -> int:
+def fit_command(
+    machine: Machine,
+    errors: Path,
+    out: Path,
+    fitting: FitOptions,
+    covariance: Path | None,
+    independent: bool,
+    as_json: bool,
+) -> int:
     """Fit smooth curves: straightness zero at both ends, positioning and angles zero at the reference point.
 
-    ERRORS is an *.errors.csv file (um, urad). Writes fitted.errors.csv and fit.json to DIR.
+    ERRORS is an *.errors.csv file (um, urad). Writes fitted.errors.csv and fit.json to DIR. If the covariance that
+    compgen identify wrote lies beside ERRORS, its correlations count, else nodes are taken as independent.
 
     \b
     Example:
-      compgen fit zha-gantry identified/identified.errors.csv --out fitted/
+      compgen fit zha-gantry identified/identified.errors.csv --max-abs linear=20 --out fitted/
     """
     OutputFolder(out)
-    result = fit(machine, read_errors(errors), fit_options(smoothness))
+    table = read_errors(errors)
+    known = covariance_of(errors, table, covariance, independent=independent)
+    result = fit(machine, table, fitting, covariance=known)
     write_all(out, fit_files(result))
     if as_json:
         print_json(result.to_dict())

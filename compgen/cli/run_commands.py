@@ -17,16 +17,16 @@ from compgen.cli.common import (
     progress,
     stdout,
 )
+from compgen.cli.fit_options import fitting_options
 from compgen.cli.identify_commands import (
-    fit_options,
     identify_options,
     instrument_options,
     method_options,
-    smoothness_option,
     systematic_options,
 )
 from compgen.cli.safety_options import active_options, limits_option
 from compgen.core.machine import Machine
+from compgen.fit import FitOptions
 from compgen.identify import SystematicInputs
 from compgen.pipeline import run
 from compgen.report.text import identification_table, run_json, verification_table
@@ -42,7 +42,7 @@ from compgen.verify.safety import SafetyLimits
 @instrument_options
 @systematic_options
 @method_options
-@smoothness_option
+@fitting_options
 @click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
 @active_options()
@@ -58,7 +58,7 @@ def run_command(
     keep_all: bool,
     systematic: SystematicInputs,
     choices: Mapping[str, Any],
-    smoothness: float | None,
+    fitting: FitOptions,
     templates: Path | None,
     allow_unverified: bool,
     active: ActiveTables | None,
@@ -81,7 +81,7 @@ def run_command(
             tuple(dict.fromkeys(controller)),
             out,
             identify_options=identify_options(u_length_um, u_length_um_per_m, keep_all, systematic, choices),
-            fit_options=fit_options(smoothness),
+            fit_options=fitting,
             templates=templates,
             allow_unverified=allow_unverified,
             active=active,

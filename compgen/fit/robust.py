@@ -36,9 +36,9 @@ def robust(curves: Mapping[str, HeldCurve], options: FitOptions) -> tuple[list[P
     trusts = [trust_of(item.y - running_median(item.y), scale) for item, scale in zip(prepared, scales, strict=True)]
     weighted: list[Weighted] = []
     for count in range(_ROUNDS):
-        prepared = [prepare(item.name, item.held, options, trust) for item, trust in zip(prepared, trusts, strict=True)]
         if count < _SEARCHES:
-            weighted = [smoothness(item, options) for item in prepared]
+            weighted = [_search(item, options, trust) for item, trust in zip(prepared, trusts, strict=True)]
+        prepared = [prepare(item.name, item.held, options, trust) for item, trust in zip(prepared, trusts, strict=True)]
         found = solve(prepared, [item.mu for item in weighted])
         residuals = [item.y - solution.curve for item, solution in zip(prepared, found, strict=True)]
         if count < _SEARCHES:
@@ -49,6 +49,11 @@ def robust(curves: Mapping[str, HeldCurve], options: FitOptions) -> tuple[list[P
             return prepared, weighted
         trusts = fresh
     raise ConvergenceError(f"the robust fit did not settle in {_ROUNDS} rounds; fit without it or give a smoothness")
+
+
+def _search(item: Prepared, options: FitOptions, trust: FloatArray) -> Weighted:
+    """Smoothness with the variance of each node so large that it lies within Huber's distance: it sees no outliers."""
+    return smoothness(prepare(item.name, item.held, options, trust**2), options)
 
 
 def running_median(y: FloatArray) -> FloatArray:
