@@ -79,7 +79,8 @@ def dense_columns(basis, position_mm, tool_mm):
                 )
             field[:, part.output] += part.sign * (amount - part.origin_mm)
         for k, node in enumerate(term.nodes_mm):
-            if term.zero_at_mm is not None and abs(node - term.zero_at_mm) < NANOMETRE:
+            zeros = [*term.zeros_mm, *([] if term.zero_at_mm is None else [term.zero_at_mm])]
+            if any(abs(node - zero) < NANOMETRE for zero in zeros):
                 continue
             unit = np.zeros(len(term.nodes_mm))
             unit[k] = 1.0

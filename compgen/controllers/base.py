@@ -56,6 +56,7 @@ class Term:
     zero_at_mm : position where the interpolated value must be zero, or None.
     keep_mm : positions where the value should stay at its start as far as the wanted correction leaves a choice (a
         line may stand in a straightness or in a squareness); this keeps the zeros of the fitted curves.
+    zeros_mm : positions of nodes whose values are zero to the last digit, as in ``start``.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Term:
     start: FloatArray
     zero_at_mm: float | None = None
     keep_mm: tuple[float, ...] = ()
+    zeros_mm: tuple[float, ...] = ()
 
     def curve_matrix(self, position_mm: FloatArray) -> FloatArray:
         """Interpolation matrix (m, n) at commanded positions (m, 3)."""

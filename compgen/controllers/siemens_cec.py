@@ -25,7 +25,9 @@ from compgen.controllers.siemens_products import (
     CecMap,
     CecTable,
     folded_tables,
+    labels_in,
     sum_into_axes,
+    written_decimals,
 )
 from compgen.controllers.siemens_reversal import backlash_rows, reversal_statement, with_reversal_tables
 from compgen.controllers.siemens_settings import take_axis_names, take_steps
@@ -220,7 +222,13 @@ class SiemensCec(Controller[CecSettings, CecTables]):
             index = item.index_number(0, 999)
             part = parts.setdefault(index, TableParts(f"table {index}", item.source))
             part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
-        return CecTables({index: _read_table(part, settings.axis_names) for index, part in sorted(parts.items())})
+        labels = labels_in(files)
+        return CecTables(
+            {
+                index: _read_table(part, settings.axis_names, labels.get(index, ""))
+                for index, part in sorted(parts.items())
+            }
+        )
 
     def emulate(self, machine: Machine, settings: CecSettings, tables: CecTables, points: Points) -> FloatArray:
         """Return what the control adds: the clipped sum of the tables, subtracted or added as ``sign`` says.
@@ -279,16 +287,19 @@ def _styled(settings: CecSettings, axis: int) -> str:
     return f"({name})" if settings.axis_style == "paren" else f'"{name}"'
 
 
-def _read_table(part: TableParts, axis_names: Sequence[str]) -> CecTable:
+def _read_table(part: TableParts, axis_names: Sequence[str], label: str) -> CecTable:
     input_item, output_item = part.scalar("$AN_CEC_INPUT_AXIS"), part.scalar("$AN_CEC_OUTPUT_AXIS")
     direction = part.scalar("$AN_CEC_DIRECTION").whole(-1_000_000, 1_000_000)
     multiplier = part.scalar("$AN_CEC_MULT_BY_TABLE").whole(0, 1_000_000)
+    table = part.table("$AN_CEC")
     return CecTable(
         _axis_value(input_item, axis_names),
         _axis_value(output_item, axis_names),
-        part.table("$AN_CEC"),
+        table,
         direction,
         multiplier,
+        written_decimals(table),
+        label,
     )
 
 

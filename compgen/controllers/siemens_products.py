@@ -12,6 +12,7 @@ ordinary tables over x and z, so that only the product remains.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
@@ -19,7 +20,7 @@ from decimal import Decimal
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.controllers.base import Term
+from compgen.controllers.base import SourceFile, Term
 from compgen.controllers.siemens_syntax import LinearTable, exact_grid
 from compgen.controllers.terms import one_dimensional_name, product_name
 from compgen.core.csvio import FloatArray
@@ -40,6 +41,7 @@ MM_DECIMALS, FACTOR_DECIMALS = 6, 9
 NEGLIGIBLE_RAD = 1e-12
 NEGLIGIBLE_PRODUCT_MM = 0.5 * 10.0**-MM_DECIMALS
 
+_LABEL = re.compile(r"; table (\d{1,6}): ([ -~]{1,300}); MD18342\[\d{1,6}\] = \d")
 _UNITS_PER_MM = 10**FACTOR_DECIMALS
 _UNITS_PER_MM_QUANTUM = 10 ** (FACTOR_DECIMALS - MM_DECIMALS)
 
@@ -220,3 +222,20 @@ def _ordinary_table(work: _Set, key: tuple[int, int], units: IntArray, nodes_mm:
 
 def _decimals(units: IntArray, decimals: int) -> tuple[Decimal, ...]:
     return tuple(Decimal(int(count)).scaleb(-decimals) for count in units)
+
+
+def written_decimals(table: LinearTable) -> int:
+    """Return with how many decimals the values of a table stand in its text, at least those of a table in mm."""
+    places = [len(f"{value:f}".partition(".")[2]) for value in table.values]
+    return min(max([MM_DECIMALS, *places]), FACTOR_DECIMALS)
+
+
+def labels_in(files: Sequence[SourceFile]) -> dict[int, str]:
+    """Return what the comments of an exported file call its tables, by index; they matter for nothing but writing."""
+    found = {}
+    for source in files:
+        for line in source.text.splitlines():
+            match = _LABEL.match(line[:400])
+            if match:
+                found[int(match.group(1))] = match.group(2)
+    return found

@@ -13,6 +13,9 @@ from compgen.core.machine import Machine
 from compgen.core.names import AXES, SQUARENESS_NAMES, error_named
 from compgen.model.volumetric import coefficients
 
+#: A straightness error is taken as zero at its ends below this (rounding of the fit).
+ZERO_END_MM = 1e-9
+
 
 def one_dimensional_name(output: int, axis: int) -> str:
     """Name of the table that corrects ``output`` as a function of ``axis``, e.g. ``X(y)``."""
@@ -148,9 +151,20 @@ def error_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatAr
         start = errors.curves[name].at(nodes) if name in errors.curves else np.zeros(len(nodes))
         if name == "EYX":
             start = start - fold * nodes
-        keep_mm = _kept_mm(machine, axis, straightness=error_named(name).is_straightness)
-        terms.append(Term(name, axis, nodes, tuple(carrier), start, keep_mm=keep_mm))
+        straightness = error_named(name).is_straightness
+        keep_mm = _kept_mm(machine, axis, straightness=straightness)
+        zeros_mm = _zero_ends_mm(nodes, start) if straightness and set(SQUARENESS_NAMES) <= names else ()
+        if zeros_mm:
+            start = np.concatenate([[0.0], start[1:-1], [0.0]])
+        terms.append(Term(name, axis, nodes, tuple(carrier), start, keep_mm=keep_mm, zeros_mm=zeros_mm))
     return terms
+
+
+def _zero_ends_mm(nodes_mm: FloatArray, start: FloatArray) -> tuple[float, ...]:
+    """Both ends of a straightness that is zero there: its line then stands in the squareness, which the control has."""
+    if len(nodes_mm) < 3 or np.max(np.abs(start[[0, -1]])) > ZERO_END_MM:
+        return ()
+    return float(nodes_mm[0]), float(nodes_mm[-1])
 
 
 def _kept_mm(machine: Machine, axis: int, *, straightness: bool) -> tuple[float, ...]:

@@ -173,6 +173,7 @@ def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
         if term.axis is not None:
             if term.zero_at_mm is not None:
                 rows.append(hat_matrix(term.nodes_mm, np.array([term.zero_at_mm]))[0])
+            rows += [row for row in hat_matrix(term.nodes_mm, np.array(term.zeros_mm)) if len(term.zeros_mm)]
             rows += _beyond_travel(term.nodes_mm, *machine.axes[term.axis].range_mm)
         blocks.append(free_basis(np.array(rows), len(term.nodes_mm)))
     return csr_array(block_diag(blocks))
