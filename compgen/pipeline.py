@@ -167,12 +167,15 @@ def export_and_verify(
     """Export, write to a temporary folder, read the bytes back from there, verify, and only then write to ``folder``.
 
     The verification moves the exact model with the ``identified`` errors, not with the fitted ones that made the
-    tables. Files that are not accepted are written as ``NOT-ACCEPTED-...``.
+    tables. Files that are not accepted are written as ``NOT-ACCEPTED-...``; what the export itself could not hold (a
+    limit that binds) is a reason too.
     """
     OutputFolder(folder)
     exported = export(machine, fitted, controller, **export_options)
     reversal: ReversalCurves | None = export_options.get("reversal")
     verification = _read_back(machine, exported, identified, reversal, limits)
+    reasons = tuple(dict.fromkeys([*verification.reasons, *exported.violations]))
+    verification = replace(verification, reasons=reasons)
     beside = check_files(machine, exported, identified, export_options.get("templates"))
     return _write_result(exported, verification, beside, folder)
 

@@ -17,6 +17,8 @@ from compgen.cli.common import (
     stderr,
     stdout,
 )
+from compgen.cli.emphasis_options import emphasis_options
+from compgen.cli.options_commands import explain_option
 from compgen.cli.safety_options import active_options, limits_option
 from compgen.core.error_table import format_errors, read_errors
 from compgen.core.files import OutputFolder, write_file
@@ -25,10 +27,12 @@ from compgen.core.points import format_points, read_points
 from compgen.core.reversal import read_reversal
 from compgen.export import export
 from compgen.pipeline import provenance_of, write_all
+from compgen.report.explain_text import explanation_markdown
 from compgen.report.text import verification_table
 from compgen.verify import read_tables, residuals, verify
 from compgen.verify.active import ActiveTables, bare_errors
 from compgen.verify.check_program import check_files
+from compgen.verify.explain import explain as explained
 from compgen.verify.safety import SafetyLimits
 
 REVERSAL_HELP = (
@@ -44,6 +48,7 @@ def reversal_option(command: Command) -> Command:
 
 @click.command("export")
 @machine_argument
+@emphasis_options
 @click.argument("errors", type=click.Path(path_type=Path))
 @controller_option()
 @out_option
@@ -51,6 +56,7 @@ def reversal_option(command: Command) -> Command:
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
 @reversal_option
 @active_options()
+@explain_option
 @json_option
 def export_command(
     machine: Machine,
@@ -61,6 +67,7 @@ def export_command(
     allow_unverified: bool,
     reversal: Path | None,
     active: ActiveTables | None,
+    explain: bool,
     as_json: bool,
 ) -> int:
     """Export errors to the files of a control, with manifest.json and preflight.md.
@@ -75,6 +82,7 @@ def export_command(
     """
     OutputFolder(out)
     table, beside = read_errors(errors), {}
+    both = read_reversal(reversal) if reversal else None
     if active is not None:
         table, lost_um = bare_errors(machine, table, active)
         beside["bare.errors.csv"] = format_errors(table, {"active_tables_removed": active.names, "lost_um": lost_um})
@@ -85,17 +93,23 @@ def export_command(
         templates=templates,
         allow_unverified=allow_unverified,
         provenance=provenance_of(machine.source, errors, reversal, *(active.paths if active else ())),
-        reversal=read_reversal(reversal) if reversal else None,
+        reversal=both,
     )
     beside |= check_files(machine, exported, table, templates)
+    explanation = explained(machine, table, exported, reversal=both, templates=templates) if explain else None
+    if explanation is not None:
+        beside["explain.md"] = explanation_markdown(explanation)
     paths = exported.write(out, beside=beside)
     for text in exported.warnings:
         stderr.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
     for text in exported.violations:
         stderr.print(f"not acceptable: {text}", style="red", markup=False, soft_wrap=True)
     if as_json:
-        print_json({**exported.manifest, "accepted": not exported.violations, "paths": [str(path) for path in paths]})
+        own = {"accepted": not exported.violations, "paths": [str(path) for path in paths]}
+        print_json({**exported.manifest, **own, **({"explain": explanation.as_dict()} if explanation else {})})
     else:
+        if explanation is not None:
+            stdout.print(beside["explain.md"], markup=False, soft_wrap=True)
         for path in paths:
             stdout.print(f"  {path}", markup=False, soft_wrap=True)
     return 1 if exported.violations else 0
@@ -134,6 +148,7 @@ def read_command(
 
 @click.command("verify")
 @machine_argument
+@emphasis_options
 @click.argument("tables", nargs=-1, required=True, type=click.Path(path_type=Path))
 @controller_option()
 @click.option(

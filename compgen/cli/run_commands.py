@@ -17,6 +17,7 @@ from compgen.cli.common import (
     progress,
     stdout,
 )
+from compgen.cli.emphasis_options import emphasis_options
 from compgen.cli.fit_options import fitting_options
 from compgen.cli.identify_commands import (
     identify_options,
@@ -24,6 +25,7 @@ from compgen.cli.identify_commands import (
     method_options,
     systematic_options,
 )
+from compgen.cli.options_commands import explain_option, explain_run
 from compgen.cli.safety_options import active_options, limits_option
 from compgen.core.machine import Machine
 from compgen.fit import FitOptions
@@ -36,6 +38,7 @@ from compgen.verify.safety import SafetyLimits
 
 @click.command("run")
 @machine_argument
+@emphasis_options
 @click.argument("measurements", nargs=-1, required=True, type=click.Path(path_type=Path))
 @controller_option(multiple=True)
 @out_option
@@ -47,6 +50,7 @@ from compgen.verify.safety import SafetyLimits
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
 @active_options()
 @limits_option
+@explain_option
 @json_option
 def run_command(
     machine: Machine,
@@ -63,6 +67,7 @@ def run_command(
     allow_unverified: bool,
     active: ActiveTables | None,
     limits: SafetyLimits,
+    explain: bool,
     as_json: bool,
 ) -> int:
     """Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.
@@ -88,6 +93,8 @@ def run_command(
             limits=limits,
             progress=show,
         )
+    if explain:
+        explain_run(machine, result, out, templates)
     if as_json:
         print_json(run_json(result))
     else:
