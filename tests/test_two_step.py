@@ -742,3 +742,17 @@ def test_lengths_and_deviations_do_not_go_together(tmp_path, gantry_file, make_e
     )
     assert isinstance(result.exception, InputError)
     assert "one after the other" in str(result.exception)
+
+
+def test_the_stations_file_of_an_identification_serves_as_known_stations(tmp_path):
+    file = tmp_path / "stations.csv"
+    file.write_text(
+        "station,setup,segment,x_mm,y_mm,z_mm,u_x_um,u_y_um,u_z_um,dead_length_mm,u_dead_length_um,readings,residual_rms_um\n"
+        "LT1,0,0,1.0,2.0,3.0,0.2,0.5,0.1,10.0,0.1,50,0.2\n"
+        "LT1,0,1,1.0,2.0,3.0,0.2,0.5,0.1,11.5,0.1,20,0.2\n"
+        "LT2,0,0,4.0,5.0,6.0,0.3,0.4,0.7,12.0,0.1,50,0.2\n"
+    )
+    known = read_stations(file)
+    assert known.names == ("LT1", "LT2")
+    assert known.position_mm.tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    assert known.u_mm.tolist() == pytest.approx([0.5e-3, 0.7e-3])

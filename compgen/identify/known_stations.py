@@ -15,6 +15,7 @@ import numpy as np
 from compgen.core.csvio import FloatArray, read_csv
 from compgen.core.lengths import POSITION_COLUMNS, Lengths
 from compgen.core.machine import Machine
+from compgen.core.names import MM_PER_UM
 from compgen.core.text import nearest
 from compgen.errors import InputError
 from compgen.identify.grid_problem import GridProblem
@@ -26,6 +27,10 @@ from compgen.model.volumetric import tool_of
 
 #: A station without a stated uncertainty is held to this: a nanometre is nothing for a tracer.
 HELD_MM = 1e-6
+
+#: Columns of ``stations.csv`` of an identification.
+U_OF_IDENTIFY = ("u_x_um", "u_y_um", "u_z_um")
+OF_IDENTIFY = (*U_OF_IDENTIFY, "setup", "segment", "dead_length_mm", "u_dead_length_um", "readings", "residual_rms_um")
 
 
 @dataclass(frozen=True)
@@ -46,17 +51,29 @@ class KnownStations:
 
 
 def read_stations(path: str | Path) -> KnownStations:
-    """Read known stations: CSV with ``station, x_mm, y_mm, z_mm`` and, if they are not exact, ``u_mm``."""
-    table = read_csv(path, required=("station", *POSITION_COLUMNS), optional=("u_mm",))
+    """Read known stations: CSV with ``station, x_mm, y_mm, z_mm`` and, if they are not exact, ``u_mm``.
+
+    ``stations.csv`` of an identification will do: its uncertainties are taken, and its further rows of a station.
+    """
+    optional = ("u_mm", *OF_IDENTIFY)
+    table = read_csv(path, required=("station", *POSITION_COLUMNS), optional=optional)
     names = table.text("station")
+    position_mm = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
+    kept: list[int] = []
     for row, name in enumerate(names):
-        if name in names[:row]:
-            raise table.fail(row, "station", f"{name!r} stands already in line {table.lines[names.index(name)]}")
-    u_mm = table.numbers("u_mm") if "u_mm" in table.columns else np.zeros(len(table))
+        first = names.index(name)
+        if first == row:
+            kept.append(row)
+        elif "dead_length_mm" not in table.columns or np.max(np.abs(position_mm[row] - position_mm[first])) > 1e-6:
+            raise table.fail(row, "station", f"{name!r} stands already in line {table.lines[first]}")
+    u_mm = np.zeros(len(table))
+    if "u_mm" in table.columns:
+        u_mm = table.numbers("u_mm")
+    elif all(name in table.columns for name in U_OF_IDENTIFY):
+        u_mm = np.max([table.numbers(name) for name in U_OF_IDENTIFY], axis=0) * MM_PER_UM
     for row in np.flatnonzero(u_mm < 0)[:1]:
         raise table.fail(int(row), "u_mm", f"{u_mm[row]:g} is negative; a standard uncertainty is not")
-    position_mm = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
-    return KnownStations(tuple(names), position_mm, np.maximum(u_mm, HELD_MM))
+    return KnownStations(tuple(names[row] for row in kept), position_mm[kept], np.maximum(u_mm[kept], HELD_MM))
 
 
 def locate_stations(machine: Machine, lengths: Lengths) -> KnownStations:

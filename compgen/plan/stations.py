@@ -23,6 +23,7 @@ _OF_IDENTIFY = (
     "u_dead_length_um",
     "readings",
     "residual_rms_um",
+    "segment",
 )
 _BOX_COLUMNS = tuple(f"{axis}_{end}_mm" for axis in "xyz" for end in ("min", "max"))
 
@@ -75,7 +76,10 @@ def read_stations(path: str | Path) -> PlannedStations:
     known = tuple(dict.fromkeys(names))
     position_mm = np.zeros((len(known), 3))
     first: dict[tuple[str, int | None], int] = {}
-    for row, name in enumerate(names):
+    main = table.labels("segment") == 0 if "segment" in table.columns else np.ones(len(table), dtype=bool)
+    kept = np.flatnonzero(main).tolist()  # dead lengths that a beam break added are no set-ups to plan
+    for row in kept:
+        name = names[row]
         earlier = first.setdefault((name, None), row)
         if first.setdefault((name, int(setup[row])), row) != row:
             raise table.fail(
@@ -88,8 +92,8 @@ def read_stations(path: str | Path) -> PlannedStations:
             )
             raise table.fail(row, "x_mm", message)
         position_mm[known.index(name)] = where[row]
-    station = np.array([known.index(name) for name in names])
-    return PlannedStations(known, position_mm, np.column_stack([station, setup]))
+    station = np.array([known.index(names[row]) for row in kept])
+    return PlannedStations(known, position_mm, np.column_stack([station, setup[kept]]))
 
 
 def format_stations(stations: PlannedStations, machine: Machine) -> str:
