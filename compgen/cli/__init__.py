@@ -10,6 +10,7 @@ from compgen.cli import (
     export_commands,
     identify_commands,
     listing_commands,
+    options_commands,
     plan_commands,
     run_commands,
     safety_commands,
@@ -39,6 +40,7 @@ MODULES = (
     identify_commands,
     plan_commands,
     export_commands,
+    options_commands,
     safety_commands,
     listing_commands,
 )
