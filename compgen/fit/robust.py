@@ -1,19 +1,22 @@
 """Huber's loss: nodes far from the curve pull with a constant force instead of one that grows (Huber 1964).
 
 Solved by reweighting: a node at distance r from the curve has its weight times min(1, k u/r), k = 1.345, until nothing
-changes; the curve is then the minimum of Huber's loss plus the smoothness, within the bounds. With correlated nodes the
-variances of a distrusted node and its covariances are inflated alike. The start compares each node with the median of
+changes; the curve is then the minimum of Huber's loss plus the smoothness. Bounds are not part of that (they would make
+good data look like outliers): the fit within bounds takes the weights as they are. With correlated nodes the variances
+of a distrusted node and its covariances are inflated alike. The start compares each node with the median of
 five neighbours, because a curve chosen by the data might follow an outlier and see none.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.errors import ConvergenceError
+from compgen.fit.bounds import Bounds
 from compgen.fit.curve import Prepared, Weighted, prepare, smoothness, solve
 from compgen.fit.held import HeldCurve
 from compgen.fit.options import FitOptions
@@ -39,7 +42,7 @@ def robust(curves: Mapping[str, HeldCurve], options: FitOptions) -> tuple[list[P
         if count < _SEARCHES:
             weighted = [_search(item, options, trust) for item, trust in zip(prepared, trusts, strict=True)]
         prepared = [prepare(item.name, item.held, options, trust) for item, trust in zip(prepared, trusts, strict=True)]
-        found = solve(prepared, [item.mu for item in weighted])
+        found = solve([replace(item, bounds=Bounds()) for item in prepared], [item.mu for item in weighted])
         residuals = [item.y - solution.curve for item, solution in zip(prepared, found, strict=True)]
         if count < _SEARCHES:
             scales = [_scale(item, residual) for item, residual in zip(prepared, residuals, strict=True)]
