@@ -217,6 +217,8 @@ def _usable(machine: Machine, chosen: tuple[str, ...]) -> list[str]:
             stderr.print(f"{name} is left out: {error}", style="yellow", markup=False, soft_wrap=True)
         else:
             usable.append(name)
+    if not usable:
+        raise InputError("the machine file has complete settings for no control; add a section [controllers.NAME]")
     return usable
 
 

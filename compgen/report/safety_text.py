@@ -88,7 +88,7 @@ def merge_text(report: MergeReport) -> Text:
     """Return how close the merged table comes to old and new together."""
     text = (
         f"old and new together reach {report.total_max_um:.1f} um; the merged tables miss it by "
-        f"{report.difference_max_um:.2f} um max, {report.difference_rms_um:.2f} um rms"
+        f"{report.difference_max_um:.2f} um max, {report.difference_rms_um:.2f} um rms, with all that this control cannot hold"
     )
     if report.lost_um > 0.1:
         text += f"; {report.lost_um:.2f} um of the old tables belong to no error of the machine's model"

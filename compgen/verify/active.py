@@ -30,6 +30,7 @@ from compgen.errors import ConvergenceError, InputError
 from compgen.export.synthesis import Projector, projector
 from compgen.identify.travel import check_travel
 from compgen.model.exact import exact_error
+from compgen.model.grid import volume_grid
 from compgen.model.observability import modelled_errors
 from compgen.model.volumetric import coefficients
 from compgen.verify.verify import ReadTables, read_tables
@@ -135,20 +136,17 @@ def bare_errors(
     Returns
     -------
     The errors, with the uncertainties of ``errors`` (a table's numbers are exact), and the largest displacement in um
-    that no error of the model can express, such as a correction that belongs to no axis pair of the chain. The frame
-    stays: what the table moved at the reference point stands in the curves as a constant.
+    that the returned errors do not express: a correction that belongs to no error of the chain, or what a finer table
+    does between the nodes. The frame stays: what the table moved at the reference point stands in the curves as a constant.
     """
-    nodes = [curve_nodes_mm(machine, errors, axis) for axis in range(3)]
-    if keep_nodes:
-        control = active.tables.controller
-        own = control.table_nodes_mm(machine, active.tables.settings, active.tables.tables)
-        nodes = [
-            np.unique(np.concatenate([a, _within(machine, k, b)]))
-            for k, (a, b) in enumerate(zip(nodes, own, strict=True))
-        ]
-    solver = projector(machine, _model_terms(machine, errors, nodes), anchored=False)
+    measured = [curve_nodes_mm(machine, errors, axis) for axis in range(3)]
+    control = active.tables.controller
+    own = control.table_nodes_mm(machine, active.tables.settings, active.tables.tables)
+    both = [np.unique(np.concatenate([measured[k], _within(machine, k, own[k])])) for k in range(3)]
+    terms = _model_terms(machine, errors, both if keep_nodes else measured)
+    solver = projector(machine, terms, anchored=False)
     position_mm = solver.position_mm
-    added = active.correction(machine, Points(position_mm))
+    added = active.correction(machine, _upwards(position_mm))
     wanted = exact_error(machine, errors, position_mm) - added
     values = np.concatenate([term.start for term in solver.basis])
     for _ in range(MOST_PASSES):
@@ -157,8 +155,23 @@ def bare_errors(
         change = solver.project_all(-rest[None])[0]
         values = values + change
         if np.max(np.abs(solver.field(change))) < CONVERGED_MM:
-            return found, float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM
+            grid = volume_grid(machine, (both[0], both[1], both[2]))
+            return found, _lost_um(machine, errors, found, active, grid.position_mm)
     raise ConvergenceError("the effect of the active tables cannot be taken out: the iteration does not settle")
+
+
+def _lost_um(
+    machine: Machine, measured: ErrorTable, found: ErrorTable, active: ActiveTables, position_mm: FloatArray
+) -> float:
+    """Largest displacement at points (n, 3) by which bare errors and active tables miss the measured errors, um."""
+    added = active.correction(machine, _upwards(position_mm))
+    rest = exact_error(machine, measured, position_mm) - added - exact_error(machine, found, position_mm + added)
+    return float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM
+
+
+def _upwards(position_mm: FloatArray) -> Points:
+    """Points approached upwards on every axis, for tables of one direction."""
+    return Points(position_mm, approach=np.ones_like(position_mm))
 
 
 def _within(machine: Machine, axis: int, nodes_mm: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from compgen.verify.verify import ReadTables
 
 #: Components below this, um rms, are left out of the list.
 NAMED_FROM_UM = 0.001
+#: Tuples longer than this are numbers of a table, which the correction shows.
+MOST_LISTED = 3
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,7 @@ def _settings(first: ReadTables, second: ReadTables) -> list[tuple[str, str, str
 
 
 def _facts(value: Any, name: str = "") -> dict[str, str]:
-    """Flatten settings or tables to texts by name; numbers of tables (decimal, floating) are left out."""
+    """Flatten settings or tables to texts by name; arrays and the values of tables are left out."""
     if is_dataclass(value) and not isinstance(value, type):
         compared = (item.name for item in fields(value) if item.compare)
         items: list[tuple[str, Any]] = [(key, getattr(value, key)) for key in compared]
@@ -161,10 +164,10 @@ def _facts(value: Any, name: str = "") -> dict[str, str]:
         items = [(str(key), item) for key, item in value.items()]
     elif isinstance(value, tuple | list) and any(is_dataclass(item) for item in value):
         items = [(str(k), item) for k, item in enumerate(value)]
-    elif isinstance(value, bool | str | int) or value is None:
+    elif isinstance(value, bool | str | int | float | Decimal) or value is None:
         return {name: str(value)}
-    elif isinstance(value, tuple) and all(isinstance(item, str) for item in value):
-        return {name: ", ".join(value)}
+    elif isinstance(value, tuple) and len(value) <= MOST_LISTED:
+        return {name: ", ".join(map(str, value))}
     else:
         return {}
     found: dict[str, str] = {}
