@@ -6,13 +6,22 @@ from compgen.controllers.base import Usage
 from compgen.report.options_text import markdown_table, tool_name, um
 from compgen.verify.capability import Left, LevelResult
 from compgen.verify.explain import CORRECTED_UM, Explanation
-from compgen.verify.levels import LABELS
+
+#: An error counts as corrected, in part at least, if less than this share of it stays.
+LEAST_HELP = 0.9
+#: What a control of each level holds, in words.
+HOLDS = {
+    "pitch": "positioning along each axis",
+    "squareness": "positioning, straightness and squareness",
+    "products": "positioning, straightness, squareness, and angles as products of tables",
+    "volumetric": "all errors of its volumetric model, at the tool in use",
+}
 
 
 def explanation_markdown(item: Explanation) -> str:
     """Return ``explain.md``."""
     parts = [
-        f"# {item.controller} on {item.machine}\n\nThis control holds: {LABELS[item.level]}.{_figures(item)}\n",
+        f"# {item.controller} on {item.machine}\n\nThis control holds {HOLDS[item.level]}.{_figures(item)}\n",
         _corrected(item),
         _stays(item),
         _next(item),
@@ -34,7 +43,8 @@ def _figures(item: Explanation) -> str:
 
 
 def _corrected(item: Explanation) -> str:
-    rows = [[fate.name, um(fate.before_um), um(fate.after_um)] for fate in item.fates if fate.after_um < fate.before_um]
+    helped = [fate for fate in item.fates if fate.after_um < LEAST_HELP * fate.before_um]
+    rows = [[fate.name, um(fate.before_um), um(fate.after_um)] for fate in helped]
     if not rows:
         return ""
     return "## What it corrects\n\n" + markdown_table(["error", "displacement before, um", "left, um"], rows)
@@ -43,7 +53,7 @@ def _corrected(item: Explanation) -> str:
 def _stays(item: Explanation) -> str:
     rows = [[fate.name, um(fate.after_um), fate.why] for fate in item.fates if fate.after_um > CORRECTED_UM]
     table = markdown_table(["error", "left, um", "why"], rows) if rows else f"Nothing above {CORRECTED_UM:g} um.\n"
-    notes = "".join(f"\n{note}.\n" for note in item.options.notes)
+    notes = "".join(f"\n{note[0].upper()}{note[1:]}.\n" for note in item.notes)
     other = ""
     if item.level != "volumetric":
         tools = [f"{um(left.after.max_um)} um at {tool}" for tool, left in _by_tool(item)]

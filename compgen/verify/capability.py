@@ -304,19 +304,22 @@ def _control_result(
     return replace(result, level=level, directional=directional, left=left, broken=tuple(made.violations))
 
 
-def _notes(errors: ErrorTable, reversal: ReversalCurves | None) -> list[str]:
-    found = []
+def missing_notes(errors: ErrorTable) -> list[str]:
+    """Say which of the 21 errors are not known, and when that matters."""
     missing = [name for name in ERROR_NAMES if name not in errors.names]
-    if missing:
-        found.append(
-            f"not in the errors file, so taken as zero: {', '.join(missing)}; with a tool of another offset than the one "
-            "measured with, some of them act too"
-        )
+    if not missing:
+        return []
+    return [
+        f"not in the errors file, so taken as zero: {', '.join(missing)}; with a tool of another offset than the one "
+        "measured with, some of them act too"
+    ]
+
+
+def _notes(errors: ErrorTable, reversal: ReversalCurves | None) -> list[str]:
     if reversal is None:
-        found.append("no reversal was given: both directions of travel are taken as equal")
-    else:
-        found.append(
-            "controls without tables of one direction are shown with the whole reversal left; their backlash parameter "
-            "takes out what lies along the axis"
-        )
-    return found
+        return [*missing_notes(errors), "no reversal was given: both directions of travel are taken as equal"]
+    return [
+        *missing_notes(errors),
+        "controls without tables of one direction are shown with the whole reversal left; their backlash parameter "
+        "takes out what lies along the axis",
+    ]

@@ -18,7 +18,7 @@ from compgen.core.reversal import ReversalCurves
 from compgen.export import Export
 from compgen.export.synthesis import projector
 from compgen.model.volumetric import tool_of
-from compgen.verify.capability import Capability, ControlResult, capability
+from compgen.verify.capability import Capability, ControlResult, capability, missing_notes
 from compgen.verify.levels import Level, level_key
 from compgen.verify.reversal import left_by_reversal
 from compgen.verify.safety import Step, safety_of
@@ -56,6 +56,7 @@ class Explanation:
     violations: tuple[str, ...]
     options: Capability
     own: ControlResult | None
+    notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
@@ -88,13 +89,14 @@ def explain(
     values = np.concatenate([term.start for term in solver.basis])
     level = level_key(solver.basis)
     safety = safety_of(machine, control, tables, lambda part: solver.field(values, part))
-    options = capability(machine, errors, reversal=reversal, templates=templates, controllers=(control.name,))
+    known = None if control.bidirectional else reversal  # its tables take the reversal out: what stays is the rest
+    options = capability(machine, errors, reversal=known, templates=templates, controllers=(control.name,))
     usage = sorted(control.usage(machine, settings, tables), key=lambda item: -item.share)
     return Explanation(
         controller=control.name,
         machine=machine.name,
         level=level,
-        fates=tuple(_fates(machine, errors, Level("own", solver), level))
+        fates=tuple(_fates(machine, errors, Level("own", solver), level, anchored=control.anchored))
         + tuple(_reversal_fates(reversal, control.bidirectional)),
         nodes=_nodes(control, machine, settings, tables),
         rounding_um=control.resolution_mm(settings) / MM_PER_UM,
@@ -103,13 +105,14 @@ def explain(
         violations=tuple(exported.violations),
         options=options,
         own=next((item for item in options.controls if item.own), None),
+        notes=tuple(missing_notes(errors)),
     )
 
 
-def _fates(machine: Machine, errors: ErrorTable, own: Level, level: str) -> list[Fate]:
+def _fates(machine: Machine, errors: ErrorTable, own: Level, level: str, *, anchored: bool) -> list[Fate]:
     tool_mm = tool_of(machine, None)
-    before = Level("nothing").left_alone_um(machine, errors, tool_mm)
-    after = own.left_alone_um(machine, errors, tool_mm)
+    before = Level("nothing").left_alone_um(machine, errors, tool_mm, anchored=anchored)
+    after = own.left_alone_um(machine, errors, tool_mm, anchored=anchored)
     return [
         Fate(name, before[name], after[name], _why(name, level) if after[name] > CORRECTED_UM else "")
         for name in sorted(before, key=lambda name: -after[name])

@@ -72,8 +72,13 @@ class Level:
             added -= self.reversal.displacement(position_mm, approach)
         return added
 
-    def left_alone_um(self, machine: Machine, errors: ErrorTable, tool_mm: FloatArray) -> dict[str, float]:
-        """Return the largest displacement (um, first order) that each error by itself leaves with a tool (3,)."""
+    def left_alone_um(
+        self, machine: Machine, errors: ErrorTable, tool_mm: FloatArray, *, anchored: bool = False
+    ) -> dict[str, float]:
+        """Return the largest displacement (um, first order) that each error by itself leaves with a tool (3,).
+
+        With ``anchored`` the mean over the volume does not count: such tables cannot hold a constant.
+        """
         if self.key in ("volumetric", "directional"):  # the control evaluates E = C P with the tool in use
             return dict.fromkeys(errors.names, 0.0)
         position_mm = _points(machine, errors) if self.solver is None else self.solver.position_mm
@@ -85,7 +90,7 @@ class Level:
             rest = volumetric_error(machine, part, position_mm, tool_mm)
             if self.solver is not None and tables is not None:
                 rest = rest + self.solver.field(tables[k])
-                rest = rest - rest.mean(axis=0) if self.solver.offsets else rest  # a constant that it cannot hold
+            rest = rest - rest.mean(axis=0) if anchored else rest
             found[name] = float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM
         return found
 
