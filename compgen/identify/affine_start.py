@@ -16,7 +16,8 @@ from compgen.identify.state import State
 
 #: Cells of the grid that are looked at, spread over the volume.
 SAMPLE = 150
-STEPS = 2
+#: One step leaves less than what the curves, which the map does not hold, do to it anyway.
+STEPS = 1
 #: Reciprocal condition below which the readings do not determine the affine map, and the start is left as it is.
 LEAST_RCOND = 1e-12
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -206,39 +207,56 @@ class GridProblem:
 
     def evaluate(self, state: State) -> tuple[float, FloatArray]:
         """Half the weighted sum of squares with the exact model, and its exact gradient (size,)."""
-        cost = 0.5 * self.scatter
         gradient = np.zeros(self.size)
+        loops = compiled_loops()
+        if loops is not None:
+            return 0.5 * self.scatter + self._compiled(loops, state, gradient), gradient
+        cost = 0.5 * self.scatter
         bodies, places = self._geometry(state)
         for data, tips in zip(self.tools, places, strict=True):
-            cost += self._backward(state, data, bodies, tips, gradient)
+            force = np.zeros_like(tips[-1])
+            cost += self._forces(state, data, tips[-1], force, gradient)
+            _pull_back(self, bodies, tips, force, gradient)
         return cost, gradient
 
-    def _backward(
-        self, state: State, data: ToolData, bodies: Sequence[_Body], tips: Sequence[FloatArray], gradient: FloatArray
-    ) -> float:
-        force = np.zeros_like(tips[-1])
-        loops = compiled_loops()
-        if loops is None:
-            cost = self._forces(state, data, tips[-1], force, gradient)
-        else:
-            by_group = np.zeros((self.groups, 4))
-            stations = state.stations_mm[self.station_of]
-            cost = float(
-                loops.forces(
-                    np.ascontiguousarray(tips[-1]),
-                    stations,
+    def _compiled(self, loops: ModuleType, state: State, gradient: FloatArray) -> float:
+        """Return the cost and add the gradient, all in one compiled pass."""
+        parameters = self.parameters
+        directions, derivatives = travel_directions(parameters.machine, _squareness(parameters, state))
+        motion = (self.motion @ state.errors).reshape(-1, 6)
+        own = _level_slices(self.levels_mm)
+        travel = np.concatenate([self.levels_mm[axis][:, None] * directions[axis] for axis in range(3)])
+        sides = dict(passing_order(parameters.machine))
+        by_motion, by_group, cost = np.zeros_like(motion), np.zeros((self.groups, 4)), 0.0
+        for data in self.tools:
+            by_tool = np.zeros_like(motion)
+            cost += float(
+                loops.chain_gradient(
+                    np.array(self.order[::-1]),
+                    np.array([rows.start for rows in own]),
+                    np.array([len(levels) for levels in self.levels_mm]),
+                    np.array([int(sides[axis]) for axis in range(3)]),
+                    motion,
+                    travel,
+                    data.tool_mm,
+                    state.stations_mm[self.station_of],
                     state.dead_length_mm,
                     data.weight,
                     data.length_mm,
-                    force,
+                    by_tool,
                     by_group,
                 )
             )
-            first, second = self.parameters.size, self.parameters.size + 3 * self.stations
-            for group, station in enumerate(self.station_of.tolist()):
-                gradient[first + 3 * station : first + 3 * station + 3] += by_group[group, :3]
-            gradient[second:] += by_group[:, 3]
-        _pull_back(self, bodies, tips, force, gradient)
+            by_motion += by_tool
+        first, second = parameters.size, parameters.size + 3 * self.stations
+        gradient[:first] += by_motion.ravel() @ self.motion
+        by_direction = [self.levels_mm[axis] @ by_motion[own[axis], :3] for axis in range(3)]
+        for k, name in enumerate(parameters.squareness):
+            part = np.vdot(by_direction, derivatives[:, :, SQUARENESS_NAMES.index(name)])
+            gradient[first - len(parameters.squareness) + k] += float(part)
+        for group, station in enumerate(self.station_of.tolist()):
+            gradient[first + 3 * station : first + 3 * station + 3] += by_group[group, :3]
+        gradient[second:] += by_group[:, 3]
         return cost
 
     def _forces(self, state: State, data: ToolData, tip: FloatArray, force: FloatArray, gradient: FloatArray) -> float:
