@@ -241,10 +241,10 @@ def _level_result(
     by_tool = []
     reversed_um = left_by_reversal(reversal, corrected=False)
     left_um = left_by_reversal(reversal, corrected=level.reversal is not None)
-    for tool in (np.array(item) for item in tools_mm):
+    tools = [np.array(item, dtype=np.float64) for item in tools_mm]
+    for tool, alone in zip(tools, level.left_alone_um(machine, errors, tools), strict=True):
         correction = level.correction(points.position_mm, approach, tool)
         left = _left(machine, errors, points, correction, reversal, tool)
-        alone = level.left_alone_um(machine, errors, tool)
         by_tool.append((left, {**alone, **dict.fromkeys(reversed_um, 0.0), **left_um}))
     return LevelResult(level.key, by_tool[0][0], tuple(by_tool))
 

@@ -111,8 +111,8 @@ def explain(
 
 def _fates(machine: Machine, errors: ErrorTable, own: Level, level: str, *, anchored: bool) -> list[Fate]:
     tool_mm = tool_of(machine, None)
-    before = Level("nothing").left_alone_um(machine, errors, tool_mm, anchored=anchored)
-    after = own.left_alone_um(machine, errors, tool_mm, anchored=anchored)
+    (before,) = Level("nothing").left_alone_um(machine, errors, [tool_mm], anchored=anchored)
+    (after,) = own.left_alone_um(machine, errors, [tool_mm], anchored=anchored)
     return [
         Fate(name, before[name], after[name], _why(name, level) if after[name] > CORRECTED_UM else "")
         for name in sorted(before, key=lambda name: -after[name])

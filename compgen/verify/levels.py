@@ -73,25 +73,26 @@ class Level:
         return added
 
     def left_alone_um(
-        self, machine: Machine, errors: ErrorTable, tool_mm: FloatArray, *, anchored: bool = False
-    ) -> dict[str, float]:
-        """Return the largest displacement (um, first order) that each error by itself leaves with a tool (3,).
+        self, machine: Machine, errors: ErrorTable, tools_mm: Sequence[FloatArray], *, anchored: bool = False
+    ) -> list[dict[str, float]]:
+        """Return the largest displacement (um, first order) that each error by itself leaves, for each tool (3,).
 
         With ``anchored`` the mean over the volume does not count: such tables cannot hold a constant.
         """
         if self.key in ("volumetric", "directional"):  # the control evaluates E = C P with the tool in use
-            return dict.fromkeys(errors.names, 0.0)
+            return [dict.fromkeys(errors.names, 0.0) for _ in tools_mm]
         position_mm = _points(machine, errors) if self.solver is None else self.solver.position_mm
-        own = [errors.only(name) for name in errors.names]
-        wanted = np.stack([-volumetric_error(machine, part, position_mm) for part in own])
-        found = {}
-        tables = None if self.solver is None else _best(self.solver, self.pitch, wanted)
-        for k, (name, part) in enumerate(zip(errors.names, own, strict=True)):
-            rest = volumetric_error(machine, part, position_mm, tool_mm)
-            if self.solver is not None and tables is not None:
-                rest = rest + self.solver.field(tables[k])
-            rest = rest - rest.mean(axis=0) if anchored else rest
-            found[name] = float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM
+        found: list[dict[str, float]] = [{} for _ in tools_mm]
+        for name in errors.names:
+            part = errors.only(name)
+            added = np.zeros_like(position_mm)
+            if self.solver is not None:
+                wanted = -volumetric_error(machine, part, position_mm)
+                added = self.solver.field(_best(self.solver, self.pitch, wanted))
+            for tool, left in zip(tools_mm, found, strict=True):
+                rest = volumetric_error(machine, part, position_mm, tool) + added
+                rest = rest - rest.mean(axis=0) if anchored else rest
+                left[name] = float(np.sqrt(np.max(np.einsum("ij,ij->i", rest, rest)))) / MM_PER_UM
         return found
 
 
@@ -140,13 +141,11 @@ def _basis(key: str, machine: Machine, errors: ErrorTable, nodes_mm: Sequence[Fl
 
 
 def _best(solver: Projector, pitch: Projector | None, wanted_mm: FloatArray) -> FloatArray:
-    """Table values (k, parameters) closest to k wanted fields (k, n, 3); with ``pitch`` those without squareness."""
-    values = solver.project_all(wanted_mm)
+    """Table values (parameters,) closest to a wanted field (n, 3); with ``pitch`` those without squareness."""
+    values = solver.project(wanted_mm)
     if pitch is not None:
-        for k, wanted in enumerate(wanted_mm):
-            _take_lines_out(solver, values[k])
-            own = _columns(solver, along=True)
-            values[k, own] = pitch.project(wanted - solver.field(values[k]))
+        _take_lines_out(solver, values)
+        values[_columns(solver, along=True)] = pitch.project(wanted_mm - solver.field(values))
     return values
 
 
@@ -188,7 +187,7 @@ def levels_of(machine: Machine, errors: ErrorTable, reversal: ReversalCurves | N
     for key, solver in solvers.items():
         wanted = wanted_correction(machine, errors, solver.position_mm)
         if key == "squareness":
-            values = _best(solver, solvers["pitch"], wanted[None])[0]
+            values = _best(solver, solvers["pitch"], wanted)
             found.append(Level("straightness", solver, values, solvers["pitch"]))
         start = np.concatenate([term.start for term in solver.basis])
         found.append(Level(key, solver, solver.project(wanted, start)))
