@@ -32,7 +32,7 @@ from compgen.fit.stacked import CurveProblem, Stack
 OURS, OSQP, CVXPY = "compgen", "OSQP cold", "cvxpy+Clarabel"
 CURVES = 18
 #: Bounds so wide that no curve touches them.
-WIDE = 1e3
+WIDE = 1.5
 
 
 def curves(n: int, *, active: bool, seed: int = 0) -> list[CurveProblem]:
@@ -117,7 +117,7 @@ def referee(problems: Sequence[CurveProblem]) -> list[FloatArray]:
         stretch = sp.diags_array(scale)
         settings = clarabel.DefaultSettings()
         settings.verbose = False
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-15
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-13
         rows = sp.csc_matrix(sp.vstack([matrix, -matrix]) / np.tile(limit, 2)[:, None] @ stretch)
         cone = [clarabel.NonnegativeConeT(2 * len(limit))]
         inner = sp.triu(sp.csc_matrix(stretch @ quadratic @ stretch), format="csc")
@@ -146,7 +146,7 @@ def compare(n: int, runs: int, *, active: bool, slow: bool) -> None:
         timing.print_comparison(title, comparison, references=(OURS,))
         expected = referee(problems)
         shown = {OURS: ours(problems), OSQP: with_osqp(problems) if OSQP in functions else None}
-    touched = sum(bool(solution.active) for solution in solve_curves(problems))
+    touched = sum(bool(solution.touched.any()) for solution in solve_curves(problems))
     far = {name: f"{deviation(found, expected):.1e}" for name, found in shown.items() if found is not None}
     if CVXPY in functions:
         far[CVXPY] = f"{deviation(with_cvxpy(problems), expected):.1e}"

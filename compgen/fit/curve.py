@@ -11,7 +11,7 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve
 from compgen.core.names import error_named
-from compgen.fit.bounds import Bounds
+from compgen.fit.bounds import Bounds, active_bounds
 from compgen.fit.correlated import CorrelatedSmoother, propagated
 from compgen.fit.held import HeldCurve
 from compgen.fit.options import FitOptions
@@ -176,7 +176,7 @@ def _report(prepared: Prepared, weighted: Weighted, solution: Solution, bias: Fl
         smoothing_bias_max=float(np.abs(bias).max()),
         smoothing_bias_rms=float(np.sqrt(np.mean(bias**2))),
         smoothing_bias=bias,
-        active_bounds=solution.active,
+        active_bounds=active_bounds(prepared.held.position_mm, solution.touched, prepared.bounds),
         solver=solution.solver,
         correlated=prepared.covariance is not None,
         distrusted_mm=tuple(float(prepared.held.position_mm[k]) for k in distrusted),

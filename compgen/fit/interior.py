@@ -19,11 +19,14 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from compgen.core.csvio import FloatArray
 from compgen.fit.bounds import Bounds, slope_limits
-from compgen.fit.stacked import Stack, band_of, curvature_rows, gather, spread, steps, windows
+from compgen.fit.stacked import Stack, band_of, curvature_rows, gather, spread, steps_mm, windows
 
-_STEPS = 60
+STEPS = 60
 #: A curve is done when its complementarity is below this share of what the bounds cost.
 _CLOSED = 1e-9
+_BROKEN = 1e-6
+#: Curves that are done leave the stack when they are at least this share of it.
+_SHRINK = 0.3
 _TINY = np.finfo(float).tiny
 BoolArray = NDArray[np.bool_]
 
@@ -39,6 +42,10 @@ class RowStack:
     kinds: tuple[int, ...]
     rows: FloatArray
     limit: FloatArray
+
+    def pick(self, nodes: BoolArray) -> RowStack:
+        """Keep the rows of the chosen nodes (N,)."""
+        return RowStack(self.kinds, self.rows[..., nodes], self.limit[..., nodes])
 
     @property
     def there(self) -> BoolArray:
@@ -65,7 +72,7 @@ class RowStack:
 
 def row_stack(stack: Stack, bounds: Sequence[Bounds], curve: FloatArray) -> RowStack:
     """Build the rows; ``curve`` (N,), the one without bounds, gives the scale of slopes that have only a direction."""
-    step = steps(stack)
+    step = steps_mm(stack)
     limits = np.array([bound.limits for bound in bounds]).T
     steepest = np.maximum(stack.largest(np.abs(stack.slopes(curve))), _TINY)
     scaled = [slope_limits(bound, float(typical)) for bound, typical in zip(bounds, steepest, strict=True)]
@@ -112,34 +119,56 @@ class _Iterate:
     slack: FloatArray
     multiplier: FloatArray
 
+    def pick(self, nodes: BoolArray) -> _Iterate:
+        """Keep the chosen nodes (N,)."""
+        return _Iterate(self.c[nodes], self.slack[..., nodes], self.multiplier[..., nodes])
 
-def interior(stack: Stack, rows: RowStack, free_curve: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+
+def interior(
+    stack: Stack, rows: RowStack, free_curve: FloatArray, steps: int = STEPS
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Curves (N,), multipliers (2, B, N) near the optimum, and which curves (k,) came there.
 
-    ``free_curve`` (N,) is the solution without bounds.
+    ``free_curve`` (N,) is the solution without bounds; ``steps`` the largest number of Newton steps.
     """
-    there = rows.there
-    count = np.maximum(_sum(stack, there.astype(float)), 1.0)
-    now = _begin(stack, rows, free_curve, there, count)
-    done, failed = np.zeros(len(stack.starts), bool), np.zeros(len(stack.starts), bool)
-    for _ in range(_STEPS):
+    owner = np.repeat(np.arange(len(stack.starts)), stack.sizes)
+    now = _begin(stack, rows, free_curve)
+    c, multiplier, done = free_curve.copy(), np.zeros_like(now.multiplier), np.zeros(len(stack.starts), bool)
+    left = np.arange(len(stack.starts))  # the curves of the stack that are still worked on
+    failed = np.zeros(len(left), bool)
+    for count in range(steps + 1):
         gap = _sum(stack, now.slack * now.multiplier)
-        cost = 0.5 * stack.total((now.c - free_curve) * stack.apply(now.c - free_curve))
-        broken = stack.largest(np.where(there, rows.values(now.c) - rows.limit, 0.0).max(axis=(0, 1)))
-        done |= (gap <= _CLOSED * np.maximum(cost, _TINY)) & (broken <= 1e-6)
-        if (done | failed).all():
+        closed = ~failed & _closed(stack, rows, now, free_curve, gap)
+        stop = closed | failed | (count == steps)
+        if stop.sum() >= _SHRINK * len(stop):  # the work goes with the number of nodes
+            nodes = np.isin(owner, left[stop])
+            c[nodes], multiplier[..., nodes] = now.c[stack.of_each(stop)], now.multiplier[..., stack.of_each(stop)]
+            done[left[closed]] = True
+            kept = stack.of_each(~stop)
+            stack, rows, now, free_curve = stack.pick(~stop), rows.pick(kept), now.pick(kept), free_curve[kept]
+            left, failed, gap, stop = left[~stop], failed[~stop], gap[~stop], stop[~stop]
+        if not len(left):
             break
-        bad = _step(stack, rows, now, there, gap / count, ~(done | failed))
-        failed[bad] = True
-    return now.c, now.multiplier, done
+        failed[_step(stack, rows, now, gap, ~stop)] = True
+    return c, multiplier, done
+
+
+def _closed(stack: Stack, rows: RowStack, now: _Iterate, free_curve: FloatArray, gap: FloatArray) -> BoolArray:
+    """Whether bounds are kept and the complementarity is small against what the bounds cost, for each curve (k,)."""
+    away = now.c - free_curve
+    cost = 0.5 * stack.total(away * stack.apply(away))
+    broken = stack.largest(np.where(rows.there, rows.values(now.c) - rows.limit, 0.0).max(axis=(0, 1)))
+    return np.asarray((gap <= _CLOSED * np.maximum(cost, _TINY)) & (broken <= _BROKEN))
 
 
 def _sum(stack: Stack, values: FloatArray) -> FloatArray:
     return stack.total(values.sum(axis=(0, 1)))
 
 
-def _begin(stack: Stack, rows: RowStack, free_curve: FloatArray, there: BoolArray, count: FloatArray) -> _Iterate:
+def _begin(stack: Stack, rows: RowStack, free_curve: FloatArray) -> _Iterate:
     """Start at the free curve, shrunk to half of the bounds that it breaks; monotone rows begin with open slack."""
+    there = rows.there
+    count = _rows_of_each(stack, there)
     values = rows.values(free_curve)
     bounded = there & (rows.limit > 0)
     over = stack.largest(np.where(bounded, values / np.where(bounded, rows.limit, 1.0), 0.0).max(axis=(0, 1)))
@@ -151,10 +180,14 @@ def _begin(stack: Stack, rows: RowStack, free_curve: FloatArray, there: BoolArra
     return _Iterate(c, slack, np.where(there, level / slack, 0.0))
 
 
-def _step(
-    stack: Stack, rows: RowStack, now: _Iterate, there: BoolArray, mean: FloatArray, moving: BoolArray
-) -> list[int]:
+def _rows_of_each(stack: Stack, there: BoolArray) -> FloatArray:
+    return np.maximum(_sum(stack, there.astype(float)), 1.0)
+
+
+def _step(stack: Stack, rows: RowStack, now: _Iterate, gap: FloatArray, moving: BoolArray) -> list[int]:
     """One predictor and corrector step of the ``moving`` curves, in place; returns curves whose matrix broke down."""
+    there = rows.there
+    mean = gap / _rows_of_each(stack, there)
     weight = now.multiplier / now.slack
     band = stack.band()
     rows.add_band(band, weight)

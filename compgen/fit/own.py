@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from compgen.errors import ConvergenceError, InputError
-from compgen.fit.bounds import active_bounds, constraint_rows
+from compgen.fit.bounds import constraint_rows
 from compgen.fit.curve import Prepared
 from compgen.fit.solve import Solution
 
@@ -154,4 +154,4 @@ def _solution(item: Prepared, x: np.ndarray) -> Solution:
     rows = constraint_rows(item.held.position_mm, item.smoother, *item.bounds.limits, item.bounds.direction)
     values = np.asarray(rows.matrix @ curve)
     near = np.where(values >= rows.upper - TOLERANCE, 1.0, np.where(values <= rows.lower + TOLERANCE, -1.0, 0.0))
-    return Solution(curve, active_bounds(item.held.position_mm, near, item.bounds), "cvxpy")
+    return Solution(curve, near, "cvxpy")

@@ -20,7 +20,7 @@ from compgen.fit.bounds import KEPT
 from compgen.fit.interior import RowStack
 from compgen.fit.stacked import Stack, band_of, gather, spread
 
-_ROUNDS, _PASSES = 12, 40
+ROUNDS, _PASSES = 12, 40
 _WEIGHT = 1e4
 _SIGN = 1e-8
 _LEFT, _EQUAL = 1e-11, 1e-11
@@ -28,9 +28,9 @@ BoolArray = NDArray[np.bool_]
 
 
 def polish(
-    stack: Stack, rows: RowStack, curve: FloatArray, multiplier: FloatArray
+    stack: Stack, rows: RowStack, curve: FloatArray, multiplier: FloatArray, rounds: int = ROUNDS
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Curves (N,), active rows (B, N) of -1, 0, 1, and which curves (k,) passed; from :func:`interior`'s result."""
+    """Curves (N,), active rows (B, N) of -1, 0, 1, and which curves (k,) passed, from the interior point's result."""
     slack = np.where(rows.there, rows.limit - rows.values(curve), np.inf)
     scale = stack.largest(multiplier.max(axis=(0, 1)))
     tight = (multiplier > 1e-6 * stack.of_each(scale)) & (slack < 1e-3)
@@ -39,7 +39,7 @@ def polish(
     active = tight[0].astype(float) - tight[1]
     solved = np.zeros(len(stack.starts), bool)
     kept, held = curve.copy(), active.copy()
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         found = equalities(stack, rows, active, curve)
         if found is None:
             break
@@ -62,7 +62,7 @@ def equalities(
 ) -> tuple[FloatArray, FloatArray, BoolArray] | None:
     """Curves (N,) with the ``active`` rows at their limits, multipliers (B, N), and where that is exact (k,)."""
     band = stack.band()
-    height = np.array([band[0].max()]) if not len(stack.starts) else stack.of_each(stack.largest(band[0]))
+    height = stack.of_each(stack.largest(band[0]))
     norm = (rows.rows**2).sum(axis=1)
     weight = np.where(active != 0, _WEIGHT * height / np.where(norm > 0, norm, 1.0), 0.0)
     target = np.where(active > 0, rows.limit[0], np.where(active < 0, -rows.limit[1], 0.0))

@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
 from compgen.fit.bounded import fit_bounded
-from compgen.fit.bounds import KEPT, Bounds, active_bounds, constraint_rows
+from compgen.fit.bounds import KEPT, Bounds, constraint_rows
 from compgen.fit.interior import RowStack, interior, row_stack
 from compgen.fit.polish import polish
-from compgen.fit.result import ActiveBound
 from compgen.fit.smooth import Smoother
 from compgen.fit.stacked import CurveProblem, Stack, curvatures_of
 
+#: The interior point method is broken off early: mostly the active bounds are known by then, or nearly.
+_FIRST_STEPS, _FIRST_ROUNDS = 10, 4
 DIRECT, INTERIOR = "direct", "interior point"
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A fitted ``curve`` (n,) in the unit of its data, the bounds that it touches, and who found it."""
+    """A fitted ``curve`` (n,) in the unit of its data, the bounds that it touches, and who found it.
+
+    ``touched`` holds -1, 0, 1 for n values, n - 1 slopes and n - 2 curvatures; empty if no bound is touched.
+    """
 
     curve: FloatArray
-    active: tuple[ActiveBound, ...] = ()
+    touched: FloatArray = field(default_factory=lambda: np.zeros(0))
     solver: str = DIRECT
 
 
@@ -65,15 +69,17 @@ def _bounded(problems: Sequence[CurveProblem]) -> list[Solution]:
     stack = Stack.build(problems)
     free = stack.solve()
     rows = row_stack(stack, [problem.bounds for problem in problems], free)
-    near, multiplier, closed = interior(stack, rows, free)
-    curve, active, exact = polish(stack, rows, near, multiplier)
+    near, multiplier, closed = interior(stack, rows, free, _FIRST_STEPS)
+    curve, active, exact = polish(stack, rows, near, multiplier, _FIRST_ROUNDS)
+    if not exact.all():
+        again, nodes = ~exact, stack.of_each(~exact)
+        some, few = stack.pick(again), rows.pick(nodes)
+        near[nodes], multiplier[..., nodes], closed[again] = interior(some, few, free[nodes])
+        curve[nodes], active[..., nodes], exact[again] = polish(some, few, near[nodes], multiplier[..., nodes])
     curve = np.where(stack.of_each(exact), curve, near)
     within = stack.largest((rows.values(curve) - rows.limit).max(axis=(0, 1))) <= KEPT
     parts = zip(problems, stack.split(curve), _split_rows(stack, rows, active), exact | (closed & within), strict=True)
-    return [
-        Solution(part, active_bounds(problem.position_mm, touched, problem.bounds), INTERIOR) if good else _one(problem)
-        for problem, part, touched, good in parts
-    ]
+    return [Solution(part, touched, INTERIOR) if good else _one(problem) for problem, part, touched, good in parts]
 
 
 def _split_rows(stack: Stack, rows: RowStack, active: FloatArray) -> list[FloatArray]:
@@ -102,4 +108,4 @@ def solve_general(problem: CurveProblem, smoother: Smoother) -> Solution:
     scaled = replace(problem, bounds=bounds.in_unit(unit), y=problem.y / unit)
     rows = constraint_rows(problem.position_mm, smoother, *scaled.bounds.limits, bounds.direction)
     found = fit_bounded(smoother, problem.mu, scaled.y, rows)
-    return Solution(found.curve * unit, active_bounds(problem.position_mm, found.active, bounds), found.solver)
+    return Solution(found.curve * unit, found.active, found.solver)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,13 @@ class Stack:
             starts, sizes, position, weight, free, bend, weight * np.concatenate([problem.y for problem in problems])
         )
 
-    def of_each(self, values: FloatArray | NDArray[np.bool_]) -> FloatArray:
+    def pick(self, chosen: NDArray[np.bool_]) -> Stack:
+        """Stack of the curves that are chosen (k,)."""
+        nodes, sizes = self.of_each(chosen), self.sizes[chosen]
+        parts = (self.position_mm, self.weight, self.free, self.bend, self.pull)
+        return Stack(np.cumsum(sizes) - sizes, sizes, *(part[..., nodes] for part in parts))
+
+    def of_each(self, values: Any) -> Any:
         """Repeat one value per curve (k,) over its nodes (N,)."""
         return np.repeat(values, self.sizes)
 
@@ -92,7 +99,7 @@ class Stack:
         slope = np.zeros(len(c))
         slope[:-1] = np.diff(c)
         slope[self.starts + self.sizes - 1] = 0.0
-        return slope / steps(self)
+        return slope / steps_mm(self)
 
     def band(self) -> FloatArray:
         """A as a lower band (3, N), entry [d, j] couples j and j + d; held nodes have 1 on the diagonal."""
@@ -139,7 +146,7 @@ def _second_difference(position_mm: FloatArray, ends: IntArray, root: FloatArray
     return found
 
 
-def steps(stack: Stack) -> FloatArray:
+def steps_mm(stack: Stack) -> FloatArray:
     """Distance (N,) from each node to the next of its curve, inf at the last."""
     step = np.full(len(stack.position_mm), math.inf)
     step[:-1] = np.diff(stack.position_mm)
@@ -159,7 +166,7 @@ def curvature_rows(step: FloatArray) -> FloatArray:
 
 def curvatures_of(stack: Stack, c: FloatArray) -> FloatArray:
     """Second derivative (N,) in the window that begins at each node, see :func:`compgen.fit.bounds.curvature`."""
-    return gather(curvature_rows(steps(stack)), c)
+    return gather(curvature_rows(steps_mm(stack)), c)
 
 
 def windows(values: FloatArray) -> FloatArray:
