@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -508,3 +509,17 @@ def test_a_machine_without_errors_has_a_page_that_says_that_nothing_shows(small_
     page = check_files(small_machine, export(small_machine, zero, "siemens-cec"), zero)["check-program.md"]
     assert "changes at least one reading by 0.0 um" in page
     assert "That is little" in page
+
+
+def test_steps_of_tables_for_downward_travel_count_too(small_machine, small_errors):
+    """A CEC table that acts downwards only (DIRECTION -1) with a wild node: nothing shows on the way up."""
+    tables = exported_tables(small_machine, small_errors, "siemens-cec")
+    entry = tables.tables.tables[0]
+    values = list(entry.table.values)
+    values[1] += Decimal("0.7")
+    wild = replace(entry, direction=-1, table=replace(entry.table, values=tuple(values)))
+    spoilt = replace(tables.tables, tables={**tables.tables.tables, 0: wild})
+    safety = safety_of(small_machine, tables.controller, spoilt, lambda position: 0.0 * position)
+    axis = "XYZ"[entry.input_axis]
+    assert any(f"between {axis} " in reason for reason in safety.reasons)
+    assert max(step.step_um for step in safety.steps) > 600.0

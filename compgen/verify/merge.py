@@ -30,7 +30,8 @@ class MergeReport:
     """How close the merged table comes to old and new together, over the volume, um.
 
     ``total_max_um`` is the largest total correction, ``difference_max_um`` and ``difference_rms_um`` what the merged
-    table misses of it, all that the control cannot hold included; ``lost_um`` is the largest part of the old table that no error of the model expresses.
+    table misses of it, all that the control cannot hold included; ``lost_um`` is the largest part of the old table that
+    no error of the model expresses.
     """
 
     total_max_um: float

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
 
@@ -141,8 +142,9 @@ def safety_of(
     settings = control.read_settings(machine)
     nodes = control.table_nodes_mm(machine, settings, tables)
 
-    def correction(position_mm: FloatArray) -> FloatArray:
-        return np.asarray(control.emulate(machine, settings, tables, _from_below(position_mm)))
+    def correction(position_mm: FloatArray, side: float = 1.0) -> FloatArray:
+        points = Points(position_mm, approach=np.full_like(position_mm, side))
+        return np.asarray(control.emulate(machine, settings, tables, points))
 
     slack_um = 2.0 * control.resolution_mm(settings) / MM_PER_UM
     steps: list[Step] = []
@@ -150,7 +152,8 @@ def safety_of(
     for axis in range(3):
         along = node_positions(machine, nodes[axis], axis)
         lines = lines_along(machine, axis, along)
-        added, wanted = _on_lines(correction, lines), _on_lines(best, lines)
+        added = np.concatenate([_on_lines(partial(correction, side=side), lines) for side in (1.0, -1.0)])
+        wanted = np.tile(_on_lines(best, lines), (2, 1, 1))
         for output in range(3):
             profile = _Profile(axis, output, along, added[:, :, output], wanted[:, :, output], slack_um)
             steps.append(profile.largest())
@@ -168,14 +171,9 @@ def safety_of(
     )
 
 
-def _from_below(position_mm: FloatArray) -> Points:
-    """Points approached in the positive direction on every axis, for tables that act in one direction."""
-    return Points(position_mm, approach=np.ones_like(position_mm))
-
-
 @dataclass(frozen=True)
 class _Profile:
-    """Correction of one axis along another on nine lines, own and best, shapes (9, n), mm, at positions (n,)."""
+    """Correction of one axis along another on nine lines in both directions, own and best, (18, n), mm, at (n,)."""
 
     axis: int
     output: int
