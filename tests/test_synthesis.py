@@ -100,7 +100,8 @@ def test_the_tables_are_the_least_squares_optimum(name, small_machine, make_erro
     dense = dense_columns(basis, solver.position_mm, small_machine.tool_offset_mm)
     offsets = np.tile(np.eye(3), (len(wanted), 1)) if anchored else np.zeros((wanted.size, 0))
     full = np.hstack([dense / np.maximum(np.linalg.norm(dense, axis=0), 1e-300), offsets])
-    solution = np.linalg.lstsq(full, wanted.ravel(), rcond=1e-13)[0]
+    root = np.repeat(np.sqrt(solver.weight), 3)
+    solution = np.linalg.lstsq(full * root[:, None], wanted.ravel() * root, rcond=1e-13)[0]
     fitted = (full[:, : dense.shape[1]] @ solution[: dense.shape[1]]).reshape(-1, 3)
     values = synthesize(small_machine, errors, basis, anchored=anchored)
     own = solver.field(np.concatenate([values[term.name] for term in basis]))

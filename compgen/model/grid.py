@@ -72,6 +72,8 @@ def volume_sample(
 ) -> VolumeSample:
     """Return points that determine tables with the given nodes over the volume: the full grid where it is not too large.
 
+    Weighted sums over them are integrals over the volume.
+
     Otherwise three grids, one for each axis: its own levels by Gauss-Legendre points of the other two. On each of them
     a function of one axis is orthogonal to functions of the others, as it is over the volume; a random sample is not,
     and would turn what the tables cannot hold into ragged values.
@@ -84,18 +86,32 @@ def volume_sample(
         levels_between(np.asarray(nodes), *axis.range_mm) for nodes, axis in zip(nodes_mm, machine.axes, strict=True)
     ]
     if np.prod([len(level) for level in levels]) <= most:
+        x, y, z = (_simpson(level) for level in levels)
         position_mm = VolumeGrid((levels[0], levels[1], levels[2])).position_mm
-        return VolumeSample(position_mm, np.ones(len(position_mm)))
+        return VolumeSample(position_mm, len(position_mm) * np.einsum("i,j,k->ijk", x, y, z).ravel())
     positions, weights = [], []
     for axis in range(3):
         count = int(np.clip(np.sqrt(most / len(levels[axis])), LEAST_ACROSS, MOST_ACROSS))
         sides = [_gauss_legendre(machine.axes[k].range_mm, cuts_mm[k], count) for k in range(3)]
-        sides[axis] = (levels[axis], np.full(len(levels[axis]), 1.0 / len(levels[axis])))
+        sides[axis] = (levels[axis], _simpson(levels[axis]))
         grid = VolumeGrid((sides[0][0], sides[1][0], sides[2][0]))
         positions.append(grid.position_mm)
         weights.append(np.einsum("i,j,k->ijk", sides[0][1], sides[1][1], sides[2][1]).ravel())
     joined = np.concatenate(weights)
     return VolumeSample(np.concatenate(positions), joined * (len(joined) / joined.sum()))
+
+
+def _simpson(levels_mm: FloatArray) -> FloatArray:
+    """Weights, which sum to 1, of levels where every second one is the middle of its neighbours.
+
+    Exact for cubic polynomials between the nodes, so for squares of what tables hold there.
+    """
+    part = np.diff(levels_mm[::2]) / (6.0 * (levels_mm[-1] - levels_mm[0]))
+    weights = np.zeros(len(levels_mm))
+    weights[1::2] = 4.0 * part
+    weights[:-1:2] += part
+    weights[2::2] += part
+    return weights
 
 
 def _gauss_legendre(
