@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Axis, Chain, Machine
-from compgen.identify import identify
+from compgen.identify import identify, joint_covariance, sample_errors
 from compgen.identify.grid_problem import grid_problem, start_moments
 from compgen.identify.parameters import ErrorParameters, error_parameters
 from compgen.identify.start import station_start_from_moments
@@ -187,6 +187,28 @@ def million() -> None:
     print(f"  ratio {np.median(ratios):.3g} ({ratios.min():.3g}-{ratios.max():.3g})")
 
 
+def sampling() -> None:
+    """10000 draws of all errors from the covariance, against identifying as often with scipy."""
+    case = Case(11, 11)
+    found = identify(case.machine, case.lengths)
+    peer = case.peer()
+    with timing.one_thread():
+        start = time.perf_counter()
+        peer.solve("trf")
+        once = time.perf_counter() - start
+        sample_errors(joint_covariance(found), 100)
+        times = []
+        for _ in range(5):
+            start = time.perf_counter()
+            sample_errors(joint_covariance(found), 10_000)
+            times.append(time.perf_counter() - start)
+    median = float(np.median(times))
+    print(
+        f"\n10000 samples of all errors: {timing.scaled(median)}; 10000 solutions by scipy trf: {10_000 * once:.0f} s"
+    )
+    print(f"  ratio {10_000 * once / median:.0f}")
+
+
 def main() -> None:
     """Run all cases."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -198,6 +220,7 @@ def main() -> None:
     if not arguments.quick:
         compare(21, 21, arguments.runs, ("trf",))
         million()
+    sampling()
 
 
 if __name__ == "__main__":

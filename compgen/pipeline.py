@@ -32,6 +32,7 @@ from compgen.identify import (
     read_measurement,
 )
 from compgen.identify.measurement import Measurement
+from compgen.identify.monte_carlo import SelfCheck
 from compgen.identify.reversal import SIGNIFICANT
 from compgen.verify import Verification, read_tables, verify
 from compgen.verify.active import ActiveTables, without_active
@@ -77,7 +78,9 @@ def provenance_of(*paths: str | Path | None) -> Provenance:
     return Provenance(tuple((path.name, sha256_of(read_bytes(path))) for path in files))
 
 
-def identification_files(result: Identification, provenance: Provenance) -> dict[str, str | bytes]:
+def identification_files(
+    result: Identification, provenance: Provenance, checked: SelfCheck | None = None
+) -> dict[str, str | bytes]:
     """Return the contents of ``identified.errors.csv`` and its covariance, ``stations.csv`` and ``identify.json``.
 
     Where a reversal was found ``identified.reversal.csv`` stands beside them. The two-step method adds
@@ -103,6 +106,8 @@ def identification_files(result: Identification, provenance: Provenance) -> dict
         files["stations.csv"] = format_csv(columns, {"machine": result.errors.metadata.get("machine", "")})
     if result.positions is not None:
         files["measured.deviations.csv"] = format_deviations(result.positions)
+    if checked is not None:
+        summary["monte_carlo"] = checked.summary()
     reversal = identified_reversal(result)
     if reversal is not None:
         files["identified.reversal.csv"] = format_reversal(reversal)
@@ -176,7 +181,7 @@ def export_and_verify(
     verification = _read_back(machine, exported, identified, reversal, limits)
     reasons = tuple(dict.fromkeys([*verification.reasons, *exported.violations]))
     verification = replace(verification, reasons=reasons)
-    beside = check_files(machine, exported, identified, export_options.get("templates"))
+    beside = check_files(machine, exported, identified, export_options.get("templates"), reversal)
     return _write_result(exported, verification, beside, folder)
 
 
@@ -298,7 +303,8 @@ def run(
             reversal=reversal,
         )
         verification = _read_back(machine, exported, identification.errors, reversal, checks.get("limits"))
-        checked[name] = exported, verification, check_files(machine, exported, identification.errors, templates)
+        beside = check_files(machine, exported, identification.errors, templates, reversal)
+        checked[name] = exported, verification, beside
     write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted)})
     results = [_write_result(*checked[name], target) for name, target in targets.items()]
     return RunResult(identification, fitted, tuple(results))

@@ -14,6 +14,7 @@ from compgen.cli.fit_options import covariance_of, covariance_options, fitting_o
 from compgen.cli.safety_options import active_options
 from compgen.core.error_table import read_errors
 from compgen.core.files import OutputFolder
+from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.fit import FitOptions, fit
@@ -24,6 +25,7 @@ from compgen.identify import (
     read_measurement,
     read_stations,
 )
+from compgen.identify.monte_carlo import self_check
 from compgen.identify.noise import METHODS
 from compgen.pipeline import failure_reported, fit_files, identification_files, identify_bare, provenance_of, write_all
 from compgen.report.text import fit_table, identification_table
@@ -120,6 +122,12 @@ def identify_options(
 @systematic_options
 @method_options
 @active_options("--controller")
+@click.option(
+    "--self-check",
+    type=click.IntRange(min=10),
+    metavar="N",
+    help="Identify again from N simulated sets of readings and compare with the stated uncertainties.",
+)
 @json_option
 def identify_command(
     machine: Machine,
@@ -132,6 +140,7 @@ def identify_command(
     systematic: SystematicInputs,
     choices: Mapping[str, Any],
     active: ActiveTables | None,
+    replicates: int | None,
     as_json: bool,
 ) -> int:
     """Identify error curves, squareness and stations from tracer lengths, or errors from measured positions.
@@ -161,11 +170,26 @@ def identify_command(
         options = identify_options(u_length_um, u_length_um_per_m, keep_all, systematic, choices)
         with failure_reported(out):
             result = identify_bare(machine, measurement, options, active)
-    write_all(out, identification_files(result, provenance_of(machine.source, *measurements)))
+        checked = None
+        if replicates is not None:
+            if active is not None or not isinstance(measurement, Lengths):
+                raise InputError("--self-check belongs to tracer lengths that were taken without active tables")
+            checked = self_check(
+                machine,
+                measurement,
+                result,
+                replicates,
+                progress=lambda k: show(f"self-check: {k} of {replicates} replicates"),
+            )
+    write_all(out, identification_files(result, provenance_of(machine.source, *measurements), checked))
     if as_json:
-        print_json(result.summary())
+        print_json({**result.summary(), **({"monte_carlo": checked.summary()} if checked else {})})
     else:
         stdout.print(identification_table(result))
+        if checked:
+            text = f"self-check, {checked.replicates} replicates: standard deviation over stated uncertainty "
+            text += f"{checked.ratio_median:.2f} ({checked.ratio_min:.2f} ... {checked.ratio_max:.2f}): "
+            stdout.print(text + ("agrees" if checked.agrees else "DOES NOT AGREE"))
     return 0
 
 

@@ -5,6 +5,7 @@ from compgen.identify.deviations import identify_deviations
 from compgen.identify.identify import identify
 from compgen.identify.known_stations import KnownStations, locate_stations, read_stations
 from compgen.identify.measurement import describe, identify_measurement, read_measurement
+from compgen.identify.monte_carlo import SelfCheck, sample_errors, self_check
 from compgen.identify.noise import IdentifyOptions
 from compgen.identify.result import Identification, StationResult
 from compgen.identify.systematic import SystematicInputs
@@ -14,6 +15,7 @@ __all__ = [
     "Identification",
     "IdentifyOptions",
     "KnownStations",
+    "SelfCheck",
     "StationResult",
     "SystematicInputs",
     "describe",
@@ -26,4 +28,6 @@ __all__ = [
     "read_covariance",
     "read_measurement",
     "read_stations",
+    "sample_errors",
+    "self_check",
 ]

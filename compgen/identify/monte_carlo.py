@@ -1,0 +1,128 @@
+"""Uncertainty by sampling: draws of the errors from their covariance, and re-identification as a self-check.
+
+Linear propagation agrees with nonlinear re-identification to some 1e-5 um, so that drawing from the covariance is
+enough for whatever depends on the errors; the re-identification shows that it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.lengths import Lengths
+from compgen.core.machine import Machine
+from compgen.errors import InputError
+from compgen.identify.covariance import Covariance
+from compgen.identify.identify import identify
+from compgen.identify.noise import IdentifyOptions
+from compgen.identify.result import Identification
+
+
+def sample_errors(covariance: Covariance, count: int, seed: int = 0) -> FloatArray:
+    """Draw deviations of the error values from their joint distribution, shape (count, k), mm and rad.
+
+    They are to be added to the values of the errors file, in the order of ``covariance.error``.
+    """
+    factor = covariance.errors_factor
+    draws = np.random.default_rng(seed).standard_normal((count, factor.shape[1]))
+    return np.asarray(draws @ factor.T)
+
+
+@dataclass(frozen=True)
+class SelfCheck:
+    """Outcome of :func:`self_check`.
+
+    ``ratio_median``, ``ratio_min``, ``ratio_max`` compare the standard deviation over the replicates with the stated
+    standard uncertainty, value by value; ``expected_spread`` is the standard deviation that chance gives such a ratio.
+    """
+
+    replicates: int
+    seed: int
+    ratio_median: float
+    ratio_min: float
+    ratio_max: float
+    expected_spread: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the stated uncertainties are those of the replicates, within chance."""
+        return abs(self.ratio_median - 1.0) < 3.0 * self.expected_spread and (
+            1.0 - 5.0 * self.expected_spread < self.ratio_min and self.ratio_max < 1.0 + 5.0 * self.expected_spread
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return the object ``monte_carlo`` of ``identify.json``."""
+        return {**asdict(self), "agrees": self.agrees}
+
+
+def self_check(
+    machine: Machine,
+    lengths: Lengths,
+    result: Identification,
+    replicates: int = 50,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda _: None,
+) -> SelfCheck:
+    """Identify again from simulated readings: the model's own with new noise of the stated size.
+
+    Parameters
+    ----------
+    machine, lengths, result : what was identified, by the joint method, and the outcome.
+    replicates : at least 10.
+    seed : of the noise.
+    progress : is told the number of finished replicates.
+    """
+    adjustment = result.adjustment
+    if replicates < 10 or adjustment is None or result.method != "joint":
+        raise InputError(f"a self-check needs at least 10 replicates of the joint method, not {replicates}")
+    used = np.flatnonzero(result.accepted)
+    sigma_mm = adjustment.sigma_mm / np.sqrt(adjustment.weight[used])
+    model_mm = (lengths.length_mm + result.residual_mm)[used]
+    plain = _rows(replace(lengths, approach=None), used)
+    options = IdentifyOptions(
+        u_length_um=result.u_length_um, u_length_um_per_m=result.u_length_um_per_m, reject=False, temperature=False
+    )
+    rng = np.random.default_rng(seed)
+    values = []
+    for k in range(replicates):
+        readings = replace(plain, length_mm=model_mm + sigma_mm * rng.standard_normal(len(used)))
+        values.append(_values(identify(machine, readings, options)))
+        progress(k + 1)
+    u = _uncertainties(result)
+    spread = np.std(values, axis=0, ddof=1)
+    ratio = spread[u > 0] / u[u > 0]
+    return SelfCheck(
+        replicates=replicates,
+        seed=seed,
+        ratio_median=float(np.median(ratio)),
+        ratio_min=float(ratio.min()),
+        ratio_max=float(ratio.max()),
+        expected_spread=float(1.0 / np.sqrt(2.0 * (replicates - 1))),
+    )
+
+
+def _rows(lengths: Lengths, rows: np.ndarray[Any, Any]) -> Lengths:
+    return replace(
+        lengths,
+        station=lengths.station[rows],
+        point=[lengths.point[k] for k in rows],
+        position_mm=lengths.position_mm[rows],
+        tool_mm=None if lengths.tool_mm is None else lengths.tool_mm[rows],
+        labels={name: values[rows] for name, values in lengths.labels.items()},
+        covariates={},
+        origin=[lengths.origin[k] for k in rows] if len(lengths.origin) else (),
+    )
+
+
+def _values(result: Identification) -> FloatArray:
+    curves = [curve.value for curve in result.errors.curves.values()]
+    return np.concatenate([*curves, [value for value, _ in result.errors.squareness.values()]])
+
+
+def _uncertainties(result: Identification) -> FloatArray:
+    curves = [curve.u for curve in result.errors.curves.values()]
+    return np.concatenate([*curves, [u for _, u in result.errors.squareness.values()]])
