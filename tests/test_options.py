@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +19,9 @@ from compgen.core.reversal import ReversalCurves, format_reversal, read_reversal
 from compgen.errors import InputError
 from compgen.export import export
 from compgen.pipeline import export_and_verify, identified_reversal
-from compgen.verify import read_tables, verify
+from compgen.verify import ReadTables, read_tables, verify
 from compgen.verify.capability import capability
+from compgen.verify.check_program import check_program
 from compgen.verify.explain import explain
 from compgen.verify.levels import LABELS, levels_of
 
@@ -47,7 +49,7 @@ def emulated(machine, exported, points):
     """What the control adds, from the text of the exported files."""
     control = controller_named(exported.controller)
     settings = control.read_settings(machine)
-    sources = [SourceFile(compgen.pipeline.Path(name), text) for name, text in exported.files.items()]
+    sources = [SourceFile(Path(name), text) for name, text in exported.files.items()]
     return control.emulate(machine, settings, control.parse(machine, settings, sources), points)
 
 
@@ -284,6 +286,22 @@ def _scenario(folder):
         f'noise_um = 0.1\nnoise_um_per_m = 0.15\n{stations}[trajectory]\ntype = "grid"\n'
     )
     return path
+
+
+def test_the_check_program_reads_nothing_of_a_reversal_that_the_tables_take_out(small_machine):
+    """Only a reversal that grows along Y, from 0 to 20 um: positions are approached upwards in Y, so half of it shows."""
+    errors = single(small_machine, "EXX", lambda x: 2e-5 * (x + 50.0))
+    curve = Curve(np.array([-100.0, 300.0]), np.array([0.0, 20.0]) * UM, np.full(2, np.nan))
+    reversal = ReversalCurves({(1, 1): curve})
+    exported = export(small_machine, errors, "siemens-cec", reversal=reversal)
+    control = controller_named("siemens-cec")
+    settings = control.read_settings(small_machine)
+    sources = [SourceFile(Path(name), text) for name, text in exported.files.items()]
+    tables = ReadTables(control, settings, control.parse(small_machine, settings, sources), ())
+    program = check_program(small_machine, tables, errors, reversal)
+    y = program.position_mm[:, 1]
+    np.testing.assert_allclose(program.off_mm[:, 1] / UM, 10.0 * (y - y[0]) / 400.0, atol=ROUNDING_UM)
+    np.testing.assert_allclose(program.on_mm / UM, 0.0, atol=2 * ROUNDING_UM)
 
 
 # --- levels ----------------------------------------------------------------------------------------------------------

@@ -95,7 +95,7 @@ def export_command(
         provenance=provenance_of(machine.source, errors, reversal, *(active.paths if active else ())),
         reversal=both,
     )
-    beside |= check_files(machine, exported, table, templates)
+    beside |= check_files(machine, exported, table, templates, both)
     explanation = explained(machine, table, exported, reversal=both, templates=templates) if explain else None
     if explanation is not None:
         beside["explain.md"] = explanation_markdown(explanation)

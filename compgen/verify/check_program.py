@@ -19,6 +19,7 @@ from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
 from compgen.export import Export
 from compgen.export.render import Format, load_format, render
 from compgen.model.exact import exact_error
@@ -62,7 +63,9 @@ class CheckProgram:
     slips: tuple[tuple[str, int, str, float, float], ...]
 
 
-def check_program(machine: Machine, tables: ReadTables, errors: ErrorTable) -> CheckProgram:
+def check_program(
+    machine: Machine, tables: ReadTables, errors: ErrorTable, reversal: ReversalCurves | None = None
+) -> CheckProgram:
     """Choose five positions and work out the readings.
 
     Parameters
@@ -70,14 +73,16 @@ def check_program(machine: Machine, tables: ReadTables, errors: ErrorTable) -> C
     machine : the machine; all positions and approaches lie within its travel.
     tables : the tables as they were parsed.
     errors : how the machine errs, usually the identified errors (mm, rad).
+    reversal : what it does differently in its two directions; every position is approached from one side.
     """
     way_mm = np.minimum(APPROACH_MM, APPROACH_SHARE * (machine.upper_mm - machine.lower_mm))
     candidates = _candidates(machine, way_mm)
     added = tables.correction(machine, _approached(candidates))
     chosen = _choose(added)
     position_mm, added_mm = candidates[chosen], added[chosen]
-    off = exact_error(machine, errors, position_mm)
-    on = exact_error(machine, errors, position_mm + added_mm) + added_mm
+    lag = 0.0 if reversal is None else reversal.displacement(position_mm, _directions(position_mm))
+    off = exact_error(machine, errors, position_mm) + lag
+    on = exact_error(machine, errors, position_mm + added_mm) + added_mm + lag
     off_mm, on_mm = off - off[0], on - on[0]
     moved = added_mm - added_mm[0]
     return CheckProgram(
@@ -94,7 +99,11 @@ def check_program(machine: Machine, tables: ReadTables, errors: ErrorTable) -> C
 
 def _approached(position_mm: FloatArray) -> Points:
     """Points with the direction of the last travel of every axis: X and Y upwards, Z downwards."""
-    return Points(position_mm, approach=np.tile([1.0, 1.0, -1.0], (len(position_mm), 1)))
+    return Points(position_mm, approach=_directions(position_mm))
+
+
+def _directions(position_mm: FloatArray) -> FloatArray:
+    return np.tile([1.0, 1.0, -1.0], (len(position_mm), 1))
 
 
 def _candidates(machine: Machine, way_mm: FloatArray) -> FloatArray:
@@ -146,7 +155,11 @@ def _slip(name: str, change_mm: FloatArray, on_mm: FloatArray) -> tuple[str, int
 
 
 def check_files(
-    machine: Machine, exported: Export, errors: ErrorTable, templates: Path | None = None
+    machine: Machine,
+    exported: Export,
+    errors: ErrorTable,
+    templates: Path | None = None,
+    reversal: ReversalCurves | None = None,
 ) -> dict[str, str]:
     """Return ``check-program.md`` and, for controls whose motion in machine coordinates is documented, the program.
 
@@ -155,13 +168,14 @@ def check_files(
     machine, errors : what moves, and how it errs.
     exported : the files; the readings are those of their text.
     templates : a user's templates folder, searched first.
+    reversal : as in :func:`check_program`.
     """
     control = controller_named(exported.controller)
     settings = control.read_settings(machine)
     sources = [SourceFile(Path(name), text) for name, text in exported.files.items()]
     tables = ReadTables(control, settings, control.parse(machine, settings, sources), ())
     card = load_format(exported.controller, templates)
-    program = check_program(machine, tables, errors)
+    program = check_program(machine, tables, errors, reversal)
     has_program = _has_template(card, templates)
     context = {**_context(machine, exported, program), "has_program": has_program}
     files = {PAGE_NAME: render(replace(card, name="_common"), "check-program.md.j2", context, templates)}
