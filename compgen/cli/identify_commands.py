@@ -124,9 +124,10 @@ def identify_options(
 @active_options("--controller")
 @click.option(
     "--self-check",
+    "replicates",
     type=click.IntRange(min=10),
     metavar="N",
-    help="Identify again from N simulated sets of readings and compare with the stated uncertainties.",
+    help="Identify N simulated sets of readings as well and compare their scatter with the stated uncertainties.",
 )
 @json_option
 def identify_command(
