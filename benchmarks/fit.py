@@ -1,10 +1,10 @@
 """The constrained fit against OSQP, cvxpy and Clarabel on the same problem (python benchmarks/fit.py).
 
 Every side gets the same 18 curves as arrays (positions, data, weights, held nodes, smoothness, bounds) and returns 18
-fitted curves. Timed is everything in between: compgen builds, factors, solves, checks the bounds and, where one is
-broken, solves the bounded problem to its optimality conditions; OSQP builds its sparse matrices, sets up and solves
-from cold, curve by curve, in the same banded form; cvxpy builds, compiles and solves one problem per curve, written as
-a quadratic form (the form that suits it best). The smoothness is given: finding it from the data is no part of it.
+fitted curves. Timed with compgen is all of it: it lays out the band, factors, solves, checks the bounds and, where one
+is broken, solves the bounded problem to its optimality conditions. The others get their sparse matrices ready made,
+outside the time: OSQP sets up and solves from cold, curve by curve; cvxpy builds, compiles and solves one problem per
+curve, written as a quadratic form (the form that suits it best). The smoothness is given: finding it is no part of it.
 
 "no bound active": bounds are there and none is touched. "active": 0.8 of the largest value and 0.6 of the largest slope
 of each curve, so that every curve touches bounds.
@@ -56,7 +56,11 @@ def _curve(rng: np.random.Generator, n: int, k: int, *, active: bool) -> CurvePr
     return CurveProblem(position, y, problem.weight, held, mu, Bounds(share[0] * largest, share[1] * steepest))
 
 
-def program(problem: CurveProblem) -> tuple[sp.csc_matrix, FloatArray, sp.csc_matrix, FloatArray]:
+#: P, q, A, limit of one curve.
+Program = tuple[sp.csc_matrix, FloatArray, sp.csc_matrix, FloatArray]
+
+
+def program(problem: CurveProblem) -> Program:
     """P, q, A, limit of min x^T P x / 2 + q^T x, |A x| <= limit, zeros eliminated; x are the free nodes."""
     n = len(problem.y)
     free = np.setdiff1d(np.arange(n), problem.held)
@@ -81,30 +85,29 @@ def ours(problems: Sequence[CurveProblem]) -> list[FloatArray]:
     return [solution.curve for solution in solve_curves(problems)]
 
 
-def with_osqp(problems: Sequence[CurveProblem], tolerance: float = 1e-6) -> list[FloatArray]:
-    """Fit with OSQP, set up afresh for every curve."""
+def with_osqp(programs: Sequence[Program], tolerance: float = 1e-6) -> list[FloatArray]:
+    """Fit with OSQP, set up afresh for every curve; returns the free nodes."""
     found = []
-    for problem in problems:
-        quadratic, linear, matrix, limit = program(problem)
+    for quadratic, linear, matrix, limit in programs:
+        upper = sp.triu(quadratic, format="csc")
         solver = osqp.OSQP()
         solver.setup(
-            sp.triu(quadratic, format="csc"), linear, matrix, -limit, limit,
+            upper, linear, matrix, -limit, limit,
             eps_abs=tolerance, eps_rel=tolerance, max_iter=20000, verbose=False,
         )  # fmt: skip
-        found.append(_whole(problem, solver.solve().x))
+        found.append(solver.solve().x)
     return found
 
 
-def with_cvxpy(problems: Sequence[CurveProblem]) -> list[FloatArray]:
-    """Fit with cvxpy and Clarabel at its own tolerances."""
+def with_cvxpy(programs: Sequence[Program]) -> list[FloatArray]:
+    """Fit with cvxpy and Clarabel at its own tolerances; returns the free nodes."""
     found = []
-    for problem in problems:
-        quadratic, linear, matrix, limit = program(problem)
+    for quadratic, linear, matrix, limit in programs:
         x = cp.Variable(len(linear))
         values = matrix @ x
         cost = 0.5 * cp.quad_form(x, cp.psd_wrap(quadratic)) + linear @ x
         cp.Problem(cp.Minimize(cost), [values <= limit, values >= -limit]).solve(solver="CLARABEL")
-        found.append(_whole(problem, x.value))
+        found.append(x.value)
     return found
 
 
@@ -134,22 +137,23 @@ def deviation(found: Sequence[FloatArray], expected: Sequence[FloatArray]) -> fl
 def compare(n: int, runs: int, *, active: bool, slow: bool) -> None:
     """Time one case and print it; ``slow``: with the peers that need seconds here."""
     problems = curves(n, active=active)
-    functions: dict[str, Callable[[], object]] = {OURS: lambda: ours(problems)}
+    programs = [program(problem) for problem in problems]
+    functions: dict[str, Callable[[], list[FloatArray]]] = {OURS: lambda: ours(problems)}
     if slow or not active:
-        functions[OSQP] = lambda: with_osqp(problems)
+        functions[OSQP] = lambda: with_osqp(programs)
     if slow or n <= 301:
-        functions[CVXPY] = lambda: with_cvxpy(problems)
+        functions[CVXPY] = lambda: with_cvxpy(programs)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         comparison = timing.alternate(functions, runs)
         title = f"{CURVES} curves of {n} nodes, {'active bounds' if active else 'no bound active'}"
         timing.print_comparison(title, comparison, references=(OURS,))
         expected = referee(problems)
-        shown = {OURS: ours(problems), OSQP: with_osqp(problems) if OSQP in functions else None}
+        far = {OURS: f"{deviation(ours(problems), expected):.1e}"}
+        for name in [name for name in functions if name != OURS]:
+            whole = [_whole(problem, x) for problem, x in zip(problems, functions[name](), strict=True)]
+            far[name] = f"{deviation(whole, expected):.1e}"
     touched = sum(bool(solution.touched.any()) for solution in solve_curves(problems))
-    far = {name: f"{deviation(found, expected):.1e}" for name, found in shown.items() if found is not None}
-    if CVXPY in functions:
-        far[CVXPY] = f"{deviation(with_cvxpy(problems), expected):.1e}"
     print(f"  curves at a bound: {touched}; deviation from the referee, um: {far}")
 
 

@@ -21,6 +21,9 @@ _FIRST_STEPS, _FIRST_ROUNDS = 10, 4
 DIRECT, INTERIOR = "direct", "interior point"
 
 
+_UNTOUCHED: FloatArray = np.zeros(0)
+
+
 @dataclass(frozen=True)
 class Solution:
     """A fitted ``curve`` (n,) in the unit of its data, the bounds that it touches, and who found it.
@@ -29,7 +32,7 @@ class Solution:
     """
 
     curve: FloatArray
-    touched: FloatArray = field(default_factory=lambda: np.zeros(0))
+    touched: FloatArray = field(default_factory=lambda: _UNTOUCHED)
     solver: str = DIRECT
 
 
@@ -52,14 +55,13 @@ def solve_curves(problems: Sequence[CurveProblem]) -> list[Solution]:
 
 def _breaks(stack: Stack, bounds: Sequence[Bounds], curve: FloatArray) -> NDArray[np.bool_]:
     """Which curves (k,) of a stack (N,) break a bound."""
-    if all(bound.none for bound in bounds):
-        return np.zeros(len(bounds), bool)
-    limits = np.array([(*bound.limits, bound.direction) for bound in bounds]).T
+    limits = np.array([(b.max_abs, b.max_slope, b.max_curvature, b.direction) for b in bounds]).T
     wrong = stack.largest(np.abs(curve)) > limits[0]
     if np.isfinite(limits[1]).any() or limits[3].any():
         slope = stack.slopes(curve)
         wrong |= stack.largest(np.abs(slope)) > limits[1]
-        wrong |= stack.largest(-slope * stack.of_each(limits[3])) > 0
+        if limits[3].any():
+            wrong |= stack.largest(-slope * stack.of_each(limits[3])) > 0
     if np.isfinite(limits[2]).any():
         wrong |= stack.largest(np.abs(curvatures_of(stack, curve))) > limits[2]
     return np.asarray(wrong)
