@@ -10,6 +10,7 @@ from compgen.core.error_table import Curve, ErrorTable, format_errors, read_erro
 from compgen.core.lengths import Lengths, format_lengths, read_lengths
 from compgen.core.machine import Axis, Chain, Machine, load_machine
 from compgen.core.points import Points, format_points, read_points
+from compgen.core.reversal import ReversalCurves, format_reversal, read_reversal
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.export import Export, export, wanted_correction
 from compgen.fit import FitOptions, FitResult, fit
@@ -54,6 +55,7 @@ __all__ = [
     "Points",
     "ReadTables",
     "Residuals",
+    "ReversalCurves",
     "RunResult",
     "Scenario",
     "Simulation",
@@ -68,6 +70,7 @@ __all__ = [
     "format_errors",
     "format_lengths",
     "format_points",
+    "format_reversal",
     "identify",
     "identify_deviations",
     "joint_covariance",
@@ -83,6 +86,7 @@ __all__ = [
     "read_errors",
     "read_lengths",
     "read_points",
+    "read_reversal",
     "read_scenario",
     "read_tables",
     "residuals",

@@ -19,7 +19,7 @@ from compgen.errors import InputError
 from compgen.resources import data_folder
 
 #: Files that are written beside those of the control.
-OWN_FILES = ("manifest.json", "preflight.md", "result.json")
+OWN_FILES = ("manifest.json", "preflight.md", "result.json", "explain.md")
 #: What a wrong template may raise: Jinja's own errors, and those of the expressions in it.
 _TEMPLATE_FAULTS = (
     TemplateError,
