@@ -496,12 +496,34 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
         "read": (small_machine_file, tables / "volcomp0.csv", *files, "--points", points_file, "--out", out / "c.csv"),
         "predict": (small_machine_file, errors_file, "--points", points_file, "--out", out / "e.csv"),
         "plan": (small_machine_file, "--stations", stations, "--grid", "--out", out),
-        "diff": (small_machine_file, tables / "volcomp0.csv", "--against", tables / "volcomp0.csv", *files, "--out", out),
+        "diff": (
+            small_machine_file,
+            tables / "volcomp0.csv",
+            "--against",
+            tables / "volcomp0.csv",
+            *files,
+            "--out",
+            out,
+        ),
         "merge": (small_machine_file, tables / "volcomp0.csv", *files, "--errors", errors_file, "--out", out),
+        "options": (small_machine_file, errors_file, "--out", out),
     }
 
 
-WRITING = ["run", "identify", "fit", "export", "verify", "simulate", "read", "predict", "plan", "diff", "merge"]
+WRITING = [
+    "run",
+    "identify",
+    "fit",
+    "export",
+    "verify",
+    "simulate",
+    "read",
+    "predict",
+    "plan",
+    "diff",
+    "merge",
+    "options",
+]
 
 
 def test_every_command_that_writes_is_among_these():
