@@ -15,6 +15,8 @@ from compgen.verify.residuals import Residuals
 
 #: Errors that leave less than this at every tool and level are not listed, um.
 LISTED_FROM_UM = 0.1
+#: A level that shrinks the rms by less than this share, or by less than this much, buys nothing.
+LEAST_GAIN, LEAST_GAIN_UM = 0.005, 0.05
 LEGEND = (
     "left: what the best table of that level leaves, largest / rms / 95 % in um; left*: the best-fit rigid motion of the "
     "workpiece taken out; buys: by how much the rms* shrinks against the level above, with the machine's own tool: full "
@@ -53,7 +55,8 @@ def _gain(before_um: float | None, after_um: float) -> str:
     if before_um is None:
         return ""
     gain = before_um - after_um
-    return f"{um(gain)} um, {100.0 * gain / before_um:.0f} %" if gain > 0.005 * before_um else "nothing"
+    worth = gain > max(LEAST_GAIN * before_um, LEAST_GAIN_UM)
+    return f"{um(gain)} um, {100.0 * gain / before_um:.0f} %" if worth else "nothing"
 
 
 def control_rows(result: Capability) -> list[list[str]]:
@@ -108,7 +111,7 @@ def _level_headings(result: Capability) -> list[str]:
 def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
     table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False)
     for number, heading in enumerate(headings):
-        table.add_column(heading, justify="left" if number == 0 else "right", overflow="fold")
+        table.add_column(heading, justify="left" if number == 0 or heading == "remark" else "right", overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     return table
