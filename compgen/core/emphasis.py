@@ -47,6 +47,14 @@ class Emphasis:
         part = self.zone_mm[axis]
         return [] if part is None or not self.has_zone else list(part)
 
+    def weight_along(self, axis: int, travel_mm: Sequence[Interval]) -> float:
+        """Return the mean weight over the two other axes where the zone is along an axis; 1 beside it."""
+        share = 1.0
+        for other, (part, (low, high)) in enumerate(zip(self.zone_mm, travel_mm, strict=True)):
+            if other != axis and part is not None:
+                share *= (part[1] - part[0]) / (high - low)
+        return 1.0 + share * (self.zone_weight - 1.0) if self.has_zone else 1.0
+
     def weight(self, position_mm: FloatArray) -> FloatArray:
         """Return the weight of positions (n, 3), shape (n,)."""
         inside = np.full(len(position_mm), self.has_zone)
