@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,15 +48,17 @@ class RowStack:
         """Keep the rows of the chosen nodes (N,)."""
         return RowStack(self.kinds, self.rows[..., nodes], self.limit[..., nodes])
 
-    @property
+    @cached_property
     def there(self) -> BoolArray:
         """Which limits exist, (2, B, N)."""
         return np.isfinite(self.limit)
 
     def values(self, c: FloatArray) -> FloatArray:
         """G c and -G c: (2, B, N)."""
-        inner = gather(self.rows, c)
-        return np.stack([inner, -inner])
+        both = np.empty_like(self.limit)
+        both[0] = gather(self.rows, c)
+        np.negative(both[0], out=both[1])
+        return both
 
     def transposed(self, v: FloatArray) -> FloatArray:
         """G^T (v[0] - v[1]) for row values (2, B, N): (N,)."""
@@ -65,8 +68,8 @@ class RowStack:
     def add_band(self, band: FloatArray, v: FloatArray) -> None:
         """Add G^T diag(v[0] + v[1]) G to a lower band (3, N)."""
         more = np.empty_like(band)
-        for rows, value in zip(self.rows, v[0] + v[1], strict=True):
-            band_of(rows * np.sqrt(value), more)
+        for rows, value in zip(self.rows, np.sqrt(v[0] + v[1]), strict=True):
+            band_of(rows * value, more)
             band += more
 
 
@@ -194,12 +197,13 @@ def _step(stack: Stack, rows: RowStack, now: _Iterate, gap: FloatArray, moving: 
     factor, bad = _factor(stack, band)
     dual = stack.pull - stack.apply(now.c) - rows.transposed(now.multiplier)
     primal = np.where(there, rows.limit - rows.values(now.c) - now.slack, 0.0)
+    inverse = 1 / now.slack
 
     def towards(target: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        push = (target - now.multiplier * primal) / now.slack
+        push = (target - now.multiplier * primal) * inverse
         dc = stack.free * dpbtrs(factor, dual - rows.transposed(push), lower=1)[0].ravel()
         moved = rows.values(dc)
-        return dc, primal - np.where(there, moved, 0.0), push + weight * moved
+        return dc, primal - moved * there, push + weight * moved
 
     full = now.slack * now.multiplier
     dc, ds, dz = towards(-full)
@@ -208,7 +212,7 @@ def _step(stack: Stack, rows: RowStack, now: _Iterate, gap: FloatArray, moving: 
     after = _sum(stack, (now.slack + reach * ds) * (now.multiplier + reach * dz))
     share = (after / np.maximum(_sum(stack, full), _TINY)) ** 3
     centre = stack.of_each(np.clip(share, 1e-10, 1.0) * mean)
-    dc, ds, dz = towards(np.where(there, centre - full - ds * dz, 0.0))
+    dc, ds, dz = towards((centre - full - ds * dz) * there)
     sure = np.where(moving, np.minimum(1.0, 0.995 * _length(stack, now, ds, dz)), 0.0)
     sure[bad] = 0.0
     reach = stack.of_each(sure)
