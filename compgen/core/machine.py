@@ -12,7 +12,8 @@ import numpy as np
 
 from compgen.core import tomlio
 from compgen.core.csvio import FloatArray
-from compgen.core.emphasis import Emphasis, Vector3, take_emphasis
+from compgen.core.emphasis import Emphasis, take_emphasis
+from compgen.core.emphasis import Vector3 as Vector3
 from compgen.core.names import AXES, ERROR_NAMES
 from compgen.core.text import nearest
 from compgen.errors import InputError
