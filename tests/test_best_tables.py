@@ -312,13 +312,26 @@ def test_a_work_zone_gets_better_and_the_rest_stays_sane(controller, options, ga
     errors = smooth_errors(plain)
     zone = ((-350.0, -100.0), (-200.0, 0.0), (-400.0, -250.0))
     inside, everywhere = np.random.default_rng(2).uniform(*np.transpose(zone), (2000, 3)), points_in(plain)
-    machines = [replace(plain, emphasis=Emphasis(zone, weight)) for weight in (1.0, 10.0, 1e4)]
+    machines = [replace(plain, emphasis=Emphasis(zone, weight)) for weight in (1.0, 10.0, 1e3)]
     in_zone = [residual(machine, errors, inside, controller) for machine in machines]
     in_all = [residual(machine, errors, everywhere, controller) for machine in machines]
     assert in_zone[0] == residual(plain, errors, inside, controller)
     assert in_zone[1] < gain * in_zone[0]
     assert in_zone[2] < 1.001 * in_zone[1]
     assert in_all[0] < in_all[1] < 2.0 * in_all[0]
+
+
+def test_a_zone_does_not_turn_a_squareness_into_a_step_of_another_axis():
+    """X(x) cannot hold what EC0Y does over Y, and the zone must not make it try."""
+    zone = ((-350.0, -100.0), (-200.0, 0.0), None)
+    machine = machine_of(emphasis=Emphasis(zone))
+    control = CONTROLLERS["siemens-eec"]
+    errors = ErrorTable({}, {"EC0Y": (2.9e-3, np.nan)})
+    texts = export(machine, errors, "siemens-eec").files
+    files = [SourceFile(Path(name), text) for name, text in texts.items()]
+    tables = control.parse(machine, control.read_settings(machine), files)
+    added = control.emulate(machine, control.read_settings(machine), tables, Points(points_in(machine)))
+    assert np.max(np.abs(added[:, 0])) < 0.1e-3
 
 
 def test_tables_for_two_tools_are_best_on_the_average_of_both():
@@ -347,8 +360,8 @@ def test_zone_and_tools_are_read_from_the_machine_file_and_the_command_line(smal
     assert machine.emphasis == Emphasis(((-100.0, 0.0), None, None), 5.0, ((0.0, 0.0, -50.0), (0.0, 0.0, -90.0)))
     manifest = export(machine, smooth_errors(machine), "isg-csv").manifest
     assert manifest["machine"]["work_zone_mm"] == {"X": [-100.0, 0.0]}
-    other = emphasised(machine, "y=0:50, Z=-100:-10", 1e4, ("1,2,-3",))
-    assert other.emphasis == Emphasis((None, (0.0, 50.0), (-100.0, -10.0)), 1e4, ((1.0, 2.0, -3.0),))
+    other = emphasised(machine, "y=0:50, Z=-100:-10", 1e3, ("1,2,-3",))
+    assert other.emphasis == Emphasis((None, (0.0, 50.0), (-100.0, -10.0)), 1e3, ((1.0, 2.0, -3.0),))
     for wrong in ("X=5", "X=5:1", "A=0:1", "X=0:1,X=2:3", "X=-9999:0", "X=nan:1", ""):
         with pytest.raises(InputError, match="--zone"):
             emphasised(machine, wrong, None, ())

@@ -37,7 +37,7 @@ def emphasis_options(command: Command) -> Command:
         "--zone-weight",
         metavar="W",
         type=click.FloatRange(1.0, MOST_ZONE_WEIGHT),
-        help=f"How much more it counts, default {ZONE_WEIGHT:g}; {MOST_ZONE_WEIGHT:g}: the zone all but alone.",
+        help=f"How much more a coordinate in it counts, default {ZONE_WEIGHT:g}; {MOST_ZONE_WEIGHT:g}: the zone all but alone.",
     )
     tools_option = click.option(
         "--tools",

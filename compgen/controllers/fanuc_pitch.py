@@ -122,9 +122,8 @@ def _best_counts(
     """Return the best cumulative curve in counts at the section ends for corrections (n,), zero at the reference."""
     below = _reference_node(nodes_mm - machine.reference_point_mm[axis])
     wanted = settings.sign * (np.asarray(values_mm) - values_mm[below]) / settings.count_mm
-    travel_mm = [item.range_mm for item in machine.axes]
-    zone_weight = machine.emphasis.weight_along(axis, travel_mm)
-    sections = section_weights(nodes_mm, travel_mm[axis], machine.emphasis.zone_mm[axis], zone_weight)
+    emphasis = machine.emphasis
+    sections = section_weights(nodes_mm, machine.axes[axis].range_mm, emphasis.zone_mm[axis], emphasis.zone_weight)
     return best_integers(wanted, sections, below, settings.increment_limit)
 
 

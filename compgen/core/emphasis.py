@@ -16,10 +16,10 @@ from compgen.errors import InputError
 Interval = tuple[float, float]
 Vector3 = tuple[float, float, float]
 
-#: How much more a point within the work zone counts than one outside, if nothing is said.
+#: How much more a coordinate within the work zone counts than one outside, if nothing is said.
 ZONE_WEIGHT = 10.0
 #: The zone all but alone; the rest of the travel still settles what the zone leaves open.
-MOST_ZONE_WEIGHT = 1e4
+MOST_ZONE_WEIGHT = 1e3
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Emphasis:
     Parameters
     ----------
     zone_mm : ranges of X, Y and Z within the travel (None: the whole travel); where all are None there is no zone.
-    zone_weight : weight of the volume within the zone; 1 outside.
+    zone_weight : how much more a coordinate within the zone counts; the factors of the axes multiply.
     tools_mm : tool offsets over which the residual is averaged; none: the machine's own.
     """
 
@@ -47,21 +47,18 @@ class Emphasis:
         part = self.zone_mm[axis]
         return [] if part is None or not self.has_zone else list(part)
 
-    def weight_along(self, axis: int, travel_mm: Sequence[Interval]) -> float:
-        """Return the mean weight over the two other axes where the zone is along an axis; 1 beside it."""
-        share = 1.0
-        for other, (part, (low, high)) in enumerate(zip(self.zone_mm, travel_mm, strict=True)):
-            if other != axis and part is not None:
-                share *= (part[1] - part[0]) / (high - low)
-        return 1.0 + share * (self.zone_weight - 1.0) if self.has_zone else 1.0
-
     def weight(self, position_mm: FloatArray) -> FloatArray:
-        """Return the weight of positions (n, 3), shape (n,)."""
-        inside = np.full(len(position_mm), self.has_zone)
+        """Return the weight of positions (n, 3), shape (n,): a factor for each axis whose coordinate is in the zone.
+
+        A product over the axes, so that what depends on one of them stays orthogonal to what depends on another: a
+        table over X must not take up, as a step at the end of the zone, what Y does on the average there.
+        """
+        weight = np.ones(len(position_mm))
         for axis, part in enumerate(self.zone_mm):
             if part is not None:
-                inside &= (position_mm[:, axis] >= part[0] - 1e-9) & (position_mm[:, axis] <= part[1] + 1e-9)
-        return np.where(inside, self.zone_weight, 1.0)
+                along = position_mm[:, axis]
+                weight[(along >= part[0] - 1e-9) & (along <= part[1] + 1e-9)] *= self.zone_weight
+        return weight
 
     def summary(self) -> dict[str, Any]:
         """Return what stands in ``manifest.json``."""
@@ -82,8 +79,10 @@ class Emphasis:
                 for letter, part in zip(AXES, self.zone_mm, strict=True)
                 if part
             ]
-            weight = f"{self.zone_weight:g} times as much as the rest"
-            notes.append(f"The tables are made for the work zone {', '.join(parts)}, which counts {weight}.")
+            zone = ", ".join(parts)
+            notes.append(
+                f"The tables are made for the work zone {zone}; a coordinate in it counts {self.zone_weight:g} times."
+            )
         if self.tools_mm:
             tools = "; ".join(", ".join(f"{value:g}" for value in tool) for tool in self.tools_mm)
             notes.append(f"The tables are made for the tool offsets (x, y, z in mm) {tools}, which count alike.")
@@ -106,7 +105,7 @@ def take_emphasis(root: tomlio.Section, travel_mm: Sequence[Interval]) -> Emphas
 
 
 def zone_weight(value: Any) -> float:
-    """A weight from 1 to 10000."""
+    """A weight from 1 to 1000."""
     result = tomlio.number(value)
     if not 1.0 <= result <= MOST_ZONE_WEIGHT:
         raise ValueError(f"a number from 1 (no zone) to {MOST_ZONE_WEIGHT:g} (the zone all but alone) is expected")
