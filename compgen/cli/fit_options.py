@@ -35,8 +35,10 @@ def fitting_options(command: Command) -> Command:
     @functools.wraps(command)
     def wrapper(*args: Any, smoothness: float | None, robust: bool, **options: Any) -> Any:
         pairs = {key: _pairs(key, options.pop(key)) for key in _BOUNDS}
-        limits = [{name: _number(key, name, text) for name, text in pairs[key].items()} for key in _BOUNDS[:3]]
-        fitting = FitOptions.from_file_units(smoothness, *limits, pairs["monotone"], robust=robust)
+        largest, steepest, bent = (
+            {name: _number(key, name, text) for name, text in pairs[key].items()} for key in _BOUNDS[:3]
+        )
+        fitting = FitOptions.from_file_units(smoothness, largest, steepest, bent, pairs["monotone"], robust=robust)
         return command(*args, fitting=fitting, **options)
 
     decorated: Any = click.option("--robust", is_flag=True, help=_HELP["robust"])(wrapper)
