@@ -47,18 +47,16 @@ class Emphasis:
         part = self.zone_mm[axis]
         return [] if part is None or not self.has_zone else list(part)
 
-    def weight(self, position_mm: FloatArray) -> FloatArray:
-        """Return the weight of positions (n, 3), shape (n,): a factor for each axis whose coordinate is in the zone.
+    def factor(self, axis: int, along_mm: FloatArray) -> FloatArray:
+        """Return the factor of one axis in the weight of positions along it, same shape.
 
-        A product over the axes, so that what depends on one of them stays orthogonal to what depends on another: a
-        table over X must not take up, as a step at the end of the zone, what Y does on the average there.
+        The weight is a product over the axes, so that what depends on one of them stays orthogonal to what depends on
+        another: a table over X must not take up, as a step at the end of the zone, what Y does on the average there.
         """
-        weight = np.ones(len(position_mm))
-        for axis, part in enumerate(self.zone_mm):
-            if part is not None:
-                along = position_mm[:, axis]
-                weight[(along >= part[0] - 1e-9) & (along <= part[1] + 1e-9)] *= self.zone_weight
-        return weight
+        ends = self.ends_mm(axis)
+        if not ends:
+            return np.ones_like(along_mm)
+        return np.where((along_mm > ends[0]) & (along_mm < ends[1]), self.zone_weight, 1.0)
 
     def summary(self) -> dict[str, Any]:
         """Return what stands in ``manifest.json``."""

@@ -140,8 +140,8 @@ def projector(
         np.unique(np.concatenate([[low, high], *(term.nodes_mm for term in basis if term.axis == axis)]))
         for axis, (low, high) in enumerate(item.range_mm for item in machine.axes)
     )
-    sample = volume_sample(machine, nodes, cuts_mm=[machine.emphasis.ends_mm(axis) for axis in range(3)])
-    position_mm, weight = sample.position_mm, sample.weight * machine.emphasis.weight(sample.position_mm)
+    sample = volume_sample(machine, nodes, emphasis=machine.emphasis)
+    position_mm, weight = sample.position_mm, sample.weight
     tool_mm = own_tool_mm = tool_of(machine, None)
     if tools_mm:
         tool_mm = np.repeat(np.array(tools_mm, dtype=np.float64), len(position_mm), axis=0)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from compgen.core.csvio import FloatArray
+from compgen.core.emphasis import Emphasis
 from compgen.core.machine import Machine
 
 #: A full grid larger than this is replaced by a low-discrepancy sample of as many points.
 MOST_POINTS = 20_000
 
 
+NO_EMPHASIS = Emphasis()
 #: Gauss-Legendre points across an axis of which the own levels are taken.
 LEAST_ACROSS, MOST_ACROSS = 4, 12
 
@@ -68,7 +69,7 @@ def volume_sample(
     machine: Machine,
     nodes_mm: tuple[FloatArray, ...],
     most: int = MOST_POINTS,
-    cuts_mm: Sequence[Sequence[float]] = ((), (), ()),
+    emphasis: Emphasis = NO_EMPHASIS,
 ) -> VolumeSample:
     """Return points that determine tables with the given nodes over the volume: the full grid where it is not too large.
 
@@ -78,22 +79,22 @@ def volume_sample(
     a function of one axis is orthogonal to functions of the others, as it is over the volume; a random sample is not,
     and would turn what the tables cannot hold into ragged values.
 
-    ``cuts_mm`` are positions of each axis where weights that are put on later jump; they are levels, and the
-    Gauss-Legendre points fill each part between them.
+    The weight of the work zone of ``emphasis`` is part of them, interval by interval: its ends are levels, and the
+    Gauss-Legendre points fill each part between them, so that all grids agree on the mean over an axis.
     """
-    nodes_mm = tuple(np.append(nodes, cuts) for nodes, cuts in zip(nodes_mm, cuts_mm, strict=True))
+    nodes_mm = tuple(np.append(nodes, emphasis.ends_mm(axis)) for axis, nodes in enumerate(nodes_mm))
     levels = [
         levels_between(np.asarray(nodes), *axis.range_mm) for nodes, axis in zip(nodes_mm, machine.axes, strict=True)
     ]
     if np.prod([len(level) for level in levels]) <= most:
-        x, y, z = (_simpson(level) for level in levels)
+        x, y, z = (_simpson(level, emphasis.factor(axis, level[1::2])) for axis, level in enumerate(levels))
         position_mm = VolumeGrid((levels[0], levels[1], levels[2])).position_mm
         return VolumeSample(position_mm, len(position_mm) * np.einsum("i,j,k->ijk", x, y, z).ravel())
     positions, weights = [], []
     for axis in range(3):
         count = int(np.clip(np.sqrt(most / len(levels[axis])), LEAST_ACROSS, MOST_ACROSS))
-        sides = [_gauss_legendre(machine.axes[k].range_mm, cuts_mm[k], count) for k in range(3)]
-        sides[axis] = (levels[axis], _simpson(levels[axis]))
+        sides = [_gauss_legendre(machine, k, emphasis, count) for k in range(3)]
+        sides[axis] = (levels[axis], _simpson(levels[axis], emphasis.factor(axis, levels[axis][1::2])))
         grid = VolumeGrid((sides[0][0], sides[1][0], sides[2][0]))
         positions.append(grid.position_mm)
         weights.append(np.einsum("i,j,k->ijk", sides[0][1], sides[1][1], sides[2][1]).ravel())
@@ -101,12 +102,14 @@ def volume_sample(
     return VolumeSample(np.concatenate(positions), joined * (len(joined) / joined.sum()))
 
 
-def _simpson(levels_mm: FloatArray) -> FloatArray:
-    """Weights, which sum to 1, of levels where every second one is the middle of its neighbours.
+def _simpson(levels_mm: FloatArray, factor: FloatArray) -> FloatArray:
+    """Weights (n,), which sum to 1, of levels where every second one is the middle of its neighbours.
 
-    Exact for cubic polynomials between the nodes, so for squares of what tables hold there.
+    Exact for cubic polynomials between the nodes, so for squares of what tables hold there. ``factor`` weighs the
+    intervals.
     """
-    part = np.diff(levels_mm[::2]) / (6.0 * (levels_mm[-1] - levels_mm[0]))
+    part = factor * np.diff(levels_mm[::2])
+    part /= 6.0 * np.sum(part)
     weights = np.zeros(len(levels_mm))
     weights[1::2] = 4.0 * part
     weights[:-1:2] += part
@@ -114,11 +117,10 @@ def _simpson(levels_mm: FloatArray) -> FloatArray:
     return weights
 
 
-def _gauss_legendre(
-    range_mm: tuple[float, float], cuts_mm: Sequence[float], count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Points within the parts of a range, about ``count`` in all, and their weights, which sum to 1."""
-    ends = np.unique(np.clip([*range_mm, *cuts_mm], *range_mm))
+def _gauss_legendre(machine: Machine, axis: int, emphasis: Emphasis, count: int) -> tuple[FloatArray, FloatArray]:
+    """Points over an axis, about ``count`` in all, within and beside the work zone; their weights sum to 1."""
+    ends = np.unique([*machine.axes[axis].range_mm, *emphasis.ends_mm(axis)])
     points, weights = np.polynomial.legendre.leggauss(max(LEAST_ACROSS, count // (len(ends) - 1)))
     middle, half = 0.5 * (ends[1:] + ends[:-1])[:, None], 0.5 * np.diff(ends)[:, None]
-    return (middle + half * points).ravel(), (half * weights).ravel() / (ends[-1] - ends[0])
+    weighted = emphasis.factor(axis, middle) * half * weights
+    return (middle + half * points).ravel(), weighted.ravel() / np.sum(weighted)
