@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -36,7 +37,12 @@ from compgen.identify.result import Identification, StationResult, worst_uncerta
 from compgen.identify.robust import Readings, RobustFit, fit_robustly
 from compgen.identify.robust_start import robust_state
 from compgen.identify.solver import Factor, factorise, solve
-from compgen.identify.start import StationStart, station_start, station_start_from_moments
+from compgen.identify.start import (
+    StationStart,
+    station_start,
+    station_start_from_moments,
+    station_starts_from_moments,
+)
 from compgen.identify.state import IntArray, State
 from compgen.identify.tables import error_table, inverse, metadata_of, unobservable
 from compgen.identify.threads import one_thread
@@ -60,7 +66,11 @@ class _Task:
     problem: AnyProblem
     station: IntArray
     group: IntArray
-    target_mm: FloatArray
+
+    @cached_property
+    def target_mm(self) -> FloatArray:
+        """Nominal target of every reading, (n, 3)."""
+        return self.lengths.position_mm + common_tool(self.machine, self.lengths.tool_mm)
 
 
 def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None = None) -> Identification:
@@ -231,7 +241,7 @@ def _task(machine: Machine, lengths: Lengths) -> _Task:
     layout = parameters_for_tools(machine, tool_mm)
     group = _groups(lengths)
     problem = _problem(machine, lengths, layout, group)
-    return _Task(machine, lengths, problem, lengths.station, group, lengths.position_mm + tool_mm)
+    return _Task(machine, lengths, problem, lengths.station, group)
 
 
 def _problem(
@@ -261,6 +271,9 @@ def _start(task: _Task) -> tuple[State, list[int]]:
     moments = start_moments(task.problem) if isinstance(task.problem, GridProblem) else None
     readings = np.bincount(task.station, minlength=len(stations))
     searched: list[int] = []
+    at_once: list[StationStart | None] = [None] * len(stations)
+    if moments is not None and groups == len(stations):
+        at_once = station_starts_from_moments(*moments)
     for k in range(len(stations)):
         own = np.flatnonzero(station_of == k)
         if readings[k] < 4 + len(own):
@@ -268,8 +281,8 @@ def _start(task: _Task) -> tuple[State, list[int]]:
             file = origin[int(np.flatnonzero(task.station == k)[0])][0] if origin else None
             message = f"station {task.lengths.stations[k]!r} has only {readings[k]} reading(s); it cannot be located"
             raise InputError(message, file=file)
-        found = None
-        if moments is not None:
+        found = at_once[k]
+        if found is None and moments is not None:
             sums, offset, centre, scale = moments
             found = station_start_from_moments(sums[own], offset[own], centre, scale)
         if found is None:

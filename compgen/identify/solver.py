@@ -19,6 +19,8 @@ from compgen.identify.state import Problem, State
 #: The remaining distance to the optimum, estimated from the last two steps, that ends the iteration (mm; angles count
 #: at a lever of one metre).
 TOLERANCE_MM = 1e-10
+#: A step of a new factor below this that does not lower the cost shows that the cost is nothing but rounding.
+STALLED_MM = 1e-8
 MAX_ITERATIONS = 80
 #: After a step of this size the lines of sight have turned so much that a new factor pays.
 FAR_MM = 0.5
@@ -98,7 +100,8 @@ def solve(problem: Problem, start: State, factor: Factor | None = None) -> Solut
         candidate = state.moved(step)
         new_cost, new_gradient = problem.evaluate(candidate)
         if not new_cost <= cost * (1 + 1e-9) + 1e-18:
-            if size < TOLERANCE_MM and not damping:  # the cost cannot be told from its rounding any more
+            stalled = size < (STALLED_MM if fresh else TOLERANCE_MM)
+            if stalled and not damping:  # the cost cannot be told from its rounding any more
                 return Solution(state, cost, factor, iteration, factorisations)
             if fresh:
                 damping = max(10.0 * damping, 1e-6)

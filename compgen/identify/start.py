@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
 
+#: Share of the largest eigenvalue below which the readings do not locate a station in closed form.
+LEAST_EIGENVALUE = 1e-10
+
 
 @dataclass(frozen=True)
 class StationStart:
@@ -64,10 +67,29 @@ def station_start_from_moments(
         return None
     unit = 1.0 / np.sqrt(diagonal)
     eigenvalues, vectors = np.linalg.eigh(normal * unit * unit[:, None])
-    if eigenvalues[0] < 1e-10 * eigenvalues[-1]:
+    if eigenvalues[0] < LEAST_EIGENVALUE * eigenvalues[-1]:
         return None
     solution = unit * (vectors @ ((vectors.T @ (right * unit)) / eigenvalues))
     return StationStart(solution[:3] * scale_mm + centre_mm, (solution[3 : 3 + groups] - offset) * scale_mm)
+
+
+def station_starts_from_moments(
+    moments: FloatArray, offset: FloatArray, centre_mm: FloatArray, scale_mm: float
+) -> list[StationStart | None]:
+    """Locate stations of one set-up each, all at once: moments (S, 6, 6) and offsets (S,) as for one."""
+    normal, right = moments[:, :5, :5], moments[:, :5, 5]
+    diagonal = np.einsum("sii->si", normal)
+    unit = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(normal * unit[:, :, None] * unit[:, None, :])
+    good = (diagonal.min(axis=1) > 0) & (eigenvalues[:, 0] >= LEAST_EIGENVALUE * eigenvalues[:, -1])
+    along = np.einsum("sik,si->sk", vectors, right * unit) / np.where(good[:, None], eigenvalues, 1.0)
+    solution = unit * np.einsum("sik,sk->si", vectors, along)
+    return [
+        StationStart(solution[k, :3] * scale_mm + centre_mm, (solution[k, 3:4] - offset[k]) * scale_mm)
+        if good[k]
+        else None
+        for k in range(len(moments))
+    ]
 
 
 def _residual(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_], x: FloatArray) -> FloatArray:

@@ -28,13 +28,21 @@ def inverse(factor: Factor) -> FloatArray:
 def error_table(layout: ErrorParameters, unknowns: FloatArray, covariance: FloatArray) -> ErrorTable:
     """Return curves and squareness for the unknown errors (size,) and their covariance (size, size), mm and rad."""
     positions = [layout.output_positions_mm(axis) for axis in range(3)]
-    bases = [layout.basis(axis, positions[axis]) for axis in range(3)]
+    plain = layout.machine.curves == "linear"  # written at the nodes, where coefficients are values
+    bases = [np.zeros((0, 0)) if plain else layout.basis(axis, positions[axis]) for axis in range(3)]
+    variance = np.diag(covariance)
     curves = {}
     for curve in layout.curves:
-        reduced = bases[curve.error.axis] @ curve.free
-        block = covariance[curve.columns, curve.columns]
-        u = np.sqrt(np.maximum(np.sum((reduced @ block) * reduced, axis=1), 0.0))
-        curves[curve.error.name] = Curve(positions[curve.error.axis], reduced @ unknowns[curve.columns], u)
+        axis, free = curve.error.axis, curve.free
+        kept = free.argmax(axis=0)
+        if plain and np.count_nonzero(free) == free.shape[1] == free[kept, np.arange(free.shape[1])].sum():
+            value, square = np.zeros(len(free)), np.zeros(len(free))
+            value[kept], square[kept] = unknowns[curve.columns], variance[curve.columns]
+        else:
+            reduced = free if plain else bases[axis] @ free
+            value = reduced @ unknowns[curve.columns]
+            square = np.sum((reduced @ covariance[curve.columns, curve.columns]) * reduced, axis=1)
+        curves[curve.error.name] = Curve(positions[axis], value, np.sqrt(np.maximum(square, 0.0)))
     first = layout.size - len(layout.squareness)
     squareness = {
         name: (float(unknowns[first + k]), float(np.sqrt(covariance[first + k, first + k])))
