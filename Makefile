@@ -1,10 +1,11 @@
 # make demo   sets up and runs the main job on the example
 # make test   sets up, checks style and types, runs the tests
+# make bench  prints the ratios against named peers
 PYTHON ?= python3
 BIN := .venv/bin
 CONTROLLERS := isg-csv etalon-exchange siemens-eec siemens-cec fanuc-pitch
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint bench clean
 .DELETE_ON_ERROR:
 
 demo: .venv/ready
@@ -33,6 +34,10 @@ lint: .venv/ready-dev
 .venv/ready-dev: .venv/ready requirements-dev.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	@touch $@
+
+# every benchmark, one after the other; some minutes on a quiet computer
+bench: .venv/ready-dev
+	for name in identify evaluate fit interval_coverage; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 clean:
 	rm -rf .venv demo-out
