@@ -107,9 +107,9 @@ def test_run_writes_everything_and_exits_with_0(call, small_machine_file, small_
     out = tmp_path / "out"
     code, stdout, stderr = call("run", small_machine_file, small_lengths_file, "--controller", "isg-csv", "--out", out)
     assert (code, stderr) == (0, "")
-    assert sorted(path.name for path in out.iterdir()) == [
-        "check-program.md",
-        "check-program.nc",
+    assert sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()) == [
+        "check/check-program.md",
+        "check/check-program.nc",
         "fit.json",
         "fitted.errors.csv",
         "identified.covariance.npz",

@@ -274,14 +274,14 @@ def test_the_command_writes_one_accepted_set(small_machine_file, small_machine, 
     words = ["merge", str(small_machine_file), str(old[0]), "--controller", "siemens-cec", "--errors", str(measured)]
     assert run_command(cli, [*words, "--out", str(out)]) == 0
     capsys.readouterr()
-    names = {path.name for path in out.iterdir()}
+    names = {path.relative_to(out).as_posix() for path in out.rglob("*")}
     assert {
         "NC_CEC.INI",
         "merge.json",
         "merged.errors.csv",
         "result.json",
         "manifest.json",
-        "check-program.md",
+        "check/check-program.md",
     } <= names
     assert json.loads((out / "merge.json").read_text())["difference_max_um"] < 0.1
     assert json.loads((out / "result.json").read_text())["accepted"] is True

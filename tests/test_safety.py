@@ -457,8 +457,8 @@ PROGRAMS = ["etalon-exchange", "isg-csv", "siemens-cec", "siemens-eec"]
 @pytest.mark.parametrize("name", ALL)
 def test_a_program_is_written_only_where_its_motion_is_documented(name, small_machine, small_errors):
     files = check_files(small_machine, export(small_machine, small_errors, name), small_errors)
-    assert ("check-program.nc" in files) == (name in PROGRAMS)
-    assert ("by hand" in files["check-program.md"]) == (name not in PROGRAMS)
+    assert ("check/check-program.nc" in files) == (name in PROGRAMS)
+    assert ("by hand" in files["check/check-program.md"]) == (name not in PROGRAMS)
     assert all(text.isascii() for text in files.values())
 
 
@@ -467,7 +467,7 @@ def test_the_program_moves_slowly_z_first_and_stops_five_times_and_once_more(
     name, small_machine, small_errors, programs
 ):
     """The blocks are walked through by hand: no rapid, no tool, no spindle; X and Y move at the safe height only."""
-    text = check_files(small_machine, export(small_machine, small_errors, name), small_errors)["check-program.nc"]
+    text = check_files(small_machine, export(small_machine, small_errors, name), small_errors)["check/check-program.nc"]
     code = [re.sub(r"\(.*?\)|;.*", "", line).strip() for line in text.splitlines()]
     place, stopped, start = {}, [], []
     for line in filter(None, code):
@@ -500,13 +500,13 @@ def test_names_of_the_user_do_not_reach_the_program(small_machine, small_errors)
     for name in PROGRAMS:
         files = check_files(machine, export(machine, small_errors, name), small_errors)
         plain = check_files(small_machine, export(small_machine, small_errors, name), small_errors)
-        assert "999" not in files["check-program.nc"]
-        assert files["check-program.nc"].count("\n") == plain["check-program.nc"].count("\n")
+        assert "999" not in files["check/check-program.nc"]
+        assert files["check/check-program.nc"].count("\n") == plain["check/check-program.nc"].count("\n")
 
 
 def test_a_machine_without_errors_has_a_page_that_says_that_nothing_shows(small_machine, small_errors):
     zero = ErrorTable({"EXX": Curve(np.array([-300.0, 200.0]), np.zeros(2), np.full(2, np.nan))})
-    page = check_files(small_machine, export(small_machine, zero, "siemens-cec"), zero)["check-program.md"]
+    page = check_files(small_machine, export(small_machine, zero, "siemens-cec"), zero)["check/check-program.md"]
     assert "changes at least one reading by 0.0 um" in page
     assert "That is little" in page
 

@@ -73,7 +73,7 @@ def export_command(
     """Export errors to the files of a control, with manifest.json and preflight.md.
 
     ERRORS is an *.errors.csv file (um, urad), usually the fitted one. Files that break a limit of the control are
-    written as NOT-ACCEPTED-... (exit code 1). check-program.md says what to read at five positions of the machine.
+    written as NOT-ACCEPTED-... (exit code 1). check/check-program.md says what to read at five positions of the machine.
     With --active ERRORS are those of the machine with its old tables; bare.errors.csv gets those without.
 
     \b

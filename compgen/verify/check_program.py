@@ -35,7 +35,8 @@ APPROACH_MM, APPROACH_SHARE = 10.0, 0.02
 MARGIN = 1.5
 #: Feed between the positions and over the last approach, mm/min.
 FEED_MM_MIN, APPROACH_FEED_MM_MIN = 1000, 200
-PROGRAM_NAME, PAGE_NAME = "check-program.nc", "check-program.md"
+#: In a folder of their own, so that nobody takes the program for a table.
+PROGRAM_NAME, PAGE_NAME = "check/check-program.nc", "check/check-program.md"
 
 
 @dataclass(frozen=True)
@@ -161,7 +162,7 @@ def check_files(
     templates: Path | None = None,
     reversal: ReversalCurves | None = None,
 ) -> dict[str, str]:
-    """Return ``check-program.md`` and, for controls whose motion in machine coordinates is documented, the program.
+    """Return ``check/check-program.md`` and, for controls whose motion in machine coordinates is documented, the program.
 
     Parameters
     ----------
