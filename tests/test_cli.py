@@ -682,3 +682,12 @@ def test_what_the_data_do_not_determine_is_reported_and_no_curve_is_written(
     assert report["identified"] is False
     assert any("EXX" in text for text in report["unobservable"])
     assert [path.name for path in out.iterdir()] == ["identify.json"]
+
+
+def test_the_line_number_in_a_message_stays_a_number(call, small_machine_file, small_lengths_file, tmp_path):
+    rows = small_lengths_file.read_text().splitlines()
+    rows[99] = rows[99].replace(".", "x", 1)
+    bad = tmp_path / "bad.lengths.csv"
+    bad.write_text("\n".join(rows) + "\n")
+    _, _, stderr = call("identify", small_machine_file, bad, "--out", tmp_path / "out")
+    assert "bad.lengths.csv:100: column" in stderr

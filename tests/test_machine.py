@@ -9,6 +9,7 @@ import pytest
 from compgen.core import machine as machine_module
 from compgen.core.machine import CHAINS, Chain, load_machine, machine_files, read_machine
 from compgen.errors import InputError
+from compgen.resources import data_folder
 
 GOOD = """\
 name = "mill"
@@ -270,3 +271,11 @@ def test_every_shipped_machine_loads_under_its_name():
         machine = load_machine(name)
         assert machine.name == name
         assert np.all(machine.upper_mm > machine.lower_mm)
+
+
+def test_a_copy_beside_its_original_is_a_second_machine_of_that_name(tmp_path):
+    shipped = data_folder("machines") / "zha-gantry.toml"
+    for name in ("a.toml", "b.toml"):
+        (tmp_path / name).write_bytes(shipped.read_bytes())
+    with pytest.raises(InputError, match="two machines are named 'zha-gantry'"):
+        machine_files((tmp_path,))

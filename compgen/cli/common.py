@@ -47,8 +47,9 @@ CONTRACT_CONTROLLERS = (
 STOPPED, READER_GONE = 130, 141
 #: Tables into a pipe or a file get the width that they need, not that of an unknown terminal.
 PIPE_WIDTH = None if sys.stdout.isatty() else 130
-stdout = Console(highlight=False, width=PIPE_WIDTH)
-stderr = Console(stderr=True, highlight=False)
+# emoji=False: rich would turn the place file.csv:100: into a picture
+stdout = Console(highlight=False, emoji=False, markup=False, width=PIPE_WIDTH)
+stderr = Console(stderr=True, highlight=False, emoji=False, markup=False)
 
 
 def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:

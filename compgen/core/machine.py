@@ -194,13 +194,15 @@ def machine_files(folders: tuple[Path, ...] = ()) -> dict[str, Path]:
     """
     found: dict[str, Path] = {}
     for folder in dict.fromkeys(path.resolve() for path in (data_folder("machines"), *folders)):
+        here: dict[str, Path] = {}
         for path in sorted([*folder.glob("*.toml"), *folder.glob("*/machine.toml")]):
             name = tomlio.read_toml(path).take("name", tomlio.text)
-            first = found.setdefault(name, path)
-            if first != path and (folder in first.parents or first.read_bytes() != path.read_bytes()):
+            first = here.get(name) or found.setdefault(name, path)
+            if first != path and (name in here or first.read_bytes() != path.read_bytes()):
                 raise InputError(
                     f"two machines are named {name!r}: this file and {first}; rename one", file=path, field="name"
                 )
+            here[name] = path
     return found
 
 
