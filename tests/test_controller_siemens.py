@@ -769,7 +769,7 @@ def test_a_good_file_with_one_changed_character_parses_or_is_an_input_error(tmp_
         tables = parsed(control, machine, own, text)
     except (InputError, CompgenWarning):
         return
-    control.violations(machine, own, tables)
+    assert all(isinstance(text, str) for text in control.violations(machine, own, tables))
 
 
 @pytest.mark.parametrize("name", ["siemens-eec", "siemens-cec"])

@@ -21,8 +21,10 @@ from compgen.core.lengths import (
     check_repeats,
     common_approach,
     common_covariates,
+    common_labels,
+    common_metadata,
     common_tool,
-    labels_of,
+    origins,
     vectors_of,
 )
 from compgen.core.names import MM_PER_UM
@@ -91,14 +93,10 @@ def read_deviations(paths: str | Path | Sequence[str | Path]) -> Deviations:
         u_mm=None if np.isnan(u_mm).all() else u_mm,
         tool_mm=common_tool(tables),
         approach=common_approach(tables),
-        labels={
-            name: np.concatenate([labels_of(table, name) for table in tables])
-            for name in LABEL_COLUMNS
-            if any(name in table.columns for table in tables)
-        },
+        labels=common_labels(tables),
         covariates=common_covariates(tables),
-        metadata={key: value for table in reversed(tables) for key, value in table.metadata.items() if key != "rows"},
-        origin=[(str(table.path), line) for table in tables for line in table.lines],
+        metadata=common_metadata(tables),
+        origin=origins(tables),
     )
 
 

@@ -75,14 +75,10 @@ def read_lengths(paths: str | Path | Sequence[str | Path]) -> Lengths:
         length_mm=np.concatenate([table.numbers("length_mm") for table in tables]),
         tool_mm=common_tool(tables),
         approach=common_approach(tables),
-        labels={
-            name: np.concatenate([labels_of(table, name) for table in tables])
-            for name in LABEL_COLUMNS
-            if any(name in table.columns for table in tables)
-        },
+        labels=common_labels(tables),
         covariates=common_covariates(tables),
-        metadata={key: value for table in reversed(tables) for key, value in table.metadata.items() if key != "rows"},
-        origin=[(str(table.path), line) for table in tables for line in table.lines],
+        metadata=common_metadata(tables),
+        origin=origins(tables),
     )
 
 
@@ -129,6 +125,25 @@ def vectors_of(table: CsvTable, names: Sequence[str]) -> FloatArray:
 def labels_of(table: CsvTable, name: str) -> NDArray[np.int64]:
     """Return a column of labels (rows,); zeros if the file lacks it."""
     return table.labels(name) if name in table.columns else np.zeros(len(table), dtype=np.int64)
+
+
+def common_labels(tables: Sequence[CsvTable]) -> dict[str, NDArray[np.int64]]:
+    """Return the label columns that any of the tables has; 0 in the others."""
+    return {
+        name: np.concatenate([labels_of(table, name) for table in tables])
+        for name in LABEL_COLUMNS
+        if any(name in table.columns for table in tables)
+    }
+
+
+def common_metadata(tables: Sequence[CsvTable]) -> dict[str, str]:
+    """Return the comments of all tables; where they differ, that of the first one counts."""
+    return {key: value for table in reversed(tables) for key, value in table.metadata.items() if key != "rows"}
+
+
+def origins(tables: Sequence[CsvTable]) -> list[tuple[str, int]]:
+    """Return file and line of every row."""
+    return [(str(table.path), line) for table in tables for line in table.lines]
 
 
 def common_tool(tables: list[CsvTable]) -> FloatArray | None:
