@@ -20,6 +20,7 @@ from compgen.cli.common import (
 from compgen.cli.emphasis_options import emphasis_options
 from compgen.cli.options_commands import explain_option
 from compgen.cli.safety_options import active_options, limits_option
+from compgen.cli.sample_options import sample_options
 from compgen.core.error_table import format_errors, read_errors
 from compgen.core.files import OutputFolder, write_file
 from compgen.core.machine import Machine
@@ -51,6 +52,7 @@ def reversal_option(command: Command) -> Command:
 @emphasis_options
 @click.argument("errors", type=click.Path(path_type=Path))
 @controller_option()
+@sample_options
 @out_option
 @click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
@@ -119,6 +121,7 @@ def export_command(
 @machine_argument
 @click.argument("tables", nargs=-1, required=True, type=click.Path(path_type=Path))
 @controller_option()
+@sample_options
 @click.option("--points", required=True, type=click.Path(path_type=Path), help="*.points.csv (mm).")
 @click.option("--out", required=True, metavar="FILE", type=click.Path(path_type=Path), help="CSV file for the result.")
 @json_option
@@ -151,6 +154,7 @@ def read_command(
 @emphasis_options
 @click.argument("tables", nargs=-1, required=True, type=click.Path(path_type=Path))
 @controller_option()
+@sample_options
 @click.option(
     "--errors", required=True, type=click.Path(path_type=Path), help="*.errors.csv of the machine (um, urad)."
 )

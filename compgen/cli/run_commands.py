@@ -27,6 +27,7 @@ from compgen.cli.identify_commands import (
 )
 from compgen.cli.options_commands import explain_option, explain_run
 from compgen.cli.safety_options import active_options, limits_option
+from compgen.cli.sample_options import sample_options
 from compgen.core.machine import Machine
 from compgen.fit import FitOptions
 from compgen.identify import SystematicInputs
@@ -41,6 +42,7 @@ from compgen.verify.safety import SafetyLimits
 @emphasis_options
 @click.argument("measurements", nargs=-1, required=True, type=click.Path(path_type=Path))
 @controller_option(multiple=True)
+@sample_options
 @out_option
 @instrument_options
 @systematic_options

@@ -129,6 +129,8 @@ class Controller(ABC, Generic[Settings, Tables]):
     anchored: bool = False
     #: True if tables may act in one direction of travel only, so that a reversal goes into them.
     bidirectional: bool = False
+    #: Setting that names a file of the user's own control to follow: "style_from", "template_from", or None.
+    sample_setting: str | None = None
 
     @abstractmethod
     def read_settings(self, machine: Machine) -> Settings:

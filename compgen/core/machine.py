@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -107,6 +107,12 @@ class Machine:
         if section is None:
             return tomlio.Section({}, path=self.source, name=f"controllers.{name}")
         return tomlio.Section(section.data, path=section.path, text=section.text, name=section.name)
+
+    def with_setting(self, controller: str, key: str, value: Any) -> Machine:
+        """Return the machine with one setting of one control put in place of what the file says."""
+        section = self.controller_settings(controller)
+        section.data[key] = value
+        return replace(self, controllers={**self.controllers, controller: section})
 
 
 def read_machine(path: str | Path) -> Machine:

@@ -70,6 +70,16 @@ class Section:
             section._nth = nth
         return found
 
+    def file(self, key: str) -> Path | None:
+        """Return the path of an existing file, None if ``key`` is absent; relative to the folder of the TOML file."""
+        name = self.take(key, text_of_path, None)
+        if name is None:
+            return None
+        path = (self.path.parent if self.path else Path()) / name
+        if not path.is_file():
+            raise self.fail(key, f"no such file: {path}; give the path of a file")
+        return path
+
     def finish(self) -> None:
         """Raise InputError for the first key that was never asked for."""
         for key in self.data:
@@ -158,6 +168,13 @@ def text(value: Any) -> str:
     """One line of text, at most 200 characters."""
     if not isinstance(value, str) or not value.strip() or len(value) > 200 or any(ord(char) < 32 for char in value):
         raise ValueError("one line of text is expected")
+    return value
+
+
+def text_of_path(value: Any) -> str:
+    """A path as text: not empty, without control characters."""
+    if not isinstance(value, str) or not value.strip() or any(ord(char) < 32 for char in value):
+        raise ValueError("the path of a file is expected")
     return value
 
 
