@@ -11,7 +11,8 @@ ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
     ("core", "errors", "resources"),
     ("model",),
-    ("measure",),
+    ("effects",),
+    ("sixdof",),
     ("simulate",),
     ("identify",),
     ("plan",),
@@ -19,8 +20,13 @@ ORDER = (
     ("controllers",),
     ("export",),
     ("verify",),
+    ("accuracy",),
+    ("imports",),
+    ("diagnose",),
     ("pipeline",),
     ("report",),
+    ("recal",),
+    ("serve",),
     ("cli",),
     ("__main__",),
 )
