@@ -28,6 +28,7 @@ from compgen.identify import (
 from compgen.model import c_matrix, exact_error, modelled_errors, observable_errors, predict, volumetric_error
 from compgen.pipeline import RunResult, run
 from compgen.plan import Plan, PlannedStations, plan, planned_stations, suggest
+from compgen.plugins import load_plugins
 from compgen.simulate import Scenario, Simulation, read_scenario, simulate, write_simulation
 from compgen.verify import ReadTables, Residuals, Verification, read_tables, residuals, verify, without_rigid_motion
 
@@ -75,6 +76,7 @@ __all__ = [
     "identify_deviations",
     "joint_covariance",
     "load_machine",
+    "load_plugins",
     "modelled_errors",
     "observable_errors",
     "plan",

@@ -23,7 +23,7 @@ ORDER = (
     ("accuracy",),
     ("imports",),
     ("diagnose",),
-    ("pipeline",),
+    ("pipeline", "plugins"),
     ("report",),
     ("recal",),
     ("serve",),

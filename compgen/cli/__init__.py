@@ -17,11 +17,14 @@ from compgen.cli import (
     simulate_commands,
 )
 from compgen.cli.common import run_command
+from compgen.cli.plugin_options import plugin_option
 from compgen.export import program_version
+from compgen.plugins import load_plugins
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(program_version(), prog_name="compgen")
+@plugin_option
 def cli() -> None:
     """From a machine-tool measurement to checked compensation tables.
 
@@ -32,6 +35,7 @@ def cli() -> None:
     Example:
       compgen run zha-gantry lengths.csv --controller isg-csv --out tables/
     """
+    load_plugins()
 
 
 MODULES = (
@@ -46,7 +50,7 @@ MODULES = (
 )
 for module in MODULES:
     for command in module.COMMANDS:
-        cli.add_command(command)
+        cli.add_command(plugin_option(command))
 
 
 def main() -> None:

@@ -19,8 +19,10 @@ from rich.console import Console
 
 from compgen.controllers import CONTROLLERS
 from compgen.core.machine import Machine, load_machine
+from compgen.core.plugins import restored, why_missing
 from compgen.core.text import nearest
 from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.plugins import KINDS
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -60,6 +62,7 @@ def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:
             CONTROLLERS[controller].read_settings(machine)
         elif controller not in CONTRACT_CONTROLLERS:
             message = f"is not a controller; {nearest(controller, {*CONTROLLERS, *CONTRACT_CONTROLLERS})}"
+            message += why_missing("control", controller) or "; if it comes from a plug-in, add --plugin PATH"
             raise InputError(message, file=machine.source, field=f"[controllers.{controller}]")
     return machine
 
@@ -130,7 +133,7 @@ def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__
 def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code of the contract; never show a traceback for bad input."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), restored(KINDS):  # plug-ins given to one command are not there for the next
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
         warnings.showwarning = _show_warning

@@ -8,6 +8,7 @@ from compgen.controllers.fanuc_pitch import FanucPitch
 from compgen.controllers.isg_csv import IsgCsv
 from compgen.controllers.siemens_cec import SiemensCec
 from compgen.controllers.siemens_eec import SiemensEec
+from compgen.core.plugins import why_missing
 from compgen.core.text import nearest
 from compgen.errors import InputError
 
@@ -24,7 +25,7 @@ CONTROLLERS: dict[str, AnyController] = {
 def controller_named(name: str) -> AnyController:
     """Return the control ``name`` or raise an InputError that lists what there is."""
     if name not in CONTROLLERS:
-        raise InputError(f"no controller is named {name!r}; {nearest(name, CONTROLLERS)}")
+        raise InputError(f"no controller is named {name!r}; {nearest(name, CONTROLLERS)}{why_missing('control', name)}")
     return CONTROLLERS[name]
 
 

@@ -129,6 +129,8 @@ class Controller(ABC, Generic[Settings, Tables]):
     anchored: bool = False
     #: True if tables may act in one direction of travel only, so that a reversal goes into them.
     bidirectional: bool = False
+    #: Folder with the sub-folder of templates of a plug-in's control; None: the shipped templates.
+    templates: Path | None = None
     #: Setting that names a file of the user's own control to follow: "style_from", "template_from", or None.
     sample_setting: str | None = None
 
@@ -172,6 +174,10 @@ class Controller(ABC, Generic[Settings, Tables]):
         An axis over which there is no table has none. The default knows none at all.
         """
         return (np.zeros(0), np.zeros(0), np.zeros(0))
+
+    def reversal_in_tables(self, settings: Settings, reversal: ReversalCurves) -> ReversalCurves:
+        """Return the part of a reversal that goes into tables of one direction; ``with_reversal`` gets just this."""
+        return reversal if self.bidirectional else ReversalCurves({})
 
     def with_reversal(self, machine: Machine, settings: Settings, tables: Tables, reversal: ReversalCurves) -> Tables:
         """Return the tables with the reversal in them; only for controls that are ``bidirectional``."""

@@ -12,6 +12,7 @@ from typing import Any
 from jinja2 import ChoiceLoader, FileSystemLoader, StrictUndefined, TemplateError, TemplateSyntaxError
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
+from compgen.controllers import CONTROLLERS
 from compgen.core import tomlio
 from compgen.core.csvio import fixed
 from compgen.core.text import one_line
@@ -72,11 +73,31 @@ def _prose(value: Any) -> str:
     return " ".join(value.split())
 
 
+def template_folders(name: str, folder: Path | None = None) -> list[Path]:
+    """Return where the templates of control ``name`` are looked for: the user's, a plug-in's own, the shipped ones."""
+    own = CONTROLLERS[name].templates if name in CONTROLLERS else None
+    return [*([folder] if folder else []), *([own] if own else []), data_folder("templates")]
+
+
+def check_templates(name: str, folder: Path) -> None:
+    """Check what a plug-in's control brings below ``folder``: the card, every template that it names, their syntax."""
+    card = _read_format(folder / name / "format.toml", name)
+    environment = _environment([folder, data_folder("templates")])
+    for template in (*(spec.template for spec in card.files), "preflight.md.j2"):
+        path = folder / name / template
+        if not path.is_file():
+            raise InputError("is missing", file=path)
+        try:
+            environment.get_template(f"{name}/{template}")
+        except TemplateSyntaxError as error:
+            raise InputError(f"is no template: {one_line(error)}", file=path, line=error.lineno) from error
+
+
 def load_format(name: str, folder: Path | None = None) -> Format:
     """Load the card of format ``name`` from ``folder`` (the user's templates), else from the shipped ones."""
     if folder is not None and not folder.is_dir():
         raise InputError("no such folder; --templates needs a folder with a sub-folder per control", file=folder)
-    for base in (*((folder,) if folder else ()), data_folder("templates")):
+    for base in template_folders(name, folder):
         path = base / name / "format.toml"
         if path.is_file():
             return _read_format(path, name)
@@ -167,7 +188,7 @@ def render(card: Format, template: str, context: Mapping[str, Any], folder: Path
     context : values; texts are flattened to one line of printable ASCII before they reach the template.
     folder : a user's templates folder, searched before the shipped one.
     """
-    folders = [*((folder,) if folder else ()), data_folder("templates")]
+    folders = template_folders(card.name, folder)
     try:
         page = _environment(folders).get_template(f"{card.name}/{template}")
         return page.render({**{key: _inert(value) for key, value in context.items()}, "format": card})

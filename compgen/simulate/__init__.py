@@ -1,12 +1,17 @@
 """A virtual machine and virtual instruments: measurement files whose truth is known."""
 
+from compgen.simulate.effects import EFFECTS, Effect
 from compgen.simulate.laser_tracer import LaserTracer, Station
 from compgen.simulate.run import Simulation, actual_tips, simulate, write_simulation
-from compgen.simulate.scenario import Scenario, read_scenario
+from compgen.simulate.scenario import INSTRUMENTS, Instrument, Scenario, read_scenario
 from compgen.simulate.trajectory import Line, Stops, Trajectory, plan_stops, trajectory_points
 from compgen.simulate.truth import RandomErrors, TruthPlan, draw_truth
 
 __all__ = [
+    "EFFECTS",
+    "INSTRUMENTS",
+    "Effect",
+    "Instrument",
     "LaserTracer",
     "Line",
     "RandomErrors",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from compgen.core.lengths import Lengths, format_lengths
 from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.model.exact import tip_position
+from compgen.simulate.effects import Effect
 from compgen.simulate.laser_tracer import Station
 from compgen.simulate.scenario import Scenario
 from compgen.simulate.trajectory import Stops, plan_stops
@@ -22,9 +23,6 @@ from compgen.simulate.truth import child_seeds, draw_truth, random_stream
 
 #: Children of the seed: one for the errors, one for the noise.
 ERROR_STREAM, NOISE_STREAM = 0, 1
-
-#: A further effect: displacement of the tip in the workpiece frame at the stops, shape (n, 3), mm.
-Effect = Callable[[Machine, Stops], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Simulation:
     name : beginning of the file names.
     lengths : the readings, as a measurement file holds them.
     truth : the true errors in mm and rad; its metadata name machine and seed.
-    stations : the true stations.
+    stations : the true stations (none for an instrument without).
     """
 
     name: str
@@ -49,8 +47,22 @@ def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequ
     """Where the tool tip really is in the workpiece frame: exact chain plus ``effects``, shape (n, 3), mm."""
     tip_mm = tip_position(machine, truth.at(stops.position_mm), stops.position_mm, stops.tool_mm)
     for effect in effects:
-        tip_mm = tip_mm + effect(machine, stops)
+        tip_mm = tip_mm + _displacement(effect, machine, stops)
     return tip_mm
+
+
+def _displacement(effect: Effect, machine: Machine, stops: Stops) -> FloatArray:
+    """What an effect adds; InputError if it is not one finite vector per stop, as code of others may have it."""
+    moved_mm = np.asarray(effect(machine, stops))
+    if (
+        moved_mm.shape != stops.position_mm.shape
+        or moved_mm.dtype.kind not in "fi"
+        or not np.all(np.isfinite(moved_mm))
+    ):
+        name = getattr(effect, "__qualname__", type(effect).__qualname__)
+        due = f"an array {stops.position_mm.shape} of finite numbers in mm"
+        raise InputError(f"the effect {name} returns {moved_mm.dtype} {moved_mm.shape}; {due} is expected")
+    return moved_mm.astype(np.float64)
 
 
 def simulate(
@@ -64,7 +76,7 @@ def simulate(
     scenario : true errors, instrument and trajectory.
     seed : takes the place of the scenario's. Errors and noise have random streams of their own, so that changing
         the one leaves the other.
-    effects : what acts besides the geometric errors.
+    effects : what acts besides the geometric errors and the effects of the scenario.
 
     Raises
     ------
@@ -80,7 +92,7 @@ def simulate(
     tools_mm = np.array(scenario.trajectory.tools_mm) if scenario.trajectory.tools_mm else None
     truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), tools_mm)
     truth.warn_outside(stops.position_mm)
-    tip_mm = actual_tips(machine, truth, stops, effects)
+    tip_mm = actual_tips(machine, truth, stops, (*scenario.effects, *effects))
     lengths = scenario.instrument.observe(stops, tip_mm, random_stream(seeds, NOISE_STREAM))
     common = {"machine": machine.name, "seed": str(used_seed)}
     reference = " ".join(f"{value:g}" for value in machine.reference_point_mm)
@@ -88,7 +100,7 @@ def simulate(
         name=scenario.name,
         lengths=replace(lengths, metadata={**common, **lengths.metadata}),
         truth=truth.replace(metadata={**common, "source": "simulated truth", "reference_point_mm": reference}),
-        stations=scenario.instrument.stations,
+        stations=getattr(scenario.instrument, "stations", ()),
     )
 
 

@@ -6,27 +6,46 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
+
+import numpy as np
 
 from compgen.core import tomlio
-from compgen.simulate.laser_tracer import LaserTracer, read_laser_tracer
-from compgen.simulate.trajectory import Trajectory, read_trajectory
+from compgen.core.csvio import FloatArray
+from compgen.core.lengths import Lengths
+from compgen.simulate.effects import Effect, read_effects
+from compgen.simulate.laser_tracer import read_laser_tracer
+from compgen.simulate.registration import instrument_problems
+from compgen.simulate.trajectory import Stops, Trajectory, read_trajectory
 from compgen.simulate.truth import RandomErrors, TruthPlan, read_truth_plan
 
-#: Reader of the ``[instrument]`` section by its ``type``.
-INSTRUMENTS: dict[str, Callable[[tomlio.Section], LaserTracer]] = {"laser-tracer": read_laser_tracer}
+
+class Instrument(Protocol):
+    """What every simulated instrument has; one with ``stations`` says where they truly are."""
+
+    @property
+    def passes(self) -> int:
+        """How often the machine runs its trajectory."""
+
+    def observe(self, stops: Stops, tip_mm: FloatArray, rng: np.random.Generator) -> Lengths:
+        """Return the readings at stops whose true tips are ``tip_mm`` (n, 3) in the workpiece frame."""
+
+
+#: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
+INSTRUMENTS: dict[str, Callable[[tomlio.Section], Instrument]] = {"laser-tracer": read_laser_tracer}
 
 
 @dataclass(frozen=True)
 class Scenario:
     """A simulated measurement; ``name`` begins the names of its files, ``seed`` starts every random number."""
 
-    instrument: LaserTracer
+    instrument: Instrument
     seed: int
     name: str = "simulated"
     errors: TruthPlan = field(default_factory=lambda: TruthPlan(random=RandomErrors()))
     trajectory: Trajectory = field(default_factory=Trajectory)
     source: Path | None = None
+    effects: tuple[Effect, ...] = ()
 
 
 def read_scenario(path: str | Path) -> Scenario:
@@ -45,15 +64,24 @@ def read_scenario(path: str | Path) -> Scenario:
     instrument = root.section("instrument")
     kind = instrument.take("type", tomlio.choice(*INSTRUMENTS))
     scenario = Scenario(
-        instrument=INSTRUMENTS[kind](instrument),
+        instrument=_instrument(kind, instrument),
         seed=seed,
         name=name,
         errors=errors,
         trajectory=read_trajectory(root.section("trajectory", required=False)),
         source=source,
+        effects=read_effects(root.sections("effects")),
     )
     root.finish()
     return scenario
+
+
+def _instrument(kind: str, section: tomlio.Section) -> Instrument:
+    made = INSTRUMENTS[kind](section)
+    problems = instrument_problems(made)
+    if problems:
+        raise section.fail("type", "; ".join(problems))
+    return made
 
 
 def _file_name(value: Any) -> str:

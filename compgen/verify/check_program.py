@@ -21,9 +21,8 @@ from compgen.core.names import AXES, MM_PER_UM
 from compgen.core.points import Points
 from compgen.core.reversal import ReversalCurves
 from compgen.export import Export
-from compgen.export.render import Format, load_format, render
+from compgen.export.render import Format, load_format, render, template_folders
 from compgen.model.exact import exact_error
-from compgen.resources import data_folder
 from compgen.verify.crash_test import signed_permutations
 from compgen.verify.verify import ReadTables
 
@@ -187,7 +186,7 @@ def check_files(
 
 def _has_template(card: Format, templates: Path | None) -> bool:
     """Whether the control's folder has a program; without one only the page is written."""
-    folders = [*([templates] if templates else []), data_folder("templates")]
+    folders = template_folders(card.name, templates)
     return any((folder / card.name / "check-program.nc.j2").is_file() for folder in folders)
 
 

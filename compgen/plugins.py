@@ -1,0 +1,39 @@
+"""The registries that plug-ins may add to, one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from compgen.controllers import CONTROLLERS
+from compgen.core.plugins import Kind, load_entry_points, load_file
+from compgen.export.registration import check_control
+from compgen.simulate import EFFECTS, INSTRUMENTS
+from compgen.simulate.registration import check_effect, check_instrument
+
+#: What plug-ins may add: word, name of the dict in a file, group of entry points, registry, check.
+KINDS = (
+    Kind("control", "CONTROLLERS", "compgen.controllers", CONTROLLERS, check_control),
+    Kind("effect", "EFFECTS", "compgen.effects", EFFECTS, check_effect),
+    Kind("instrument", "INSTRUMENTS", "compgen.instruments", INSTRUMENTS, check_instrument),
+)
+CONTROLS, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS = KINDS
+
+
+def load_plugins(paths: Sequence[str | Path] = (), *, installed: bool = True) -> None:
+    """Register plug-ins for this process.
+
+    Parameters
+    ----------
+    paths : ``.py`` files or package folders that hold ``CONTROLLERS``, ``EFFECTS`` or ``INSTRUMENTS``.
+    installed : also those of installed distributions; one that is broken is left out with a warning.
+
+    Raises
+    ------
+    InputError
+        with file and line for a plug-in among ``paths`` that cannot be imported or is not complete.
+    """
+    if installed:
+        load_entry_points(KINDS)
+    for path in paths:
+        load_file(path, KINDS)
