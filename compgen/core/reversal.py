@@ -52,6 +52,10 @@ class ReversalCurves:
         curve = self.curves.get((axis, axis))
         return 0.0 if curve is None else float(np.mean(curve.value))
 
+    def without(self, other: ReversalCurves) -> ReversalCurves:
+        """Return the curves that are not in ``other``."""
+        return ReversalCurves({key: curve for key, curve in self.curves.items() if key not in other.curves})
+
     @property
     def largest_mm(self) -> dict[tuple[int, int], float]:
         """Largest reversal in size of each curve, with its sign."""

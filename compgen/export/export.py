@@ -130,9 +130,12 @@ def export(
     basis = control.basis(machine, settings, errors)
     values = synthesize(machine, errors, basis, anchored=control.anchored)
     tables = control.build(machine, settings, basis, values)
-    if reversal is not None and control.bidirectional:
-        tables = control.with_reversal(machine, settings, tables, reversal)
-    own = _with_backlash(control, machine, settings, control.context(machine, settings, tables), reversal)
+    rest = reversal
+    if reversal is not None:
+        held = control.reversal_in_tables(settings, reversal)
+        rest = reversal.without(held)
+        tables = control.with_reversal(machine, settings, tables, held) if held.curves else tables
+    own = _with_backlash(control, machine, settings, control.context(machine, settings, tables), rest)
     own = {**own, "warnings": [*own["warnings"], *machine.emphasis.notes]}
     common = export_context(machine, errors, controller, provenance or Provenance(), reversal)
     files = render_files(card, {**common, **own}, templates)
@@ -165,8 +168,8 @@ def rerender(
 def _with_backlash(
     control: AnyController, machine: Machine, settings: Any, own: dict[str, Any], reversal: ReversalCurves | None
 ) -> dict[str, Any]:
-    """Add the backlash parameters of a control without tables of one direction, and what they cannot hold."""
-    if reversal is None or control.bidirectional:
+    """Add the backlash parameters for a reversal that no table of one direction holds, and what they cannot hold."""
+    if reversal is None or not reversal.curves:
         return own
     parameters = control.backlash_parameters(machine, settings, reversal)
     left = {

@@ -300,7 +300,7 @@ def _control_result(
     except CompgenError as error:
         return replace(result, problem=str(error))
     left = _left(machine, errors, points, correction, reversal, tool_of(machine, None))
-    directional = reversal is not None and control.bidirectional
+    directional = reversal is not None and bool(control.reversal_in_tables(settings, reversal).curves)
     return replace(result, level=level, directional=directional, left=left, broken=tuple(made.violations))
 
 

@@ -89,7 +89,10 @@ def explain(
     values = np.concatenate([term.start for term in solver.basis])
     level = level_key(solver.basis)
     safety = safety_of(machine, control, tables, lambda part: solver.field(values, part))
-    known = None if control.bidirectional else reversal  # its tables take the reversal out: what stays is the rest
+    rest = None  # what tables of one direction do not take out
+    if reversal is not None:
+        rest = reversal.without(control.reversal_in_tables(settings, reversal))
+    known = rest if rest is not None and rest.curves else None
     options = capability(machine, errors, reversal=known, templates=templates, controllers=(control.name,))
     usage = sorted(control.usage(machine, settings, tables), key=lambda item: -item.share)
     return Explanation(
@@ -97,7 +100,7 @@ def explain(
         machine=machine.name,
         level=level,
         fates=tuple(_fates(machine, errors, Level("own", solver), level, anchored=control.anchored))
-        + tuple(_reversal_fates(reversal, control.bidirectional)),
+        + tuple(_reversal_fates(reversal, rest)),
         nodes=_nodes(control, machine, settings, tables),
         rounding_um=control.resolution_mm(settings) / MM_PER_UM,
         steps=safety.steps,
@@ -134,8 +137,8 @@ def _why(name: str, level: str) -> str:
     return "the nodes of the tables do not follow it closely"
 
 
-def _reversal_fates(reversal: ReversalCurves | None, corrected: bool) -> list[Fate]:
-    before, after = (left_by_reversal(reversal, corrected=done) for done in (False, corrected))
+def _reversal_fates(reversal: ReversalCurves | None, rest: ReversalCurves | None) -> list[Fate]:
+    before, after = (left_by_reversal(part, corrected=False) for part in (reversal, rest))
     why = "the tables act in both directions alike: the control's backlash parameter takes the part along the axis"
     return [Fate(name, value, after.get(name, 0.0), why if name in after else "") for name, value in before.items()]
 

@@ -50,7 +50,16 @@ class ReadTables:
         """Return what the control adds at positions (n, 3), the mean of both directions of travel, shape (n, 3), mm."""
         if not self.controller.bidirectional:
             return self.correction(machine, Points(position_mm))
-        return mean_correction(lambda points: self.correction(machine, points), position_mm)
+
+        def added(points: Points) -> FloatArray:
+            return self.correction(machine, points)
+
+        mean = mean_correction(added, position_mm)
+        if (
+            self.controller.anchored
+        ):  # zero at the reference point in one direction only: a constant, which does no harm
+            mean -= mean_correction(added, np.array([machine.reference_point_mm], dtype=np.float64))
+        return mean
 
 
 def read_tables(machine: Machine, paths: Sequence[str | Path] | str | Path, controller: str) -> ReadTables:
@@ -208,7 +217,7 @@ def verify(
         unrepresentable_um=float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM,
         uncorrected_um={
             **_uncorrected(machine, errors, solver),
-            **left_by_reversal(reversal, corrected=control.bidirectional),
+            **left_by_reversal(_not_in_tables(tables, reversal), corrected=False),
         },
         points=len(where),
         files=tables.files,
@@ -240,8 +249,16 @@ def _reversal_reasons(machine: Machine, tables: ReadTables, reversal: ReversalCu
     control = tables.controller
     if reversal is None or not control.bidirectional:
         return []
-    resolution_mm = control.resolution_mm(tables.settings)
-    return reversal_reasons(machine, lambda points: tables.correction(machine, points), reversal, resolution_mm)
+    held = control.reversal_in_tables(tables.settings, reversal)
+    rounding_mm = 2.0 * control.resolution_mm(tables.settings)  # of both directions
+    return reversal_reasons(machine, lambda points: tables.correction(machine, points), held, rounding_mm)
+
+
+def _not_in_tables(tables: ReadTables, reversal: ReversalCurves | None) -> ReversalCurves | None:
+    """Part of a reversal that no table of one direction holds."""
+    if reversal is None:
+        return None
+    return reversal.without(tables.controller.reversal_in_tables(tables.settings, reversal))
 
 
 def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dict[str, float]:
