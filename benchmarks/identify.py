@@ -18,7 +18,8 @@ from scipy.optimize import least_squares
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Axis, Chain, Machine
 from compgen.identify import identify, joint_covariance, sample_errors
-from compgen.identify.grid_problem import grid_problem, start_moments
+from compgen.identify.grid_problem import grid_problem
+from compgen.identify.grid_start import start_moments
 from compgen.identify.parameters import ErrorParameters, error_parameters
 from compgen.identify.start import station_start_from_moments
 from compgen.model import modelled_errors

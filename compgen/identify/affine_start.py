@@ -11,7 +11,8 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Reference
 from compgen.core.names import AXES
-from compgen.identify.grid_problem import GridProblem, nominal_targets
+from compgen.identify.grid import nominal_targets
+from compgen.identify.grid_problem import GridProblem
 from compgen.identify.state import State
 
 #: Cells of the grid that are looked at, spread over the volume.

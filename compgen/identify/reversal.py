@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.names import AXES, MM_PER_UM
-from compgen.identify.grid_problem import levels_of
+from compgen.identify.grid import levels_of
 from compgen.identify.segments import time_order
 from compgen.identify.state import IntArray
 from compgen.simulate.trajectory import approach_of

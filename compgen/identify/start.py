@@ -51,7 +51,7 @@ def station_start(points_mm: FloatArray, length_mm: FloatArray, group: NDArray[n
 def station_start_from_moments(
     moments: FloatArray, offset: FloatArray, centre_mm: FloatArray, scale_mm: float
 ) -> StationStart | None:
-    """Locate one station from the moments of its set-ups (g, 6, 6) as ``grid_problem.start_moments`` has them.
+    """Locate one station from the moments of its set-ups (g, 6, 6) as ``grid_start.start_moments`` has them.
 
     None where they do not determine it.
     """

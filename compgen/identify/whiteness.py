@@ -17,7 +17,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import CompgenWarning
-from compgen.identify.grid_problem import levels_of
+from compgen.identify.grid import levels_of
 from compgen.identify.segments import time_order
 from compgen.identify.state import IntArray
 
