@@ -1,51 +1,112 @@
-"""``compgen controllers`` and ``compgen machines``."""
+"""``compgen controllers``, ``machines``, ``effects`` and ``instruments``: what is there."""
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 
 import click
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from compgen.cli.common import json_option, open_machine, print_json, stdout
 from compgen.controllers import CONTROLLERS
 from compgen.core.machine import machine_files
 from compgen.core.names import AXES
-from compgen.export import load_format
+from compgen.core.plugins import Kind
+from compgen.export import Format, load_format
+from compgen.export.card import control_card
 from compgen.model import modelled_errors
+from compgen.plugins import CONTROLS, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS
+from compgen.report.card_text import card_text
 
 
 @click.command("controllers")
+@click.argument("name", required=False, metavar="[NAME]")
 @json_option
-def controllers_command(as_json: bool) -> int:
+def controllers_command(name: str | None, as_json: bool) -> int:
     """List the controls that compgen writes, what they can express, and how well their format is documented.
 
-    Nothing is computed; the units of each control's numbers (mm, rad, counts) stand in its preflight.md.
+    With NAME: the card of one control: what it can express, the settings of the machine file (units in their names:
+    mm, um) with defaults, limits, sources, and what no public document settles. Nothing is computed; the units of each
+    control's numbers (mm, rad, counts) stand in its preflight.md.
 
     \b
     Example:
-      compgen controllers
+      compgen controllers siemens-cec
     """
-    cards = [load_format(name) for name in sorted(CONTROLLERS)]
+    if name is not None:
+        _show_card(name, as_json)
+        return 0
+    cards = [load_format(known) for known in sorted(CONTROLLERS)]
     if as_json:
-        print_json(
-            {
-                card.name: {
-                    "title": card.title,
-                    "expresses": card.expresses,
-                    "evidence": card.evidence,
-                    "unverified": list(card.unverified),
-                    "limits": list(card.limits),
-                }
-                for card in cards
-            }
-        )
+        print_json({card.name: _listed(card) for card in cards})
         return 0
     table = Table("name", "control", "what it can express", "format", box=box.SIMPLE)
     for card in cards:
-        table.add_row(card.name, card.title, card.expresses, card.evidence)
+        origin = CONTROLS.origins.get(card.name)
+        table.add_row(card.name, card.title, card.expresses, f"{card.evidence}{', plug-in' if origin else ''}")
     stdout.print(table)
+    return 0
+
+
+def _show_card(name: str, as_json: bool) -> None:
+    card, origin = control_card(name), CONTROLS.origins.get(name)
+    if as_json:
+        print_json({**card.summary(), "plugin": origin})
+    else:
+        stdout.print(card_text(card, origin))
+
+
+def _listed(card: Format) -> dict[str, object]:
+    return {
+        "title": card.title,
+        "expresses": card.expresses,
+        "evidence": card.evidence,
+        "unverified": list(card.unverified),
+        "limits": list(card.limits),
+        "plugin": CONTROLS.origins.get(card.name),
+    }
+
+
+@click.command("effects")
+@json_option
+def effects_command(as_json: bool) -> int:
+    """List the effects that a scenario may have beside the geometric errors ([[effects]], displacements in mm).
+
+    \b
+    Example:
+      compgen effects
+    """
+    return _list_readers(SIMULATED_EFFECTS, as_json)
+
+
+@click.command("instruments")
+@json_option
+def instruments_command(as_json: bool) -> int:
+    """List the instruments that compgen simulates ([instrument] of a scenario, readings in mm).
+
+    \b
+    Example:
+      compgen instruments
+    """
+    return _list_readers(SIMULATED_INSTRUMENTS, as_json)
+
+
+def _list_readers(kind: Kind, as_json: bool) -> int:
+    """Print what a registry of readers holds: the first line of each docstring, and the plug-in that it came from."""
+    rows = {
+        name: {"title": (inspect.getdoc(reader) or "").partition("\n")[0], "plugin": kind.origins.get(name)}
+        for name, reader in sorted(kind.registry.items())
+    }
+    if as_json:
+        print_json(rows)
+        return 0
+    table = Table("name", "what it is", "from", box=box.SIMPLE)
+    for name, row in rows.items():
+        table.add_row(name, Text(row["title"] or ""), Text(row["plugin"] or "built in", overflow="fold"))
+    stdout.print(table if rows else f"no {kind.word} is built in; --plugin PATH adds some")
     return 0
 
 
@@ -78,4 +139,4 @@ def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
     return 0
 
 
-COMMANDS = (controllers_command, machines_command)
+COMMANDS = (controllers_command, machines_command, effects_command, instruments_command)

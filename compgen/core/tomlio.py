@@ -6,6 +6,7 @@ import math
 import re
 import tomllib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
@@ -18,6 +19,24 @@ D = TypeVar("D")
 _REQUIRED = object()
 
 
+@dataclass(frozen=True)
+class Asked:
+    """A key that a reader asked for: its name with those of sub-sections, its default unless required, its check."""
+
+    key: str
+    required: bool
+    default: Any
+    check: Callable[[Any], Any]
+
+    @property
+    def allowed(self) -> str:
+        """What the check says that it expects: its message about something that fits nowhere."""
+        message = _refusal(self.check, object())
+        if message == _refusal(number, object()):
+            message = _refusal(self.check, -1.0) or message
+        return re.sub(r"\s+(is|are) expected\b", "", message).rstrip(",")
+
+
 class Section:
     """One table of a TOML file whose keys are taken one by one.
 
@@ -28,6 +47,16 @@ class Section:
         self.data, self.path, self.text, self.name = dict(data), path, text, name
         self._nth = 0  # which of the tables of that name, for an array of tables
         self._known: set[str] = set()
+        self._asked: dict[str, Asked | Section] = {}
+
+    @property
+    def asked(self) -> list[Asked]:
+        """What was taken so far, in its order, also in sub-sections (``axis_names.X``)."""
+        found: list[Asked] = []
+        for key, item in self._asked.items():
+            inner = [item] if isinstance(item, Asked) else item.asked
+            found += inner if isinstance(item, Asked) else [replace(one, key=f"{key}.{one.key}") for one in inner]
+        return found
 
     def fail(self, key: str, message: str) -> InputError:
         """Return the error that points at ``key`` of this section."""
@@ -45,6 +74,7 @@ class Section:
     def take(self, key: str, check: Callable[[Any], T], default: D) -> T | D: ...
     def take(self, key: str, check: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
         """Return the checked value of ``key``; ``check`` raises ValueError with what is expected."""
+        self._asked[key] = Asked(key, default is _REQUIRED, None if default is _REQUIRED else default, check)
         if key not in self:
             if default is _REQUIRED:
                 present = [name for name in self.data if name not in self._known]
@@ -58,8 +88,10 @@ class Section:
     def section(self, key: str, *, required: bool = True) -> Section:
         """Return the sub-section ``key`` (an empty one if it is absent and not required)."""
         full = f"{self.name}.{key}" if self.name else key
-        value = self.take(key, _table) if required else self.take(key, _table, {})
-        return Section(value, path=self.path, text=self.text, name=full)
+        value = self.take(key, table) if required else self.take(key, table, {})
+        inner = Section(value, path=self.path, text=self.text, name=full)
+        self._asked[key] = inner
+        return inner
 
     def sections(self, key: str) -> list[Section]:
         """Return the sub-sections of an array of tables (``[[key]]``), empty if absent."""
@@ -116,6 +148,17 @@ def read_toml(path: str | Path) -> Section:
         found = re.search(r"line (\d+)", str(error))
         line = int(found.group(1)) if found else len(text.splitlines())
         raise InputError(f"is not valid TOML: {error}", file=source, line=line) from error
+
+
+def _refusal(check: Callable[[Any], Any], value: Any) -> str:
+    """The message of a check about a value, empty if it takes it or is not prepared for it."""
+    try:
+        check(value)
+    except ValueError as error:
+        return str(error)
+    except Exception:  # a check that takes texts for granted
+        return ""
+    return ""
 
 
 # --- checks: each returns the clean value or raises ValueError with what is expected -----------------------------
@@ -222,7 +265,8 @@ def ascending(value: Any) -> tuple[float, ...]:
     return items
 
 
-def _table(value: Any) -> dict[str, Any]:
+def table(value: Any) -> dict[str, Any]:
+    """A table of keys and values."""
     if not isinstance(value, dict):
         raise ValueError("a table ([section]) is expected")
     return value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path, PurePath
 from typing import Any
@@ -48,6 +48,8 @@ class Format:
     """The card of a control's format as ``templates/<name>/format.toml`` has it.
 
     ``evidence`` is ``"documented"`` or ``"unverified"``; ``unverified`` lists what no public document settles.
+    ``settings`` says what each key of ``[controllers.<name>]`` means; ``example_settings`` are some that the control
+    takes, where keys have no default.
     """
 
     name: str
@@ -59,6 +61,8 @@ class Format:
     limits: tuple[str, ...]
     unverified: tuple[str, ...]
     sources: tuple[str, ...]
+    settings: Mapping[str, str] = field(default_factory=dict)
+    example_settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _texts(value: Any) -> tuple[str, ...]:
@@ -104,6 +108,10 @@ def load_format(name: str, folder: Path | None = None) -> Format:
     raise InputError(f"no format.toml for {name!r} in {folder or data_folder('templates')}")
 
 
+def _meanings(section: tomlio.Section) -> dict[str, str]:
+    return {key: section.take(key, _prose) for key in section.data}
+
+
 def _named(expected: str) -> Callable[[Any], str]:
     def check(value: Any) -> str:
         if value != expected:
@@ -142,6 +150,8 @@ def _read_format(path: Path, name: str) -> Format:
         limits=root.take("limits", _texts),
         unverified=root.take("unverified", _texts, ()),
         sources=root.take("sources", _texts),
+        settings=_meanings(root.section("settings", required=False)),
+        example_settings=root.take("example_settings", tomlio.table, {}),
     )
     root.finish()
     if not files or len({spec.name.lower() for spec in files}) != len(files):
