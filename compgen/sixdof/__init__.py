@@ -1,0 +1,3 @@
+"""The six-DOF laser instrument of Jia et al. 2022: constants, signals from errors and back."""
+
+from __future__ import annotations
