@@ -8,6 +8,7 @@ from compgen.controllers.fanuc_pitch import FanucPitch
 from compgen.controllers.isg_csv import IsgCsv
 from compgen.controllers.siemens_cec import SiemensCec
 from compgen.controllers.siemens_eec import SiemensEec
+from compgen.controllers.twincat_lists import TwincatLists
 from compgen.core.plugins import why_missing
 from compgen.core.text import nearest
 from compgen.errors import InputError
@@ -19,6 +20,7 @@ CONTROLLERS: dict[str, AnyController] = {
     "fanuc-pitch": FanucPitch(),
     "siemens-cec": SiemensCec(),
     "siemens-eec": SiemensEec(),
+    "twincat-lists": TwincatLists(),
 }
 
 
