@@ -5,6 +5,7 @@ from __future__ import annotations
 from compgen.controllers.base import AnyController, Controller, Monomial, SourceFile, Term
 from compgen.controllers.etalon_exchange import EtalonExchange
 from compgen.controllers.fanuc_pitch import FanucPitch
+from compgen.controllers.heidenhain_com import HeidenhainCom
 from compgen.controllers.isg_csv import IsgCsv
 from compgen.controllers.siemens_cec import SiemensCec
 from compgen.controllers.siemens_eec import SiemensEec
@@ -18,6 +19,7 @@ CONTROLLERS: dict[str, AnyController] = {
     "isg-csv": IsgCsv(),
     "etalon-exchange": EtalonExchange(),
     "fanuc-pitch": FanucPitch(),
+    "heidenhain-com": HeidenhainCom(),
     "siemens-cec": SiemensCec(),
     "siemens-eec": SiemensEec(),
     "twincat-lists": TwincatLists(),
