@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from compgen.core.csvio import FloatArray
 from compgen.fit.bounds import Bounds, slope_limits
-from compgen.fit.stacked import Stack, band_of, curvature_rows, gather, spread, steps_mm, windows
+from compgen.fit.stacked import Stack, band_of, curvature_rows, gather, spread, windows
 
 STEPS = 60
 #: A curve is done when its complementarity is below this share of what the bounds cost.
@@ -75,14 +75,13 @@ class RowStack:
 
 def row_stack(stack: Stack, bounds: Sequence[Bounds], curve: FloatArray) -> RowStack:
     """Build the rows; ``curve`` (N,), the one without bounds, gives the scale of slopes that have only a direction."""
-    step = steps_mm(stack)
     limits = np.array([bound.limits for bound in bounds]).T
     steepest = np.maximum(stack.largest(np.abs(stack.slopes(curve))), _TINY)
     scaled = [slope_limits(bound, float(typical)) for bound, typical in zip(bounds, steepest, strict=True)]
     made = [
-        _rows(stack, 0, _values(step), limits[0], (-np.ones(len(bounds)), np.ones(len(bounds)))),
-        _rows(stack, 1, _slopes(step), np.array([item[0] for item in scaled]), _ends(scaled)),
-        _rows(stack, 2, curvature_rows(step), limits[2], (-np.ones(len(bounds)), np.ones(len(bounds)))),
+        _rows(stack, 0, _values(len(stack.free)), limits[0], (-np.ones(len(bounds)), np.ones(len(bounds)))),
+        _rows(stack, 1, _slopes(stack.per_mm), np.array([item[0] for item in scaled]), _ends(scaled)),
+        _rows(stack, 2, curvature_rows(stack.per_mm), limits[2], (-np.ones(len(bounds)), np.ones(len(bounds)))),
     ]
     used = [kind for kind, (_, limit) in enumerate(made) if np.isfinite(limit).any()]
     return RowStack(
@@ -94,14 +93,14 @@ def _ends(scaled: list[tuple[float, float, float]]) -> tuple[FloatArray, FloatAr
     return np.array([item[1] for item in scaled]), np.array([item[2] for item in scaled])
 
 
-def _values(step: FloatArray) -> FloatArray:
-    rows = np.zeros((3, len(step)))
+def _values(n: int) -> FloatArray:
+    rows = np.zeros((3, n))
     rows[0] = 1.0
     return rows
 
 
-def _slopes(step: FloatArray) -> FloatArray:
-    return np.stack([-1 / step, 1 / step, np.zeros(len(step))])
+def _slopes(per_mm: FloatArray) -> FloatArray:
+    return np.stack([-per_mm, per_mm, np.zeros(len(per_mm))])
 
 
 def _rows(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,21 +20,23 @@ from compgen.fit.stacked import CurveProblem, Stack, curvatures_of
 
 #: The interior point method is broken off early: mostly the active bounds are known by then, or nearly.
 _FIRST_STEPS, _FIRST_ROUNDS = 10, 4
+#: Curves are laid together up to so many nodes: more would leave the cache.
+_PORTION = 6000
+BoolArray = NDArray[np.bool_]
 DIRECT, INTERIOR = "direct", "interior point"
 
 
 _UNTOUCHED: FloatArray = np.zeros(0)
 
 
-@dataclass(frozen=True)
-class Solution:
+class Solution(NamedTuple):
     """A fitted ``curve`` (n,) in the unit of its data, the bounds that it touches, and who found it.
 
     ``touched`` holds -1, 0, 1 for n values, n - 1 slopes and n - 2 curvatures; empty if no bound is touched.
     """
 
     curve: FloatArray
-    touched: FloatArray = field(default_factory=lambda: _UNTOUCHED)
+    touched: FloatArray = _UNTOUCHED
     solver: str = DIRECT
 
 
@@ -43,28 +47,45 @@ def solve_curves(problems: Sequence[CurveProblem]) -> list[Solution]:
     the bounds is the bounded minimum. The others are solved together by :func:`compgen.fit.interior.interior`, and
     what does not pass there goes one by one to a general solver (:func:`compgen.fit.bounded.fit_bounded`).
     """
+    found = [solution for part in _portions(problems) for solution in _without_bounds(part)]
+    broken = [k for k, solution in enumerate(found) if solution is None]
+    again = (solution for part in _portions([problems[k] for k in broken]) for solution in _bounded(part))
+    return [next(again) if solution is None else solution for solution in found]
+
+
+def _portions(problems: Sequence[CurveProblem]) -> Iterator[Sequence[CurveProblem]]:
+    """Cut a list where about ``_PORTION`` nodes are together."""
+    first, nodes = 0, 0
+    for k, problem in enumerate(problems):
+        if nodes and nodes + len(problem.y) > _PORTION:
+            yield problems[first:k]
+            first, nodes = k, 0
+        nodes += len(problem.y)
+    if nodes:
+        yield problems[first:]
+
+
+def _without_bounds(problems: Sequence[CurveProblem]) -> list[Solution | None]:
+    """Fit without bounds; None for the curves that would break theirs."""
     stack = Stack.build(problems)
-    free = stack.solve()
-    found = [Solution(curve) for curve in stack.split(free)]
-    broken = np.flatnonzero(_breaks(stack, [problem.bounds for problem in problems], free)).tolist()
-    if broken:
-        for k, solution in zip(broken, _bounded([problems[k] for k in broken]), strict=True):
-            found[k] = solution
-    return found
+    curve = stack.solve()
+    breaks = _breaks(stack, [problem.bounds for problem in problems], curve).tolist()
+    return [None if bad else Solution(part) for part, bad in zip(stack.split(curve), breaks, strict=True)]
 
 
-def _breaks(stack: Stack, bounds: Sequence[Bounds], curve: FloatArray) -> NDArray[np.bool_]:
+def _breaks(stack: Stack, bounds: Sequence[Bounds], curve: FloatArray) -> BoolArray:
     """Which curves (k,) of a stack (N,) break a bound."""
-    limits = np.array([(b.max_abs, b.max_slope, b.max_curvature, b.direction) for b in bounds]).T
-    wrong = stack.largest(np.abs(curve)) > limits[0]
-    if np.isfinite(limits[1]).any() or limits[3].any():
+    wrong: BoolArray = stack.largest(np.abs(curve)) > [bound.max_abs for bound in bounds]
+    steepest, bent = [bound.max_slope for bound in bounds], [bound.max_curvature for bound in bounds]
+    direction = [bound.direction for bound in bounds]
+    if any(direction) or min(steepest) < math.inf:
         slope = stack.slopes(curve)
-        wrong |= stack.largest(np.abs(slope)) > limits[1]
-        if limits[3].any():
-            wrong |= stack.largest(-slope * stack.of_each(limits[3])) > 0
-    if np.isfinite(limits[2]).any():
-        wrong |= stack.largest(np.abs(curvatures_of(stack, curve))) > limits[2]
-    return np.asarray(wrong)
+        if any(direction):
+            wrong |= stack.largest(-slope * stack.of_each(direction)) > 0
+        wrong |= stack.largest(np.abs(slope, out=slope)) > steepest
+    if min(bent) < math.inf:
+        wrong |= stack.largest(np.abs(curvatures_of(stack, curve))) > bent
+    return wrong
 
 
 def _bounded(problems: Sequence[CurveProblem]) -> list[Solution]:

@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpbtrf, dpbtrs
+from scipy.linalg.lapack import dpbsv, dpbtrs
 
 from compgen.core.csvio import FloatArray
 from compgen.errors import ConvergenceError
@@ -23,7 +25,10 @@ from compgen.fit.bounds import Bounds
 _SETTLED, _REFINEMENTS = 1e-12, 6
 #: With the largest diagonal of A below this many of the smallest weights the first solution has 9 digits or more.
 _EASY = 1e6
+_HELD = np.array([1.0, 0.0, 0.0])
+_TINY = float(np.finfo(float).tiny)
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -45,44 +50,64 @@ class CurveProblem:
 class Stack:
     """k curves with N nodes in all. Everything that acts on a held node is zero.
 
-    ``starts`` (k,) and ``sizes`` (k,): where the curves stand; ``position_mm`` (N,); ``weight`` (N,), ``free`` (N,);
-    ``bend`` (3, N): sqrt(mu) D2, entry [i, j] of the row j acts on node j + i; ``pull`` (N,): W y.
+    ``starts`` (k,) and ``sizes`` (k,): where the curves stand; ``held``: the held nodes; ``per_mm`` (N,): inverse
+    distance from each node to the next of its curve, zero at the last; ``weight`` (N,); ``stiff`` (N,): mu times the
+    square of the factor of the difference of slopes that begins at a node; ``pull`` (N,): W y.
     """
 
     starts: IntArray
     sizes: IntArray
-    position_mm: FloatArray
+    held: IntArray
+    per_mm: FloatArray
     weight: FloatArray
-    free: FloatArray
-    bend: FloatArray
+    stiff: FloatArray
     pull: FloatArray
 
     @classmethod
     def build(cls, problems: Sequence[CurveProblem]) -> Stack:
         """Lay the curves one behind the other."""
-        sizes = np.array([len(problem.y) for problem in problems])
-        ends = np.cumsum(sizes)
+        count = [len(problem.y) for problem in problems]
+        after = list(accumulate(count))
+        each = zip(after, count, problems, strict=True)
+        held = np.array([end - n + k for end, n, problem in each for k in problem.held], dtype=np.intp)
+        sizes, ends = np.array(count), np.array(after)
+        parts = [[p.position_mm for p in problems], [p.weight for p in problems], [p.y for p in problems]]
+        position, weight, pull = np.concatenate([part for kind in parts for part in kind]).reshape(3, -1)
+        weight[held] = 0.0
+        pull *= weight
         starts = ends - sizes
-        position = np.concatenate([problem.position_mm for problem in problems])
-        free = np.ones(len(position))
-        free[[start + k for start, problem in zip(starts.tolist(), problems, strict=True) for k in problem.held]] = 0.0
-        weight = free * np.concatenate([problem.weight for problem in problems])
-        span = position[ends - 1] - position[starts]
-        root = np.array([problem.mu for problem in problems]) ** 0.5 * (span / np.maximum(sizes - 1, 1)) ** 1.5
-        bend = _second_difference(position, ends, np.repeat(root, sizes)) * windows(free)
-        return cls(
-            starts, sizes, position, weight, free, bend, weight * np.concatenate([problem.y for problem in problems])
-        )
+        mean = (position[ends - 1] - position[starts]) / np.maximum(sizes - 1, 1)
+        per_mm = _inverse_steps(position, ends)
+        level = np.array([2 * problem.mu for problem in problems]) * mean**3
+        return cls(starts, sizes, held, per_mm, weight, _stiffness(per_mm, level.repeat(sizes)), pull)
 
-    def pick(self, chosen: NDArray[np.bool_]) -> Stack:
-        """Stack of the curves that are chosen (k,)."""
+    @cached_property
+    def free(self) -> FloatArray:
+        """0 at held nodes, else 1: (N,)."""
+        free = np.ones(len(self.weight))
+        free[self.held] = 0.0
+        return free
+
+    @cached_property
+    def bend(self) -> FloatArray:
+        """sqrt(mu) D2 (3, N), entry [i, j] of the row j acts on node j + i."""
+        bend = np.zeros((3, len(self.weight)))
+        root = np.sqrt(self.stiff[:-1])
+        bend[0, :-1], bend[2, :-1] = root * self.per_mm[:-1], root * self.per_mm[1:]
+        bend[1] = -bend[0] - bend[2]
+        bend *= windows(self.free)
+        return bend
+
+    def pick(self, chosen: BoolArray) -> Stack:
+        """Keep the chosen curves (k,)."""
         nodes, sizes = self.of_each(chosen), self.sizes[chosen]
-        parts = (self.position_mm, self.weight, self.free, self.bend, self.pull)
-        return Stack(np.cumsum(sizes) - sizes, sizes, *(part[..., nodes] for part in parts))
+        parts = (self.per_mm, self.weight, self.stiff, self.pull)
+        held = np.flatnonzero(self.free[nodes] == 0)
+        return Stack(np.cumsum(sizes) - sizes, sizes, held, *(part[nodes] for part in parts))
 
     def of_each(self, values: Any) -> Any:
         """Repeat one value per curve (k,) over its nodes (N,)."""
-        return np.repeat(values, self.sizes)
+        return np.asarray(values).repeat(self.sizes)
 
     def largest(self, values: FloatArray) -> FloatArray:
         """Largest of node values (..., N) in each curve (..., k)."""
@@ -99,33 +124,58 @@ class Stack:
 
     def slopes(self, c: FloatArray) -> FloatArray:
         """Slope (N,) from each node to the next of its curve, zero at the last."""
-        slope = np.zeros(len(c))
-        slope[:-1] = np.diff(c)
-        slope[self.starts + self.sizes - 1] = 0.0
-        return slope / steps_mm(self)
+        slope = np.empty(len(c))
+        np.subtract(c[1:], c[:-1], out=slope[:-1])
+        slope[-1] = 0.0
+        slope *= self.per_mm
+        return slope
 
     def band(self) -> FloatArray:
         """A as a lower band (3, N), entry [d, j] couples j and j + d; held nodes have 1 on the diagonal."""
-        band = np.empty((3, len(self.weight)))
-        band_of(self.bend, band)
-        band[0] += self.weight
-        band[0] += 1.0 - self.free
+        band, before, after = lower_band(len(self.weight)), self.per_mm[:-1], self.per_mm[1:]
+        one = self.stiff[:-1] * before
+        two = one * after  # first times last coefficient of a row
+        band[2, :-1], band[2, -1] = two, 0.0
+        one *= before
+        diagonal = self.weight.copy()
+        diagonal[:-1] += one
+        one += two  # first times middle, less its sign
+        beside = np.zeros(len(diagonal))
+        np.negative(one, out=beside[:-1])
+        diagonal[1:] += one
+        np.multiply(self.stiff[:-1], after, out=one)
+        one *= after
+        diagonal[2:] += one[:-1]
+        one += two  # middle times last, less its sign
+        diagonal[1:] += one
+        beside[1:] -= one
+        band[0], band[1] = diagonal, beside
+        self.hold(band)
         return band
+
+    def hold(self, band: FloatArray) -> None:
+        """Cut the held nodes from a lower band (3, N), 1 on the diagonal."""
+        band.T[self.held] = _HELD
+        band[1, self.held - 1] = band[2, self.held - 2] = 0.0  # those past an end are zero anyway
 
     def apply(self, c: FloatArray) -> FloatArray:
         """A c for node values (N,) that are zero at held nodes, without forming the product of differences."""
-        return self.weight * c + spread(self.bend, gather(self.bend, c))
+        product = spread(self.bend, gather(self.bend, c))
+        product += self.weight * c
+        return product
 
     def solve(self) -> FloatArray:
         """Fitted curves (N,) without bounds, refined against the product form of A."""
         band = self.band()
-        height = float(band[0].max())
-        factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
+        own = self.weight.copy()
+        own[self.held] = 1.0
+        height, lowest = float(band[0].max()), float(own.min())
+        factor, solved, info = dpbsv(band, self.pull, lower=1, overwrite_ab=1)
         if info:
             raise ConvergenceError("the system of the smooth curves is not positive definite; lower the smoothness")
-        c = dpbtrs(factor, self.pull, lower=1)[0].ravel()
-        if height <= _EASY * float((self.weight + (1.0 - self.free) * height).min()):
-            return np.asarray(self.free * c)
+        c: FloatArray = solved.ravel()
+        if height <= _EASY * lowest:
+            return c
         for _ in range(_REFINEMENTS):
             step = dpbtrs(factor, self.pull - self.apply(c), lower=1)[0].ravel()
             c += step
@@ -134,46 +184,48 @@ class Stack:
         return np.asarray(self.free * c)
 
 
-def _second_difference(position_mm: FloatArray, ends: IntArray, root: FloatArray) -> FloatArray:
-    """Coefficients (3, N) of ``root`` (N,) times D2/h^1.5, see :func:`compgen.fit.smooth.second_difference`."""
-    slope = np.ones(len(position_mm))
-    slope[:-1] = position_mm[1:] - position_mm[:-1]
-    slope[ends - 1] = 1.0  # no step from one curve to the next
-    slope = 1 / slope
-    found = np.zeros((3, len(position_mm)))
-    first, second = slope[:-1], slope[1:]
-    scale = root[:-1] * np.sqrt(2 * first * second / (first + second))
-    inside = np.ones(len(position_mm))
-    inside[ends - 1] = 0.0
-    inside[ends[ends > 1] - 2] = 0.0
-    scale *= inside[:-1]
-    found[0, :-1] = scale * first
-    found[2, :-1] = scale * second
-    found[1] = -found[0] - found[2]
-    return found
+def lower_band(n: int) -> FloatArray:
+    """Return room for a lower band (3, n) in the order of LAPACK, which works on it without a copy."""
+    return np.empty((n, 3)).T
 
 
-def steps_mm(stack: Stack) -> FloatArray:
-    """Distance (N,) from each node to the next of its curve, inf at the last."""
-    step = np.full(len(stack.position_mm), math.inf)
-    step[:-1] = np.diff(stack.position_mm)
-    step[stack.starts + stack.sizes - 1] = math.inf
-    return step
+def _inverse_steps(position_mm: FloatArray, ends: IntArray) -> FloatArray:
+    per_mm = np.ones(len(position_mm))
+    np.subtract(position_mm[1:], position_mm[:-1], out=per_mm[:-1])
+    per_mm[ends - 1] = math.inf  # no step from one curve to the next
+    return np.divide(1.0, per_mm, out=per_mm)
 
 
-def curvature_rows(step: FloatArray) -> FloatArray:
+def _stiffness(per_mm: FloatArray, level: FloatArray) -> FloatArray:
+    """Square (N,) of the factor of rows of D2 by slopes, see :func:`compgen.fit.smooth.second_difference`.
+
+    With p, q the inverses of the steps beside a node a row is sqrt(mu h^3 2 p q/(p + q)) (p, -p - q, q); ``level`` (N,)
+    is 2 mu h^3.
+    """
+    first, second = per_mm[:-1], per_mm[1:]
+    stiff = np.empty(len(per_mm))
+    stiff[-1] = 0.0
+    inner = np.add(first, second, out=stiff[:-1])
+    inner += _TINY  # a curve of one node has no steps
+    np.divide(first, inner, out=inner)
+    inner *= second
+    inner *= level[:-1]
+    return stiff
+
+
+def curvature_rows(per_mm: FloatArray) -> FloatArray:
     """Coefficients (3, N) of c'' in windows of three nodes; zero where a window leaves its curve."""
-    rows = np.zeros((3, len(step)))
-    before, after = step[:-1], step[1:]
-    scale = np.where(np.isfinite(before) & np.isfinite(after), 2 / (before + after), 0.0)
-    rows[0, :-1], rows[2, :-1] = scale / before, scale / after
+    rows = np.zeros((3, len(per_mm)))
+    first, second = per_mm[:-1], per_mm[1:]
+    scale = 2 * (first / (first + second + _TINY)) * second  # 2 / (step before + step after)
+    rows[0, :-1], rows[2, :-1] = scale * first, scale * second
     rows[1] = -rows[0] - rows[2]
     return rows
 
 
 def curvatures_of(stack: Stack, c: FloatArray) -> FloatArray:
     """Second derivative (N,) in the window that begins at each node, see :func:`compgen.fit.bounds.curvature`."""
-    return gather(curvature_rows(steps_mm(stack)), c)
+    return gather(curvature_rows(stack.per_mm), c)
 
 
 def windows(values: FloatArray) -> FloatArray:
@@ -202,9 +254,13 @@ def spread(rows: FloatArray, v: FloatArray) -> FloatArray:
 def band_of(rows: FloatArray, out: FloatArray) -> None:
     """Write R^T R of rows (3, N) as a lower band (3, N)."""
     first, middle, last = rows
-    np.multiply(first, first, out=out[0])
-    out[0, 1:] += (middle * middle)[:-1]
-    out[0, 2:] += (last * last)[:-2]
-    np.multiply(first, middle, out=out[1])
-    out[1, 1:] += (middle * last)[:-1]
+    diagonal, product = first * first, middle * middle
+    diagonal[1:] += product[:-1]
+    np.multiply(last, last, out=product)
+    diagonal[2:] += product[:-2]
+    out[0] = diagonal
+    np.multiply(first, middle, out=diagonal)
+    np.multiply(middle, last, out=product)
+    diagonal[1:] += product[:-1]
+    out[1] = diagonal
     np.multiply(first, last, out=out[2])
