@@ -7,6 +7,8 @@ from compgen.controllers.etalon_exchange import EtalonExchange
 from compgen.controllers.fanuc_pitch import FanucPitch
 from compgen.controllers.heidenhain_com import HeidenhainCom
 from compgen.controllers.isg_csv import IsgCsv
+from compgen.controllers.linuxcnc_comp import LinuxcncComp
+from compgen.controllers.linuxcnc_volumetric import LinuxcncVolumetric
 from compgen.controllers.siemens_cec import SiemensCec
 from compgen.controllers.siemens_eec import SiemensEec
 from compgen.controllers.twincat_lists import TwincatLists
@@ -22,6 +24,8 @@ CONTROLLERS: dict[str, AnyController] = {
     "heidenhain-com": HeidenhainCom(),
     "siemens-cec": SiemensCec(),
     "siemens-eec": SiemensEec(),
+    "linuxcnc-comp": LinuxcncComp(),
+    "linuxcnc-volumetric": LinuxcncVolumetric(),
     "twincat-lists": TwincatLists(),
 }
 

@@ -129,6 +129,8 @@ class Controller(ABC, Generic[Settings, Tables]):
     anchored: bool = False
     #: True if tables may act in one direction of travel only, so that a reversal goes into them.
     bidirectional: bool = False
+    #: True if tables are looked up where the axes stand, after the correction, and not at the command.
+    at_axes: bool = False
     #: Folder with the sub-folder of templates of a plug-in's control; None: the shipped templates.
     templates: Path | None = None
     #: Setting that names a file of the user's own control to follow: "style_from", "template_from", or None.

@@ -128,7 +128,7 @@ def export(
     settings = control.read_settings(machine)
     card = usable_format(controller, templates, allow_unverified=allow_unverified)
     basis = control.basis(machine, settings, errors)
-    values = synthesize(machine, errors, basis, anchored=control.anchored)
+    values = synthesize(machine, errors, basis, anchored=control.anchored, at_axes=control.at_axes)
     tables = control.build(machine, settings, basis, values)
     rest = reversal
     if reversal is not None:

@@ -209,19 +209,25 @@ def _keep_rows(basis: Sequence[Term]) -> FloatArray:
     return np.vstack(blocks)
 
 
-def synthesize(machine: Machine, errors: ErrorTable, basis: Sequence[Term], *, anchored: bool) -> dict[str, FloatArray]:
+def synthesize(
+    machine: Machine, errors: ErrorTable, basis: Sequence[Term], *, anchored: bool, at_axes: bool = False
+) -> dict[str, FloatArray]:
     """Return the table values by term that come closest to the wanted correction over the volume.
 
     The machine's work zone and tools (``machine.emphasis``) say what counts more.
     """
     solver = projector(machine, basis, anchored=anchored)
-    return solver.by_name(best_values(machine, errors, solver))
+    return solver.by_name(best_values(machine, errors, solver, at_axes=at_axes))
 
 
-def best_values(machine: Machine, errors: ErrorTable, solver: Projector) -> FloatArray:
-    """Return all values (parameters,) of the best tables, over the tools of ``machine.emphasis`` if it has some."""
+def best_values(machine: Machine, errors: ErrorTable, solver: Projector, *, at_axes: bool = False) -> FloatArray:
+    """Return all values (parameters,) of the best tables, over the tools of ``machine.emphasis`` if it has some.
+
+    With ``at_axes`` the tables are looked up where the axes stand: they hold minus the error there, not c*.
+    """
     if machine.emphasis.tools_mm:
         solver = projector(machine, solver.basis, anchored=bool(solver.offsets), tools_mm=machine.emphasis.tools_mm)
-    wanted = wanted_correction(machine, errors, solver.position_mm, solver.sample_tool_mm)
+    wanted_at = (lambda *given: -exact_error(*given)) if at_axes else wanted_correction
+    wanted = wanted_at(machine, errors, solver.position_mm, solver.sample_tool_mm)
     start = np.concatenate([term.start for term in solver.basis])
     return solver.project(wanted, start)

@@ -1,0 +1,39 @@
+"""Text that LinuxCNC reads: lines one by one, so that garbage of any size fails at its first wrong line; numbers."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+
+from compgen.controllers.base import SourceFile
+
+#: A number as C reads it with %lf, less hexadecimal digits, ``inf`` and ``nan``.
+_NUMBER = re.compile(r"[+-]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][+-]?\d{1,4})?")
+#: What is quoted of a wrong word.
+SHOWN = 40
+
+
+def lines_of(source: SourceFile) -> Iterator[tuple[int, str, bool]]:
+    """Yield number (from 1), text without its end, and whether the line has an end, of each line (LF or CRLF)."""
+    text, start, number = source.text, 0, 1
+    while start < len(text):
+        end = text.find("\n", start)
+        last = len(text) if end < 0 else end
+        yield number, text[start:last].removesuffix("\r"), end >= 0
+        start, number = last + 1, number + 1
+
+
+def number_in(source: SourceFile, line: int, word: str, what: str) -> float:
+    """Return a finite number; InputError with the line for a decimal comma, nan, inf or anything else."""
+    if _NUMBER.fullmatch(word) and math.isfinite(value := float(word)):
+        return value
+    hint = "; LinuxCNC reads '.' as decimal point" if "," in word else ""
+    raise source.fail(f"{word[:SHOWN]!r} is not a number; {what} is due{hint}", line)
+
+
+def whole_in(source: SourceFile, line: int, word: str, what: str, limits: tuple[int, int]) -> int:
+    """Return a whole number within ``limits`` (both included); else InputError with the line."""
+    if not re.fullmatch(r"\d{1,9}", word) or not limits[0] <= int(word) <= limits[1]:
+        raise source.fail(f"{word[:SHOWN]!r} is not {what}; {limits[0]} ... {limits[1]} is due", line)
+    return int(word)
