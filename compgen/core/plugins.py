@@ -123,14 +123,20 @@ def _import(name: str, file: Path, package: bool, origin: str) -> ModuleType:
     )
     assert isinstance(spec, ModuleSpec) and spec.loader is not None  # true for every .py file
     module = importlib.util.module_from_spec(spec)
+    _forget(name)
     sys.modules[name] = module  # dataclasses and relative imports look there
     try:
         spec.loader.exec_module(module)
     except _FAULTS as error:
-        for loaded in [key for key in sys.modules if key == name or key.startswith(f"{name}.")]:
-            del sys.modules[loaded]
+        _forget(name)
         raise _import_error(error, origin, file) from error
     return module
+
+
+def _forget(name: str) -> None:
+    """Take a plug-in and its parts out of the loaded modules, so that they are read again."""
+    for loaded in [key for key in sys.modules if key == name or key.startswith(f"{name}.")]:
+        del sys.modules[loaded]
 
 
 def _import_error(error: BaseException, origin: str, file: Path | None) -> InputError:

@@ -11,9 +11,13 @@ from compgen.core.plugins import call_problem
 from compgen.errors import InputError
 from compgen.export.render import check_templates
 
-#: Methods that have a default in the base class, and those that have none.
-_OPTIONAL = ("table_nodes_mm", "with_reversal", "backlash_parameters", "usage")
-_REQUIRED = tuple(sorted(Controller.__abstractmethods__))
+#: Methods without and with a default in the base class.
+_REQUIRED = tuple(name for name in vars(Controller) if name in Controller.__abstractmethods__)
+_OPTIONAL = tuple(
+    name
+    for name, item in vars(Controller).items()
+    if inspect.isfunction(item) and not name.startswith("_") and name not in _REQUIRED
+)
 
 
 def check_control(name: str, thing: Any) -> tuple[Any, list[str]]:
