@@ -7,14 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from compgen.controllers.fanuc_pitch_limits import MOST_MISSED, shortfall_text
 from compgen.controllers.fanuc_pitch_settings import PitchSettings
 from compgen.controllers.fanuc_pitch_tables import (
-    MOST_MISSED,
+    AT_REFERENCE,
+    INTERVAL,
+    NEGATIVE_FIRST,
     PARAMETERS,
     PitchBlock,
     PitchTables,
-    shortfall_text,
 )
+from compgen.controllers.fanuc_style import Punched
 from compgen.core.csvio import fixed
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
@@ -26,6 +29,8 @@ MEANINGS = (
     "farthest point number on the positive side",
     "magnification",
     "interval",
+    "farthest point number on the negative side for travel in negative direction",
+    "value at the reference point when it is reached against the direction of the reference return",
 )
 
 
@@ -33,7 +38,8 @@ def pitch_context(machine: Machine, settings: PitchSettings, tables: PitchTables
     """Return the context beyond the common one; ``plan`` holds point number -> value for a binary transfer."""
     present = [(axis, block) for axis, block in enumerate(tables.blocks) if block is not None]
     records = _records(settings, present)
-    points = {block.first + k: value for _, block in present for k, value in enumerate(block.values)}
+    punched = _punched(settings, present)
+    points = {number: value for _, block in present for number, value in block.points()}
     return {
         "sign_statement": _sign_statement(settings),
         "parameters": _preflight_parameters(settings, present),
@@ -41,14 +47,18 @@ def pitch_context(machine: Machine, settings: PitchSettings, tables: PitchTables
             *_warnings(settings, present),
             *(shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts <= MOST_MISSED),
         ],
-        "tables": [_summary(machine, axis, block) for axis, block in present],
+        "tables": [_summary(machine, settings, axis, block) for axis, block in present],
         "style": settings,
         "records": records,
+        "file": punched,
+        "style_notes": list(settings.style_notes),
+        "bidirectional": settings.bidirectional,
         "points": [{"number": settings.number_base + number, "value": value} for number, value in points.items()],
         "plan": {
             "parameters": {record["number"]: {a["axis"]: a["value"] for a in record["axes"]} for record in records},
             "points": points,
             "value_type": settings.value_type,
+            "bidirectional": settings.bidirectional,
             "stores": settings.stores,
             "detection_unit_um": settings.detection_unit_um,
         },
@@ -58,23 +68,38 @@ def pitch_context(machine: Machine, settings: PitchSettings, tables: PitchTables
 
 def _interval_text(settings: PitchSettings, interval_mm: Decimal) -> str:
     """Interval as it is written, e.g. ``50.0``, or a whole number of the machine file's unit."""
-    if not settings.real_point:
-        return str(int(interval_mm / settings.interval_quantum_mm))
-    text = f"{interval_mm:f}"
-    return text if "." in text else f"{text}.0"
+    real = settings.style.real_point
+    return settings.style.length(interval_mm if real else interval_mm / settings.interval_quantum_mm)
 
 
 def _parameter_values(settings: PitchSettings, block: PitchBlock) -> tuple[str, ...]:
-    whole = (block.reference, block.first, block.last, block.magnification)
-    return (*map(str, whole), _interval_text(settings, block.interval_mm))
+    whole = settings.style.whole
+    numbers = (block.reference, block.first, block.last, block.magnification)
+    found = (*map(whole, numbers), _interval_text(settings, block.interval_mm))
+    return (*found, whole(block.negative_first), whole(block.at_reference)) if settings.bidirectional else found
+
+
+def _numbers(settings: PitchSettings) -> tuple[int, ...]:
+    return (*PARAMETERS, NEGATIVE_FIRST, AT_REFERENCE) if settings.bidirectional else PARAMETERS
+
+
+def _punched(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> Punched:
+    """Text of the file in its style: parameters by number, points by number."""
+    style, parameters = settings.style, []
+    columns = [(settings.axis_numbers[axis], _parameter_values(settings, block)) for axis, block in present]
+    for k, number in enumerate(_numbers(settings)):
+        letter = style.real_letter if number == INTERVAL else "P"
+        parameters += style.parameter(number, [(axis, values[k]) for axis, values in columns], letter)
+    points = sorted(pair for _, block in present for pair in block.points())
+    return Punched(style.file(parameters if present else [], [style.point(*pair) for pair in points]))
 
 
 def _records(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> list[dict[str, Any]]:
-    """Parameters 3620 ... 3624 in order, each with its axes in ascending axis number, values as text."""
+    """Parameters 3620 ... in order, each with its axes in ascending axis number, values as text."""
     columns = sorted((settings.axis_numbers[axis], _parameter_values(settings, block)) for axis, block in present)
     return [
         {"number": parameter, "axes": [{"axis": number, "value": values[k]} for number, values in columns]}
-        for k, parameter in enumerate(PARAMETERS)
+        for k, parameter in enumerate(_numbers(settings))
     ]
 
 
@@ -82,11 +107,17 @@ def _preflight_parameters(settings: PitchSettings, present: list[tuple[int, Pitc
     rows = [
         {"name": f"{number} ({AXES[axis]}, A{settings.axis_numbers[axis]})", "value": value, "meaning": meaning}
         for axis, block in present
-        for number, value, meaning in zip(PARAMETERS, _parameter_values(settings, block), MEANINGS, strict=True)
+        for number, value, meaning in zip(
+            _numbers(settings), _parameter_values(settings, block), MEANINGS, strict=False
+        )
     ]
     linear = settings.interpolation == "linear"
     rows += [
-        {"name": "3605#0", "value": "0", "meaning": "bi-directional pitch compensation off, for X, Y and Z"},
+        {
+            "name": "3605#0",
+            "value": str(int(settings.bidirectional)),
+            "meaning": f"bi-directional pitch compensation {'on' if settings.bidirectional else 'off'}, for X, Y and Z",
+        },
         {
             "name": "3602#0 (APE)",
             "value": "total" if settings.total else "incremental",
@@ -98,6 +129,26 @@ def _preflight_parameters(settings: PitchSettings, present: list[tuple[int, Pitc
             "meaning": f"interpolated pitch compensation; the files were checked as {settings.interpolation}",
         },
     ]
+    return rows + (_directional_rows(settings, present) if settings.bidirectional else [])
+
+
+def _directional_rows(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:
+    """Reference return as the tables take it, and backlash, which the tables of both directions hold already."""
+    rows = []
+    for axis, _ in present:
+        name, towards = f"({AXES[axis]}, A{settings.axis_numbers[axis]})", settings.reference_return[axis] > 0
+        rows += [
+            {
+                "name": f"1006#5 (ZMI) {name}",
+                "value": "0" if towards else "1",
+                "meaning": f"reference return in {'positive' if towards else 'negative'} direction, as the tables take it; "
+                "if the control has another value, set reference_return in the machine file: the reversal would double",
+            },
+            *(
+                {"name": f"{number} {name}", "value": "0", "meaning": "the tables of both directions hold the backlash"}
+                for number in (1851, 1852)
+            ),
+        ]
     return rows
 
 
@@ -113,11 +164,28 @@ def _sign_statement(settings: PitchSettings) -> str:
         f"The numbers are {stored}; one count is {count_um:g} um (magnification {settings.magnification} times "
         f"detection unit {settings.detection_unit_um:g} um). {kind}. An axis that travels {2 * count_um:g} um too "
         f"short over a section in the positive direction gets {2 * settings.sign:+d} there."
+        + (_directional_statement(settings) if settings.bidirectional else "")
+    )
+
+
+def _directional_statement(settings: PitchSettings) -> str:
+    return (
+        " Points from 3621 to 3622 act in travel in positive direction, as many from 3626 on in negative direction, their "
+        "values seen in the positive direction as well. With a reference return in positive direction an axis that stops "
+        f"{settings.count_mm / MM_PER_UM:g} um farther after positive than after negative travel gets "
+        f"{settings.sign:+d} in 3627."
     )
 
 
 def _warnings(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> list[str]:
     found = ["The sign of the values is not settled by public documents: check it at one section first (part 3)."]
+    if settings.style_notes:
+        found.append("The style was taken from the sample: " + "; ".join(settings.style_notes) + ".")
+    if settings.bidirectional:
+        found.append(
+            "Bi-directional: 3627 (value at the reference point reached against the reference return) and the numbers of "
+            "the points for negative travel are not settled by public documents; check both directions at the machine."
+        )
     if settings.interpolation == "staircase":
         worst = max((int(np.max(np.abs(np.diff(block.curve)))) for _, block in present), default=0)
         found.append(
@@ -133,8 +201,9 @@ def _warnings(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) ->
     return found
 
 
-def _summary(machine: Machine, axis: int, block: PitchBlock) -> dict[str, Any]:
+def _summary(machine: Machine, settings: PitchSettings, axis: int, block: PitchBlock) -> dict[str, Any]:
     """One axis in numbers, for preflight: where its table lies and how large its values are."""
+    curves = block.curves(settings.reference_return[axis])
     ends_mm = machine.reference_point_mm[axis] + block.curve_mm
     return {
         "axis": AXES[axis],
@@ -144,8 +213,11 @@ def _summary(machine: Machine, axis: int, block: PitchBlock) -> dict[str, Any]:
         "interval_mm": float(block.interval_mm),
         "first_mm": float(ends_mm[0]),
         "last_mm": float(ends_mm[-1]),
-        "largest_step": int(np.max(np.abs(np.diff(block.curve)), initial=0)),
-        "largest_sum": int(np.max(np.abs(block.curve))),
+        "largest_step": max(int(np.max(np.abs(np.diff(curve)), initial=0)) for curve in curves),
+        "largest_sum": max(int(np.max(np.abs(curve))) for curve in curves),
+        "negative_first": block.negative_first,
+        "negative_last": block.negative_first + len(block.negative) - 1,
+        "at_reference": block.at_reference,
     }
 
 
@@ -171,18 +243,23 @@ def _check(machine: Machine, settings: PitchSettings, axis: int, block: PitchBlo
 
 
 def backlash_rows(settings: PitchSettings, reversal: ReversalCurves) -> list[dict[str, str]]:
-    """Return parameter 1851 for the mean reversal of each axis along itself, in detection units.
+    """Return parameters 1851 and 1852 for the mean reversal of each axis along itself, in detection units.
 
     Source: parameter manuals B-63090EN p. 97, B-64120EN p. 116: added in the direction of movement, -9999 to +9999;
     an axis that stops short (reversal value below zero) gets a positive value.
     """
+    meanings = {
+        1851: "backlash compensation in detection units: minus the mean reversal value; these tables act in both "
+        "directions alike. If a value was active while the machine was measured, add this one to it",
+        1852: "the same in rapid traverse, if the control keeps it apart (1800#4, RBK = 1)",
+    }
     return [
         {
-            "name": f"1851 ({AXES[axis]}, A{settings.axis_numbers[axis]})",
+            "name": f"{number} ({AXES[axis]}, A{settings.axis_numbers[axis]})",
             "value": str(round(-reversal.mean_mm(axis) / (settings.detection_unit_um * MM_PER_UM))),
-            "meaning": "backlash compensation in detection units: minus the mean reversal value; these tables act in both "
-            "directions alike. If a value was active while the machine was measured, add this one to it",
+            "meaning": meaning,
         }
         for axis in range(3)
+        for number, meaning in meanings.items()
         if abs(reversal.mean_mm(axis)) >= WORTH_MM
     ]

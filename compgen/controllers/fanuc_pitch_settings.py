@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any, Literal
 
+from compgen.controllers.fanuc_style import FanucStyle, take_length_unit_mm, take_style
 from compgen.controllers.grids import take_loss_mm
 from compgen.core import tomlio
 from compgen.core.machine import Machine
@@ -32,7 +33,12 @@ class PitchSettings:
     increment_limit : largest magnitude of the change over a section, in counts.
     first_number, last_number : compensation point numbers that may be used. Number 0 is left out by default: axes
         without a table have 3620 ... 3622 = 0 and would take part in its value.
-    q_word, digits, real_point, number_base, crlf : style of the file.
+    first_numbers : first number of the block of each axis, None: assigned.
+    reserved : blocks (first, last) of other axes, which are left free.
+    bidirectional : a table for each direction of travel (3605#0 = 1).
+    negative_first_number, negative_last_number : point numbers of the tables for travel in negative direction.
+    reference_return : direction of the reference return of X, Y, Z, +1 or -1.
+    style, style_notes : how the file is written, and what a sample of the user's control told of it.
     interval_unit_mm : unit of 3624 without a decimal point.
     axis_numbers : controlled axis numbers of X, Y, Z.
     """
@@ -48,13 +54,21 @@ class PitchSettings:
     increment_limit: int
     first_number: int
     last_number: int
-    q_word: bool
-    digits: int
-    real_point: bool
-    number_base: int
-    crlf: bool
+    first_numbers: tuple[int | None, int | None, int | None]
+    reserved: tuple[tuple[int, int], ...]
+    bidirectional: bool
+    negative_first_number: int
+    negative_last_number: int
+    reference_return: tuple[int, int, int]
+    style: FanucStyle
+    style_notes: tuple[str, ...]
     interval_unit_mm: float
     axis_numbers: tuple[int, int, int]
+
+    @property
+    def number_base(self) -> int:
+        """Record number of compensation point 0."""
+        return self.style.number_base
 
     @property
     def sign(self) -> int:
@@ -74,7 +88,9 @@ class PitchSettings:
     @property
     def interval_quantum_mm(self) -> Decimal:
         """Step of the interval as it is written, mm."""
-        return INTERVAL_QUANTUM_MM if self.real_point else Decimal(repr(self.interval_unit_mm))
+        if not self.style.real_point:
+            return Decimal(repr(self.interval_unit_mm))
+        return max(INTERVAL_QUANTUM_MM, Decimal(1).scaleb(-(self.style.decimals or 3)))
 
     @property
     def least_interval_mm(self) -> float:
@@ -85,7 +101,7 @@ class PitchSettings:
 def read_pitch_settings(machine: Machine) -> PitchSettings:
     """Read and check ``[controllers.fanuc-pitch]``; every key has a default but ``interval_unit_mm`` (see there)."""
     section = machine.controller_settings("fanuc-pitch")
-    real_point = section.take("real_point", tomlio.flag, True)
+    style, notes = take_style(section)
     settings = PitchSettings(
         detection_unit_um=section.take("detection_unit_um", tomlio.positive, 1.0),
         magnification=section.take("magnification", tomlio.whole(1, 100), 1),
@@ -98,12 +114,17 @@ def read_pitch_settings(machine: Machine) -> PitchSettings:
         loss_mm=take_loss_mm(section),
         first_number=section.take("first_number", tomlio.whole(0, 9999), 1),
         last_number=section.take("last_number", tomlio.whole(0, 9999), 1023),
-        q_word=section.take("q_word", tomlio.flag, False),
-        digits=section.take("digits", tomlio.whole(1, 8), 5),
-        real_point=real_point,
-        number_base=section.take("number_base", tomlio.whole(0, 90000), 10000),
-        crlf=section.take("eol", tomlio.choice("lf", "crlf"), "lf") == "crlf",
-        interval_unit_mm=_interval_unit(section, real_point),
+        first_numbers=_per_axis(
+            section.section("first_numbers", required=False), tomlio.whole(0, 9999), (None, None, None)
+        ),
+        reserved=section.take("reserved_numbers", _spans, ()),
+        bidirectional=section.take("bidirectional", tomlio.flag, False),
+        negative_first_number=section.take("negative_first_number", tomlio.whole(0, 9999), 3000),
+        negative_last_number=section.take("negative_last_number", tomlio.whole(0, 9999), 4023),
+        reference_return=_per_axis(section.section("reference_return", required=False), _direction, (1, 1, 1)),
+        style=style,
+        style_notes=notes,
+        interval_unit_mm=take_length_unit_mm(section, style),
         axis_numbers=_per_axis(section.section("axis_numbers", required=False), tomlio.whole(1, 99), (1, 2, 3)),
     )
     _check_together(section, settings)
@@ -121,20 +142,28 @@ def _per_axis(section: tomlio.Section, check: Callable[[Any], Any], default: tup
     return values
 
 
-def _interval_unit(section: tomlio.Section, real_point: bool) -> float:
-    if not real_point and "interval_unit_mm" not in section:
-        raise section.fail(
-            "interval_unit_mm",
-            "is missing; with real_point = false parameter 3624 is a whole number whose unit depends on the control "
-            "(1.0 or 0.001 mm are common): read 3624 of a known axis and give the unit in mm",
-        )
-    return section.take("interval_unit_mm", tomlio.positive, 1.0)
+def _direction(value: Any) -> int:
+    """Direction of a reference return."""
+    return {"positive": 1, "negative": -1}[tomlio.choice("positive", "negative")(value)]
+
+
+def _spans(value: Any) -> tuple[tuple[int, int], ...]:
+    """A list of blocks of numbers."""
+    if not isinstance(value, list):
+        raise ValueError("a list of blocks of numbers [[first, last], ...] is expected")
+    whole, found = tomlio.whole(0, 9999), []
+    for item in value:
+        if not isinstance(item, list) or len(item) != 2 or whole(item[0]) > whole(item[1]):
+            raise ValueError("blocks of numbers [first, last], the lower one first, are expected")
+        found.append((item[0], item[1]))
+    return tuple(found)
 
 
 def _check_together(section: tomlio.Section, settings: PitchSettings) -> None:
     if settings.last_number < settings.first_number:
         raise section.fail("last_number", f"lies below first_number = {settings.first_number}")
-    if settings.number_base < 10000 and not settings.q_word:
+    _check_bidirectional(section, settings)
+    if settings.number_base < 10000 and not settings.style.q_word:
         raise section.fail(
             "number_base",
             f"{settings.number_base} makes pitch data look like parameters; 10000 or more, or q_word = true, is needed",
@@ -147,3 +176,19 @@ def _check_together(section: tomlio.Section, settings: PitchSettings) -> None:
                 f"{axis} = {interval_mm:g} mm cannot be written; multiples of {settings.interval_quantum_mm} mm can"
             )
             raise section.fail("interval_mm", message)
+
+
+def _check_bidirectional(section: tomlio.Section, settings: PitchSettings) -> None:
+    """Refuse what no public document settles: 3627 with total values, and with a magnification."""
+    if not settings.bidirectional:
+        return
+    if settings.total:
+        raise section.fail("value_type", "how 3627 counts beside total values is not documented; use 'incremental'")
+    if settings.magnification != 1:
+        raise section.fail(
+            "magnification",
+            "whether 3627 is multiplied by it is not documented; with bidirectional = true it must be 1 (a larger "
+            "increment_limit or shorter sections hold steep curves)",
+        )
+    if settings.negative_last_number < settings.negative_first_number:
+        raise section.fail("negative_last_number", f"lies below {settings.negative_first_number}")

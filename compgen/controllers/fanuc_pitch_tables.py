@@ -8,26 +8,24 @@ A[n] = A[n-1] + v[n]; with total values A[n] is stored. One count is magnificati
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.controllers.base import SourceFile, Usage, coverage_violations
+from compgen.controllers.base import SourceFile
 from compgen.controllers.fanuc_pitch_settings import PitchSettings
 from compgen.controllers.fanuc_text import Record, axis_values, read_records, type_word
 from compgen.core.csvio import FloatArray
-from compgen.core.machine import Machine
-from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.names import AXES
 from compgen.errors import InputError
 
 REFERENCE, FARTHEST_NEGATIVE, FARTHEST_POSITIVE, MAGNIFICATION, INTERVAL = PARAMETERS = (3620, 3621, 3622, 3623, 3624)
+#: Travel per revolution of a rotary axis; bi-directional: farthest negative number and value at the reference point.
+PER_TURN, NEGATIVE_FIRST, AT_REFERENCE = 3625, 3626, 3627
 #: Total values travel as 16-bit numbers.
 MOST_TOTAL = 32767
-#: A table that misses by more counts than this because its steps are limited is not acceptable.
-MOST_MISSED = 1.0
 #: Largest compensation point number that is read at all; what the control takes is checked by the limits.
 MOST_NUMBER = 9999
 
@@ -38,6 +36,10 @@ class PitchBlock:
 
     ``values`` are the numbers as stored, for the point numbers ``first`` ... ``last``, shape (n,); ``total`` tells
     how they count; ``reference`` is the number of the reference point.
+
+    Bi-directional: ``values`` act in travel in positive direction, ``negative`` (as many, from the number
+    ``negative_first``, parameter 3626) in negative direction; ``at_reference`` (3627) is what the curve of the direction
+    against the reference return has at the reference point, where the other one is zero.
     """
 
     reference: int
@@ -46,6 +48,9 @@ class PitchBlock:
     total: bool
     magnification: int
     interval_mm: Decimal
+    negative: tuple[int, ...] = ()
+    negative_first: int = 0
+    at_reference: int = 0
 
     @property
     def last(self) -> int:
@@ -60,9 +65,26 @@ class PitchBlock:
     @property
     def curve(self) -> NDArray[np.int64]:
         """Cumulative curve A in counts at ``curve_numbers``, zero at the reference number, shape (m,)."""
-        values = np.array(self.values, dtype=np.int64)
+        return self._sums(self.values)
+
+    def points(self) -> list[tuple[int, int]]:
+        """Return all (point number, value) of the axis, those for travel in negative direction behind the others."""
+        found = [(self.first + k, value) for k, value in enumerate(self.values)]
+        return found + [(self.negative_first + k, value) for k, value in enumerate(self.negative)]
+
+    def _sums(self, stored: tuple[int, ...]) -> NDArray[np.int64]:
+        values = np.array(stored, dtype=np.int64)
         sums = values if self.total else np.concatenate([[0], np.cumsum(values)])
         return np.asarray(sums - sums[self.reference - self.curve_numbers[0]], dtype=np.int64)
+
+    def curves(self, reference_return: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Curves after travel in positive and in negative direction, for a reference return in direction +1 or -1."""
+        if not self.negative:
+            return self.curve, self.curve
+        positive, negative = self.curve, self._sums(self.negative)
+        if reference_return > 0:
+            return positive, negative + self.at_reference
+        return positive + self.at_reference, negative
 
     @property
     def curve_mm(self) -> FloatArray:
@@ -80,15 +102,26 @@ class Shortfall:
 
 
 @dataclass(frozen=True)
+class Wanted:
+    """Wanted curve of one axis: ``counts`` (n,), real numbers, at section ends ``nodes_mm`` (n,) in machine coordinates."""
+
+    nodes_mm: FloatArray
+    counts: FloatArray
+
+
+@dataclass(frozen=True)
 class PitchTables:
     """Tables of X, Y, Z (None: the axis has none); ``others`` holds (axis number, first, last) of further axes.
 
-    ``shortfalls`` is known of tables that were built; tables read from text do not say what was wanted.
+    ``turns`` holds (axis number, sum of the values over a revolution) of rotary axes among these. ``shortfalls`` and
+    ``wanted`` are known of tables that were built; tables read from text do not say what was wanted.
     """
 
     blocks: tuple[PitchBlock | None, PitchBlock | None, PitchBlock | None]
     others: tuple[tuple[int, int, int], ...] = ()
+    turns: tuple[tuple[int, int], ...] = field(default=(), compare=False)
     shortfalls: tuple[Shortfall, ...] = field(default=(), compare=False)
+    wanted: tuple[Wanted | None, Wanted | None, Wanted | None] = field(default=(None, None, None), compare=False)
 
 
 Parameters = dict[tuple[int, int], tuple[str, Record]]
@@ -113,7 +146,9 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
     if not any(blocks):
         numbers = ", ".join(f"A{number}" for number in settings.axis_numbers)
         raise texts[0].fail(f"holds none of the parameters 3620 to 3624 for the axes {numbers}; punch them as well")
-    return PitchTables((blocks[0], blocks[1], blocks[2]), _others(settings, parameters))
+    others = _others(settings, parameters)
+    turns = _turns(settings, others, parameters, points)
+    return PitchTables((blocks[0], blocks[1], blocks[2]), others, turns)
 
 
 def _sort_in(record: Record, base: int, parameters: Parameters, points: Points) -> None:
@@ -121,7 +156,7 @@ def _sort_in(record: Record, base: int, parameters: Parameters, points: Points) 
     point = record.number - base
     if 0 <= point <= MOST_NUMBER:
         points.setdefault(point, []).append(record)
-    if record.number not in PARAMETERS:
+    if record.number not in (*PARAMETERS, PER_TURN, NEGATIVE_FIRST, AT_REFERENCE):
         return
     kind, words = type_word(record, record.words())
     if kind == 0 and base < 10000:
@@ -154,15 +189,16 @@ def _block(
     settings: PitchSettings, file: SourceFile, axis: int, parameters: Parameters, points: Points
 ) -> PitchBlock | None:
     number = settings.axis_numbers[axis]
-    missing = [str(parameter) for parameter in PARAMETERS if (parameter, number) not in parameters]
-    if len(missing) == len(PARAMETERS):
+    needed = (*PARAMETERS, NEGATIVE_FIRST, AT_REFERENCE) if settings.bidirectional else PARAMETERS
+    missing = [str(parameter) for parameter in needed if (parameter, number) not in parameters]
+    if set(map(str, PARAMETERS)) <= set(missing):
         return None
     if missing:
         raise file.fail(f"parameter {', '.join(missing)} is missing for {AXES[axis]} (axis A{number})")
 
-    def whole(parameter: int, high: int) -> int:
+    def whole(parameter: int, high: int, low: int = 0) -> int:
         text, record = parameters[parameter, number]
-        return record.whole(text, 0, high)
+        return record.whole(text, low, high)
 
     first, last = whole(FARTHEST_NEGATIVE, MOST_NUMBER), whole(FARTHEST_POSITIVE, MOST_NUMBER)
     reference = whole(REFERENCE, MOST_NUMBER)
@@ -172,7 +208,7 @@ def _block(
             f"{AXES[axis]} has the reference point {reference} and the points {first} to {last}; the reference point "
             f"must be one of {lowest} to {last}"
         )
-    return PitchBlock(
+    block = PitchBlock(
         reference=reference,
         first=first,
         values=_values(settings, (first, last), parameters[FARTHEST_POSITIVE, number][1], points),
@@ -180,6 +216,13 @@ def _block(
         magnification=whole(MAGNIFICATION, 100),
         interval_mm=_interval(settings, *parameters[INTERVAL, number]),
     )
+    if not settings.bidirectional:
+        return block
+    negative_first = whole(NEGATIVE_FIRST, MOST_NUMBER)
+    span = (negative_first, negative_first + last - first)
+    negative = _values(settings, span, parameters[NEGATIVE_FIRST, number][1], points)
+    at_reference = whole(AT_REFERENCE, MOST_TOTAL, -MOST_TOTAL - 1)
+    return replace(block, negative=negative, negative_first=negative_first, at_reference=at_reference)
 
 
 def _values(settings: PitchSettings, span: tuple[int, int], who: Record, points: Points) -> tuple[int, ...]:
@@ -217,85 +260,18 @@ def _others(settings: PitchSettings, parameters: Parameters) -> tuple[tuple[int,
     return tuple(found)
 
 
-def pitch_violations(machine: Machine, settings: PitchSettings, tables: PitchTables) -> list[str]:
-    """Return every limit that the tables break, and travel that they leave out, in words."""
-    messages = []
-    for axis, block in enumerate(tables.blocks):
-        if block is None:
-            messages.append(f"{AXES[axis]} has no pitch table: none of its travel is covered")
-        else:
-            messages += _block_violations(settings, AXES[axis], block)
-            first_mm, last_mm = machine.reference_point_mm[axis] + block.curve_mm[[0, -1]]
-            messages += coverage_violations(machine, axis, first_mm, last_mm, f"the pitch table of {AXES[axis]}")
-    messages += [shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts > MOST_MISSED]
-    return messages + _overlaps(tables)
+def _turns(
+    settings: PitchSettings, others: Sequence[tuple[int, int, int]], parameters: Parameters, points: Points
+) -> tuple[tuple[int, int], ...]:
+    """Sum of the values over a revolution, of further axes whose numbers span their travel per revolution (3625).
 
-
-def shortfall_text(settings: PitchSettings, shortfall: Shortfall) -> str:
-    """Say that the limit of the change per section keeps a table from what was wanted, and what helps."""
-    numbers = ", ".join(map(str, shortfall.sections[:5])) + (", ..." if len(shortfall.sections) > 5 else "")
-    return (
-        f"{AXES[shortfall.axis]}: the wanted curve is too steep, the limit is {settings.increment_limit} counts per "
-        f"section: {len(shortfall.sections)} sections are full (points {numbers}), and even the best table misses by up "
-        f"to {shortfall.missed_counts * settings.count_mm / MM_PER_UM:.1f} um; a shorter interval or a larger "
-        f"magnification is needed"
-    )
-
-
-def _block_violations(settings: PitchSettings, name: str, block: PitchBlock) -> list[str]:
-    messages = _value_violations(settings, name, block)
-    if block.last > settings.last_number:
-        messages.append(
-            f"{name}: the points {block.first} to {block.last} go beyond the last number {settings.last_number}"
-        )
-    if block.magnification == 0:
-        messages.append(f"{name}: the magnification is 0, which switches the table off")
-    if float(block.interval_mm) < settings.least_interval_mm - 1e-9:
-        messages.append(
-            f"{name}: the interval {block.interval_mm:f} mm is shorter than the {settings.least_interval_mm:g} mm that "
-            f"{settings.max_feed_mm_min:g} mm/min need"
-        )
-    return messages
-
-
-def _value_violations(settings: PitchSettings, name: str, block: PitchBlock) -> list[str]:
-    messages = []
-    steps = np.abs(np.diff(block.curve))
-    if steps.size and steps.max() > settings.increment_limit:
-        worst = int(np.argmax(steps))
-        messages.append(
-            f"{name}: the change over section {block.curve_numbers[worst + 1]} is {steps[worst]} counts, the limit is "
-            f"{settings.increment_limit}; a shorter interval or a larger magnification is needed"
-        )
-    if block.total and max(map(abs, block.values)) > MOST_TOTAL:
-        most = max(map(abs, block.values))
-        messages.append(f"{name}: a total value of {most} counts does not fit 16 bits ({MOST_TOTAL})")
-    if block.total and block.values[block.reference - block.first] != 0:
-        messages.append(f"{name}: the total value at the reference point {block.reference} must be 0")
-    return messages
-
-
-def _overlaps(tables: PitchTables) -> list[str]:
-    spans = [(AXES[k], block.first, block.last) for k, block in enumerate(tables.blocks) if block is not None]
-    spans += [(f"axis A{number}", first, last) for number, first, last in tables.others]
-    return [
-        f"the compensation points of {a} ({a_first} to {a_last}) and {b} ({b_first} to {b_last}) overlap"
-        for (a, a_first, a_last), (b, b_first, b_last) in combinations(spans, 2)
-        if a_first <= b_last and b_first <= a_last
-    ]
-
-
-def pitch_usage(settings: PitchSettings, tables: PitchTables) -> list[Usage]:
-    """Return the largest change over a section, the point numbers and the interval against their limits."""
-    found, used = [], 0
-    for axis, block in enumerate(tables.blocks):
-        if block is None:
-            continue
-        used += len(block.values)
-        step = int(np.max(np.abs(np.diff(block.curve)), initial=0))
-        found.append(Usage(f"change over a section of {AXES[axis]}", step, settings.increment_limit, "counts"))
-        if settings.max_feed_mm_min is not None:
-            least, own = settings.least_interval_mm, float(block.interval_mm)
-            found.append(Usage(f"shortest section at the feed, {AXES[axis]}", least, own, "mm"))
-    numbers = settings.last_number - settings.first_number + 1
-    return [*found, Usage("compensation points", used, numbers, "points")]
+    Source: Series 0i-PB parameter manual B-63980EN/01, p. 100: the numbers go from the reference point's to it plus
+    travel per revolution over interval; the values behind the first must sum to zero.
+    """
+    found = []
+    for axis, first, last in others:
+        text, record = parameters.get((PER_TURN, axis), ("0", None))
+        interval = Decimal(parameters[INTERVAL, axis][0]) if (INTERVAL, axis) in parameters else Decimal(0)
+        if record is not None and interval > 0 and Decimal(text) == (last - first) * interval:
+            found.append((axis, sum(_values(settings, (first + 1, last), record, points))))
+    return tuple(found)

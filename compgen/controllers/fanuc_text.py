@@ -29,12 +29,14 @@ _WORD = re.compile(r"[ \t]*([A-Z])([+-]?(?:\d{1,12}(?:\.\d{0,12})?|\.\d{1,12}))(
 
 @dataclass(frozen=True)
 class Record:
-    """One block of a file: its number, and the text behind it."""
+    """One block of a file: its number (of so many digits, perhaps filled with zeros), and the text behind it."""
 
     number: int
     rest: str
     file: SourceFile
     line: int
+    digits: int = 0
+    filled: bool = False
 
     def fail(self, message: str) -> InputError:
         """Return the error that points at this record."""
@@ -95,22 +97,25 @@ def _record(file: SourceFile, block: str, line: int, inside: bool) -> Record:
     if found.end() != len(block):
         what = one_line(block[found.end() : found.end() + 20])
         raise file.fail(f"{what!r} has no place in a block; words are a letter and a decimal number with '.'", line)
-    return Record(int(found[1]), found[2], file, line)
+    return Record(int(found[1]), found[2], file, line, len(found[1]), found[1].startswith("0"))
 
 
 def type_word(record: Record, words: Sequence[tuple[str, str]]) -> tuple[int | None, list[tuple[str, str]]]:
     """Return the type word ``Q`` (0 pitch data, 1 parameter, None if there is none) and the other words."""
-    if words and words[0][0] == "Q":
-        return record.whole(words[0][1], 0, 9), list(words[1:])
+    for place in (0, -1):
+        if words and words[place][0] == "Q":
+            others = list(words)
+            return record.whole(others.pop(place)[1], 0, 9), others
     return None, list(words)
 
 
 def axis_values(record: Record, words: Sequence[tuple[str, str]]) -> list[tuple[int, str]]:
-    """Return the (axis number, value as text) pairs ``A1P40A2P20`` of a parameter of the axis type."""
+    """Return the (axis number, value as text) pairs ``A1P40A2P20`` (or ``P40A1``) of a parameter of the axis type."""
     if not words or len(words) % 2:
         raise record.fail("pairs of an axis word A and a value word P are due, e.g. A1P40A2P20")
     pairs = []
-    for (axis_letter, axis), (value_letter, value) in zip(words[::2], words[1::2], strict=True):
+    for first, second in zip(words[::2], words[1::2], strict=True):
+        (axis_letter, axis), (value_letter, value) = (second, first) if second[0] == "A" else (first, second)
         if axis_letter != "A":
             raise record.fail(f"{axis_letter}{axis} stands where an axis word A is due, e.g. A1P40")
         if value_letter == "I":
