@@ -9,6 +9,8 @@ from compgen.controllers.heidenhain_com import HeidenhainCom
 from compgen.controllers.isg_csv import IsgCsv
 from compgen.controllers.linuxcnc_comp import LinuxcncComp
 from compgen.controllers.linuxcnc_volumetric import LinuxcncVolumetric
+from compgen.controllers.pmac import Pmac
+from compgen.controllers.mitsubishi import Mitsubishi
 from compgen.controllers.siemens_cec import SiemensCec
 from compgen.controllers.siemens_eec import SiemensEec
 from compgen.controllers.twincat_lists import TwincatLists
@@ -22,11 +24,13 @@ CONTROLLERS: dict[str, AnyController] = {
     "etalon-exchange": EtalonExchange(),
     "fanuc-pitch": FanucPitch(),
     "heidenhain-com": HeidenhainCom(),
+    "mitsubishi": Mitsubishi(),
     "siemens-cec": SiemensCec(),
     "siemens-eec": SiemensEec(),
     "linuxcnc-comp": LinuxcncComp(),
     "linuxcnc-volumetric": LinuxcncVolumetric(),
     "twincat-lists": TwincatLists(),
+    "pmac": Pmac(),
 }
 
 

@@ -1,0 +1,139 @@
+"""Mitsubishi machine error compensation: positioning and relative position errors as a set sheet of whole numbers.
+
+What the control is taken to do, and how sure that is, stands in ``templates/mitsubishi/format.toml``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from decimal import ROUND_CEILING, Decimal
+from typing import Any
+
+import numpy as np
+
+from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controllers.grids import Grid, equidistant_grid
+from compgen.controllers.integers import IntegerCurve, best_integers, section_weights
+from compgen.controllers.mitsubishi_context import sheet_context
+from compgen.controllers.mitsubishi_settings import (
+    HIGHEST_VALUE,
+    INTERVAL_QUANTUM_MM,
+    MitsubishiSettings,
+    read_mitsubishi_settings,
+)
+from compgen.controllers.mitsubishi_tables import (
+    MitsubishiTables,
+    SetTable,
+    Shortfall,
+    parse_sheet,
+    sheet_usage,
+    sheet_violations,
+    values_of,
+)
+from compgen.controllers.terms import one_dimensional_name, one_dimensional_terms
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.points import Points
+
+
+class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
+    """Tables of each axis over each axis in counts of half a setting unit, zero at the reference point."""
+
+    name = "mitsubishi"
+    anchored = True
+
+    def read_settings(self, machine: Machine) -> MitsubishiSettings:
+        """Check ``[controllers.mitsubishi]``."""
+        return read_mitsubishi_settings(machine)
+
+    def basis(self, machine: Machine, settings: MitsubishiSettings, errors: ErrorTable) -> list[Term]:
+        """Return one term per set, its nodes the division points, the reference point one of them."""
+        nodes = [_grid(machine, settings, errors, axis).nodes_mm for axis in range(3)]
+        return one_dimensional_terms(machine, errors, nodes, settings.pairs, anchored=True)
+
+    def build(
+        self, machine: Machine, settings: MitsubishiSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
+    ) -> MitsubishiTables:
+        """Find the best whole curves within the range of the values, and give the sets consecutive numbers."""
+        terms = {term.name: term for term in basis}
+        sets: list[SetTable] = []
+        shortfalls: list[Shortfall] = []
+        free = settings.first_number
+        for output, base in settings.pairs:
+            term = terms[one_dimensional_name(output, base)]
+            at = int(np.argmin(np.abs(term.nodes_mm - machine.reference_point_mm[base])))
+            best = _best_counts(machine, settings, base, term.nodes_mm, values[term.name], at)
+            numbers = values_of(best.counts, at)
+            sets.append(SetTable(base, output, free + at, free, numbers, settings.scale, _interval(term.nodes_mm)))
+            free += len(numbers)
+            if best.limited:
+                shortfalls.append(Shortfall(output, base, best.largest))
+        return MitsubishiTables(tuple(sets), tuple(shortfalls))
+
+    def context(self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables) -> dict[str, Any]:
+        """Return the rows of the sheet, the plan number -> value, parameters and the statement of the sign."""
+        return sheet_context(machine, settings, tables)
+
+    def parse(self, machine: Machine, settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
+        """Read the set sheet; a ``.json`` plan among the files is passed over."""
+        return parse_sheet(settings, files)
+
+    def emulate(
+        self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables, points: Points
+    ) -> FloatArray:
+        """Return the sum of the sets' curves, linear between division points, held beyond the ends."""
+        added = np.zeros((len(points), 3))
+        for table in tables.sets:
+            along = points.position_mm[:, table.base] - machine.reference_point_mm[table.base]
+            counts = np.interp(along, table.along_mm, table.curve)
+            added[:, table.output] += settings.sign * settings.half_unit_mm * table.scale * counts
+        return added
+
+    def violations(self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables) -> list[str]:
+        """Return broken limits: values, numbers, overlaps, scale, travel left out."""
+        return sheet_violations(machine, settings, tables)
+
+    def table_nodes_mm(
+        self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables
+    ) -> tuple[FloatArray, ...]:
+        """Return the division points of each base axis."""
+        return nodes_by_axis((t.base, machine.reference_point_mm[t.base] + t.along_mm) for t in tables.sets)
+
+    def usage(self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables) -> list[Usage]:
+        """Return the largest value, numbers and sets against their limits."""
+        return sheet_usage(settings, tables)
+
+    def resolution_mm(self, settings: MitsubishiSettings) -> float:
+        """Half a count of each table that acts on an axis, where the range of the values does not bind."""
+        return 0.5 * settings.count_mm * (3 if settings.relative else 1)
+
+
+def _grid(machine: Machine, settings: MitsubishiSettings, errors: ErrorTable, axis: int) -> Grid:
+    """Division points of a base axis: equal intervals in whole 0.001 mm, an equal share of the numbers for each set."""
+    most = (settings.last_number - settings.first_number + 1) // len(settings.pairs)
+    output = None if settings.relative else axis
+    asked = settings.interval_mm[axis]
+    loss_mm = settings.loss_mm
+    grid = equidistant_grid(
+        machine, errors, axis, most=most, step_mm=asked, anchor=True, loss_mm=loss_mm, output=output
+    )
+    if grid.step % INTERVAL_QUANTUM_MM:
+        step = (grid.step / INTERVAL_QUANTUM_MM).to_integral_value(rounding=ROUND_CEILING) * INTERVAL_QUANTUM_MM
+        grid = equidistant_grid(machine, errors, axis, most=most, step_mm=float(step), anchor=True)
+    return grid
+
+
+def _interval(nodes_mm: FloatArray) -> Decimal:
+    step = Decimal(repr(float(nodes_mm[1] - nodes_mm[0]))).quantize(INTERVAL_QUANTUM_MM)
+    return step
+
+
+def _best_counts(
+    machine: Machine, settings: MitsubishiSettings, base: int, nodes_mm: FloatArray, values_mm: FloatArray, at: int
+) -> IntegerCurve:
+    """Return the best curve in counts at the division points for corrections (n,), zero at index ``at``."""
+    wanted = settings.sign * (np.asarray(values_mm) - values_mm[at]) / settings.count_mm
+    emphasis = machine.emphasis
+    sections = section_weights(nodes_mm, machine.axes[base].range_mm, emphasis.zone_mm[base], emphasis.zone_weight)
+    return best_integers(wanted, sections, at, HIGHEST_VALUE)
