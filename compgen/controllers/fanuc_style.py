@@ -29,6 +29,7 @@ class FanucStyle:
     Parameters
     ----------
     eol, block_end, space : line end, what stands before it (``;`` or nothing), what stands between words.
+    mark : first and last line.
     digits, point_digits : digits of the N words of parameters and of compensation points, filled with zeros.
     q_word, q_last : type word Q1 (parameter) or Q0 (pitch data), behind the other words if ``q_last``.
     value_first : the value word stands before its axis word.
@@ -44,6 +45,7 @@ class FanucStyle:
 
     eol: str = "\n"
     block_end: str = ""
+    mark: str = "%"
     space: str = ""
     digits: int = 5
     point_digits: int = 5
@@ -106,8 +108,8 @@ class FanucStyle:
     def file(self, parameters: Sequence[str], points: Sequence[str]) -> str:
         """Return the text of a file from its records."""
         parts = [points, parameters] if self.points_first else [parameters, points]
-        between = ["%", "%"] if self.containers == 2 and parameters and points else []
-        lines = ["%", *self.header, *parts[0], *between, *parts[1], *self.footer, "%"]
+        between = [self.mark] * 2 if self.containers == 2 and parameters and points else []
+        lines = [self.mark, *self.header, *parts[0], *between, *parts[1], *self.footer, self.mark]
         return self.eol.join(lines) + (self.eol if self.last_eol else "")
 
 
@@ -183,9 +185,9 @@ def style_of(file: SourceFile) -> tuple[FanucStyle, tuple[str, ...]]:
 
 
 def is_point(record: Record) -> bool:
-    """Whether a record looks like a compensation point: type Q0, or 10000 and above with a single value."""
+    """Whether a record looks like a compensation point: type Q0, or 10000 and above without axis words."""
     kind, words = type_word(record, record.words())
-    return kind == 0 or (kind is None and record.number >= 10000 and len(words) == 1)
+    return kind == 0 or (kind is None and record.number >= 10000 and not any(word[0] in "ASL" for word in words))
 
 
 def _is_pitch_parameter(record: Record) -> bool:
@@ -212,7 +214,8 @@ def _frame(file: SourceFile, records: Sequence[Record], points: Sequence[Record]
         last_eol=bool(marks) and marks[-1] < len(pieces) - 1,
         points_first=bool(points) and 0 < first_point < first_other,
         containers=2 if len(marks) >= 4 else 1,
-        block_end=";" if ";" in text else "",
+        block_end=";" if any(piece.rstrip().endswith(";") for piece in pieces) else "",
+        mark=pieces[marks[0]].strip() if marks else "%",
     )
 
 

@@ -1,0 +1,203 @@
+"""The style of a file that was punched from the user's own control is found out, followed, and told."""
+
+from __future__ import annotations
+
+import re
+import time
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from compgen.controllers import SourceFile, controller_named
+from compgen.controllers.fanuc_pitch_tables import PitchTables
+from compgen.controllers.fanuc_style import FanucStyle, style_of
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Axis, Chain, Machine
+from compgen.errors import InputError
+from compgen.export import export
+from compgen.export.render import load_format, render_files
+
+SAMPLE = (Path(__file__).parent / "golden" / "fanuc-pitch" / "PITCH.TXT").read_text()
+CURVE_MM = np.array([0, 2, 3, 4, 2, 2, 1, 1, 0, 2, 3, 3, 2, 1, -1, -1, 0, 2]) * 1e-3
+CONTROL = controller_named("fanuc-pitch")
+
+
+def sample_machine(**options):
+    """The machine of the manual's example: its table is the sample, number for number."""
+    axes = tuple(Axis(r, np.linspace(*r, 3)) for r in ((-400.0, 450.0), (-1.0, 1.0), (-1.0, 1.0)))
+    machine = Machine("sample", Chain("WXYFZT"), axes)
+    defaults = {"first_number": 33, "interval_mm": {"X": 50.0, "Y": 1.0, "Z": 1.0}}
+    for key, value in {**defaults, **options}.items():
+        machine = machine.with_setting("fanuc-pitch", key, value)
+    return machine
+
+
+def written(machine):
+    chosen = CONTROL.read_settings(machine)
+    basis = CONTROL.basis(machine, chosen, ErrorTable())
+    values = {term.name: term.start for term in basis} | {"X(x)": CURVE_MM}
+    tables = PitchTables((CONTROL.build(machine, chosen, basis, values).blocks[0], None, None))
+    context = {"machine_name": "m", "input_sha256": "0" * 64, **CONTROL.context(machine, chosen, tables)}
+    return render_files(load_format("fanuc-pitch"), context)["PITCH.TXT"], context["warnings"]
+
+
+def with_q_words(text):
+    return re.sub(r"(?m)^N1(\d{4})", r"N1\1Q0", re.sub(r"(?m)^N0(\d{4})", r"N0\1Q1", text))
+
+
+def spaced(text):
+    return re.sub(r"(?m)(?<=[\d.])(?=[A-Z])", " ", text)
+
+
+def points_first(text):
+    lines = text.split()
+    return "\n".join(["%", *lines[6:-1], *lines[1:6], "%", ""])
+
+
+CLONES = {
+    "as it is": lambda t: t,
+    "Q words": with_q_words,
+    "Q words behind": lambda t: re.sub(r"(?m)^(N\d+)(Q\d)(.+)$", r"\1\3\2", with_q_words(t)),
+    "white space": spaced,
+    "Q words and white space": lambda t: spaced(with_q_words(t)),
+    "no leading zeros": lambda t: t.replace("N0", "N"),
+    "more digits": lambda t: t.replace("N", "N000"),
+    "CR LF": lambda t: t.replace("\n", "\r\n"),
+    "LF CR CR": lambda t: t.replace("\n", "\n\r\r"),
+    "CR": lambda t: t.replace("\n", "\r"),
+    "semicolons": lambda t: t.replace("\n", ";\n"),
+    "semicolons without those of the marks": lambda t: t.replace("\n", ";\n").replace("%;", "%"),
+    "value word before axis word": lambda t: re.sub(r"A1P([\d.]+)", r"P\1A1", t),
+    "metric lengths": lambda t: t.replace("P50.0", "M50.0"),
+    "three decimals": lambda t: t.replace("P50.0", "P50.000"),
+    "a bare point": lambda t: t.replace("P50.0", "P50."),
+    "whole numbers with a point": lambda t: re.sub(r"P(-?\d+)$", r"P\1.", t, flags=re.M),
+    "plus signs": lambda t: re.sub(r"P(\d+)$", r"P+\1", t, flags=re.M),
+    "filled values": lambda t: re.sub(r"P(-?)(\d+)$", lambda m: f"P{m[1]}{int(m[2]):04d}", t, flags=re.M),
+    "number base 20000": lambda t: t.replace("N10", "N20"),
+    "points first": points_first,
+    "two containers": lambda t: t.replace("N10033", "%\n%\nN10033"),
+    "comments": lambda t: t.replace("%\nN03620", "%\n(PITCH; X 2024)\nN03620").replace("P2\n%", "P2\n(END)\n%"),
+    "no last line end": lambda t: t.rstrip("\n"),
+    "all of it": lambda t: spaced(with_q_words(points_first(t))).replace("P50.0", "M50.000").replace("\n", ";\r\n"),
+}
+
+
+@pytest.mark.parametrize("name", CLONES)
+def test_the_example_is_written_byte_for_byte_as_the_sample_that_was_punched(tmp_path, name):
+    text = CLONES[name](SAMPLE)
+    assert (text == SAMPLE) == (name == "as it is")
+    path = tmp_path / "PUNCH.TXT"
+    path.write_bytes(text.encode("ascii"))
+    own, warnings = written(sample_machine(style_from=str(path)))
+    assert own == text
+    assert any(warning.startswith("The style was taken from the sample") for warning in warnings)
+    chosen = CONTROL.read_settings(sample_machine(style_from=str(path)))
+    back = CONTROL.parse(sample_machine(), chosen, [SourceFile(path, own)])
+    assert np.array_equal(back.blocks[0].curve, np.rint(CURVE_MM * 1e3))
+
+
+def test_numbers_without_a_point_need_their_unit(tmp_path):
+    path = tmp_path / "PUNCH.TXT"
+    path.write_text(SAMPLE.replace("P50.0", "P50000"))
+    with pytest.raises(InputError, match="interval_unit_mm"):
+        CONTROL.read_settings(sample_machine(style_from=str(path)))
+    own, _ = written(sample_machine(style_from=str(path), interval_unit_mm=0.001))
+    assert own == path.read_text()
+
+
+def test_what_the_user_states_stands_before_what_the_sample_shows(tmp_path):
+    path = tmp_path / "PUNCH.TXT"
+    path.write_text(with_q_words(SAMPLE))
+    own, _ = written(sample_machine(style_from=str(path), q_word=False, eol="crlf"))
+    assert own == SAMPLE.replace("\n", "\r\n")
+
+
+def test_one_record_per_axis_is_followed_and_told_in_preflight(tmp_path, small_machine, small_errors):
+    path = tmp_path / "PUNCH.TXT"
+    rows = [f"N0{n}A{a}P{v}" for n, v in ((3620, 5), (3621, 5), (3622, 6), (3623, 1), (3624, "20.0")) for a in (1, 2)]
+    path.write_text("\n".join(["%", *rows, "N10005P1", "N10006P-1", "%", ""]))
+    made = export(small_machine.with_setting("fanuc-pitch", "style_from", str(path)), small_errors, "fanuc-pitch")
+    text = made.files["PITCH.TXT"]
+    assert re.findall(r"(?m)^N03620.*$", text) == [m[0] for m in re.finditer(r"(?m)^N03620A[123]P\d+$", text)]
+    assert text.count("N03620A") == 3
+    assert "one record per axis" in made.preflight and "compensation point 0 is record N10000" in made.preflight
+    assert made.violations == []
+
+
+def test_what_a_sample_does_not_show_is_said():
+    _, notes = style_of(SourceFile(Path("p"), "%\nN10041P2\n%\n"))
+    assert any("no parameter 3624" in note and "NOT confirmed" in note for note in notes)
+    _, notes = style_of(SourceFile(Path("p"), "%\nN03620A1P40\nN03624A1P50.0\n%\n"))
+    assert any("no compensation point" in note and "NOT confirmed" in note for note in notes)
+
+
+MALFORMED = [
+    (lambda t: "", "holds no '%'", None),
+    (lambda t: "%\n%\n", "holds no record", 1),
+    (lambda t: t.replace("N10036P-2", "O1234"), "is not a block", 10),
+    (lambda t: t.replace("N10036P-2", "N10036P-2,5"), "no place", 10),
+    (lambda t: t.replace("N10036P-2", "N10036P-2E1"), "single value word", 10),
+    (lambda t: t.replace("N10036P-2", "N10036P-2.5"), "whole number", 10),
+    (lambda t: t.replace("N10036P-2", "N10036Q0P-2"), "some records have a type word", 10),
+    (lambda t: t.replace("N10036P-2", "N10036 P-2"), "white space", 10),
+    (lambda t: t.replace("N10036", "N010036"), "digits", None),
+    (lambda t: t.replace("N03624A1P50.0", "N03624A1I2.0"), "inch", 6),
+    (lambda t: t.replace("N03624A1P50.0", "N03624A1P50.0A2P50"), "some lengths", 6),
+    (lambda t: t.replace("P2\n", "P2\r\n", 1), "does not end with", None),
+    (lambda t: t[: t.rindex("%")], "last '%' is missing", None),
+    (lambda t: t.replace("N03620A1P40", "N03620"), "no value", 2),
+]
+
+
+@pytest.mark.parametrize(("damage", "words", "line"), MALFORMED)
+def test_a_sample_that_is_not_understood_is_refused_with_its_line(tmp_path, damage, words, line):
+    path = tmp_path / "PUNCH.TXT"
+    text = damage(SAMPLE)
+    assert text != SAMPLE
+    path.write_bytes(text.encode())
+    with pytest.raises(InputError, match=words) as caught:
+        CONTROL.read_settings(sample_machine(style_from=str(path)))
+    assert caught.value.file == path
+    assert caught.value.line == line or line is None
+
+
+def test_bytes_that_are_no_ascii_and_files_that_are_not_there_are_refused(tmp_path):
+    path = tmp_path / "PUNCH.TXT"
+    path.write_bytes(b"%\nN03620A1P40\n\xff\xfe\n%\n")
+    with pytest.raises(InputError, match="not ASCII") as caught:
+        CONTROL.read_settings(sample_machine(style_from=str(path)))
+    assert caught.value.line == 3
+    with pytest.raises(InputError, match="no such file"):
+        CONTROL.read_settings(sample_machine(style_from=str(tmp_path / "none.txt")))
+
+
+def test_a_huge_sample_is_refused_at_once(tmp_path):
+    path = tmp_path / "PUNCH.TXT"
+    path.write_bytes(b"%\n" + b"N1P1\n" * 2_000_000)
+    start = time.process_time()
+    with pytest.raises(InputError):
+        CONTROL.read_settings(sample_machine(style_from=str(path)))
+    assert time.process_time() - start < 1.0
+
+
+@given(st.lists(st.one_of(st.sampled_from([*SAMPLE.split(), "%", "(x)", "N1", "N03620P1A1"]), st.text(max_size=8))))
+@settings(max_examples=150, deadline=None)
+def test_any_sample_is_understood_or_refused_but_never_crashes(lines):
+    try:
+        style, notes = style_of(SourceFile(Path("p"), "\n".join(["%", *lines, "%"])))
+    except InputError as error:
+        assert str(error).isprintable()
+    else:
+        assert notes and style.whole(-2).startswith("-")
+
+
+@given(st.integers(-99999, 99999), st.booleans(), st.booleans(), st.integers(0, 6))
+@settings(max_examples=60, deadline=None)
+def test_whole_numbers_mean_the_same_in_every_style(value, point, plus, zeros):
+    text = FanucStyle(whole_point=point, plus=plus, zeros=zeros).whole(value)
+    assert Decimal(text) == value
