@@ -29,6 +29,8 @@ range_mm = [-240.0, 0.0]
 nodes = 7
 [controllers.siemens-cec]
 sign = "error"
+[controllers.pmac]
+counts_per_mm = { X = 1000.0, Y = 2000.0, Z = -1500.0 }
 """
 
 SMALL_SCENARIO = """\
