@@ -191,6 +191,10 @@ class Controller(ABC, Generic[Settings, Tables]):
         """Return the control's backlash parameters (name, value, meaning) for a reversal that no table holds."""
         return []
 
+    def left_out(self, machine: Machine, settings: Settings, errors: ErrorTable) -> list[str]:
+        """Return what of these errors the tables could hold but have no room for, in words with what stays in um."""
+        return []
+
     def usage(self, machine: Machine, settings: Settings, tables: Tables) -> list[Usage]:
         """Return how much of each limit of the control the tables use."""
         return []

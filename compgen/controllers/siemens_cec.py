@@ -9,18 +9,17 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
-from compgen.controllers.grids import equidistant_grid, take_loss_mm
-from compgen.controllers.siemens_limits import cec_usage, largest_sums, set_violations
+from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.siemens_limits import cec_usage, largest_sums, set_violations, stated_limit_violations
 from compgen.controllers.siemens_preflight import cec_parameters, cec_sign_statement, cec_warnings
 from compgen.controllers.siemens_products import (
     MM_DECIMALS,
-    MULT_MODES,
     NEGLIGIBLE_PRODUCT_MM,
     CecMap,
     CecTable,
@@ -29,16 +28,18 @@ from compgen.controllers.siemens_products import (
     sum_into_axes,
     written_decimals,
 )
+from compgen.controllers.siemens_ranking import Choice, chosen_terms
 from compgen.controllers.siemens_reversal import backlash_rows, reversal_statement, with_reversal_tables
-from compgen.controllers.siemens_settings import take_axis_names, take_steps
+from compgen.controllers.siemens_settings import CecSettings, take_cec_settings
 from compgen.controllers.siemens_syntax import (
+    PROTECTING,
+    SWITCHES,
     Assignment,
     TableParts,
     axis_of,
     read_assignments,
 )
 from compgen.controllers.terms import one_dimensional_terms, product_terms
-from compgen.core import tomlio
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -47,7 +48,7 @@ from compgen.core.points import Points
 from compgen.core.reversal import ReversalCurves
 from compgen.errors import CompgenWarning
 
-#: Variables of the tables without ``$``, with the number of their indices (K3-2013, p. 248-249).
+#: Variables of the tables and their switches without ``$``, with the number of their indices (K3-2013, p. 245-249).
 VARIABLES = {
     "AN_CEC": 2,
     "AN_CEC_INPUT_AXIS": 1,
@@ -58,52 +59,15 @@ VARIABLES = {
     "AN_CEC_DIRECTION": 1,
     "AN_CEC_MULT_BY_TABLE": 1,
     "AN_CEC_IS_MODULO": 1,
+    "MA_CEC_ENABLE": 1,
+    "SN_CEC_TABLE_ENABLE": 1,
+    "SN_CEC_TABLE_WEIGHT": 1,
 }
-_SIGN_MISSING = (
-    "is missing. Siemens' readable documents do not say whether the control adds or subtracts the sum of the tables: "
-    'test it at the machine (one table, both nodes 0.05: the axis moves by -0.05 for "error", by +0.05 for '
-    '"correction") and write sign = "error" or sign = "correction"'
-)
 _AXIS_VALUE = re.compile(r'\(\s*([A-Z0-9_]{1,32})\s*\)|"([A-Z0-9_]{1,32})"')
 #: Every output axis has three ordinary tables and, on every chain, at most three products.
 _ORDINARY_PER_AXIS = _PRODUCTS_PER_AXIS = 3
 #: Factors of a product have 9 decimals and stay below some mm: what their rounding may add up to on one axis.
 _FACTOR_ROUNDING_MM = 1e-8
-
-
-@dataclass(frozen=True)
-class CecSettings:
-    """Settings ``[controllers.siemens-cec]``.
-
-    Parameters
-    ----------
-    sign : ``"error"`` (the control subtracts the sum) or ``"correction"`` (it adds it).
-    mult_mode : S1 to S4, see :mod:`compgen.controllers.siemens_products`.
-    products : whether angular errors are exported as products of tables.
-    axis_names : names of X, Y, Z on the control.
-    axis_style : ``"paren"`` writes (AX1), ``"quote"`` writes "AX1".
-    step_mm : node distances that the user asks for, or None.
-    loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
-    max_points : nodes that the control can hold per table.
-    tables_available : tables that the control has, or None if that is not stated.
-    max_sum_mm : MD32720 of X, Y, Z in mm, or None if that is not stated.
-    """
-
-    sign: str
-    mult_mode: str
-    products: bool
-    axis_names: tuple[str, str, str]
-    axis_style: str
-    step_mm: tuple[float | None, ...]
-    loss_mm: float
-    max_points: int
-    tables_available: int | None
-    max_sum_mm: tuple[float, float, float] | None
-
-    @property
-    def subtracts(self) -> bool:
-        """Whether the control subtracts the sum of the tables from the command."""
-        return self.sign == "error"
 
 
 @dataclass(frozen=True)
@@ -122,43 +86,24 @@ class SiemensCec(Controller[CecSettings, CecTables]):
     def read_settings(self, machine: Machine) -> CecSettings:
         """Check the settings; ``sign`` is mandatory."""
         section = machine.controller_settings(self.name)
-        if "sign" not in section:
-            raise section.fail("sign", _SIGN_MISSING)
-        max_points = section.take("max_points", tomlio.whole(3, 100_000), 2000)
-        settings = CecSettings(
-            sign=section.take("sign", tomlio.choice("error", "correction")),
-            mult_mode=section.take("mult_mode", tomlio.choice(*MULT_MODES), "S1"),
-            products=section.take("products", tomlio.flag, True),
-            axis_names=take_axis_names(section),
-            axis_style=section.take("axis_style", tomlio.choice("paren", "quote"), "paren"),
-            step_mm=take_steps(section, machine, max_points),
-            loss_mm=take_loss_mm(section),
-            max_points=max_points,
-            tables_available=section.take("tables_available", tomlio.whole(1, 1000), None),
-            max_sum_mm=section.take("max_sum_mm", _max_sum, None),
-        )
+        settings = take_cec_settings(section, machine)
         section.finish()
         return settings
 
     def basis(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> list[Term]:
-        """Return nine tables output over axis, and the products with levers that count from the reference point."""
-        nodes = [
-            equidistant_grid(
-                machine,
-                errors,
-                axis,
-                most=settings.max_points,
-                step_mm=settings.step_mm[axis],
-                loss_mm=settings.loss_mm,
-            ).nodes_mm
-            for axis in range(3)
-        ]
-        pairs = [(output, axis) for output in range(3) for axis in range(3)]
-        if not settings.products:
-            return one_dimensional_terms(machine, errors, nodes, pairs)
-        origin = machine.reference_point_mm
-        ordinary = one_dimensional_terms(machine, errors, nodes, pairs, lever_origin_mm=origin)
-        return ordinary + product_terms(machine, errors, nodes, origin)
+        """Return nine tables output over axis, and the products with levers that count from the reference point.
+
+        If the control has fewer tables than that takes, those remain that leave the least error over the volume.
+        """
+        return self._choice(machine, settings, errors).kept
+
+    def left_out(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> list[str]:
+        """Return which tables the control has no room for, and what stays uncorrected for that, in words."""
+        return self._choice(machine, settings, errors).statements()
+
+    def _choice(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> Choice:
+        terms = cec_terms(machine, settings, errors, [(output, axis) for output in range(3) for axis in range(3)])
+        return chosen_terms(machine, errors, terms, settings.mult_mode, settings.tables_usable)
 
     def build(
         self, machine: Machine, settings: CecSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
@@ -195,6 +140,9 @@ class SiemensCec(Controller[CecSettings, CecTables]):
             "warnings": cec_warnings(machine, names, tables.tables, settings, sums),
             "sign": settings.sign,
             "mult_mode": settings.mult_mode,
+            "container": settings.container.kind,
+            "program_enables": settings.container.enables,
+            "outputs": [names[axis] for axis in sorted({entry.output_axis for entry in tables.tables.values()})],
             "has_products": any(entry.multiplier for entry in tables.tables.values()),
             "tables": [self._table_context(settings, index, entry) for index, entry in sorted(tables.tables.items())],
         }
@@ -211,24 +159,15 @@ class SiemensCec(Controller[CecSettings, CecTables]):
             "direction": entry.direction,
             "multiplier": entry.multiplier,
             "modulo": int(entry.table.modulo),
+            "enabled": int(entry.enabled),
+            "weight": float(entry.weight),
             "decimals": entry.decimals,
             "values_mm": [float(value) for value in entry.table.values],
         }
 
     def parse(self, machine: Machine, settings: CecSettings, files: Sequence[SourceFile]) -> CecTables:
         """Read the tables; every variable of a table must be there, because the control keeps old values."""
-        parts: dict[int, TableParts] = {}
-        for item in read_assignments(files, VARIABLES):
-            index = item.index_number(0, 999)
-            part = parts.setdefault(index, TableParts(f"table {index}", item.source))
-            part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
-        labels = labels_in(files)
-        return CecTables(
-            {
-                index: _read_table(part, settings.axis_names, labels.get(index, ""))
-                for index, part in sorted(parts.items())
-            }
-        )
+        return cec_tables_from(read_assignments(files, VARIABLES), files, settings)
 
     def emulate(self, machine: Machine, settings: CecSettings, tables: CecTables, points: Points) -> FloatArray:
         """Return what the control adds: the clipped sum of the tables, subtracted or added as ``sign`` says.
@@ -245,17 +184,9 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return -total if settings.subtracts else total
 
     def violations(self, machine: Machine, settings: CecSettings, tables: CecTables) -> list[str]:
-        """Return broken rules of the set, and sums above MD32720 if the machine file states it."""
+        """Return broken rules of the set, and sums above MD32720 or too fast for MD32730 if the file states them."""
         found = set_violations(machine, tables.tables, settings.max_points, settings.tables_available)
-        if settings.max_sum_mm is None:
-            return found
-        for axis, (value, place) in enumerate(largest_sums(machine, tables.tables, settings.mult_mode)):
-            if abs(value) > settings.max_sum_mm[axis]:
-                found.append(
-                    f"the sum into {settings.axis_names[axis]} reaches {value:+.6f} mm at X {place[0]:g} Y {place[1]:g} "
-                    f"Z {place[2]:g}; MD32720 clips it at {settings.max_sum_mm[axis]:g} mm"
-                )
-        return found
+        return found + stated_limit_violations(machine, tables.tables, settings)
 
     def table_nodes_mm(self, machine: Machine, settings: CecSettings, tables: CecTables) -> tuple[FloatArray, ...]:
         """Return the nodes of all tables by their input axis."""
@@ -271,20 +202,54 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return ordinary + settings.products * (_PRODUCTS_PER_AXIS * NEGLIGIBLE_PRODUCT_MM + _FACTOR_ROUNDING_MM)
 
 
-def _max_sum(value: Any) -> tuple[float, float, float]:
-    """MD32720 in mm: one number above zero for all axes, or a table with X, Y and Z."""
-    if isinstance(value, dict):
-        if set(value) != set(AXES):
-            raise ValueError("one number, or a table { X = ..., Y = ..., Z = ... }, is expected")
-        x, y, z = (tomlio.positive(value[axis]) for axis in AXES)
-        return x, y, z
-    number = tomlio.positive(value)
-    return number, number, number
-
-
 def _styled(settings: CecSettings, axis: int) -> str:
     name = settings.axis_names[axis]
     return f"({name})" if settings.axis_style == "paren" else f'"{name}"'
+
+
+def cec_terms(
+    machine: Machine, settings: CecSettings, errors: ErrorTable, pairs: Sequence[tuple[int, int]]
+) -> list[Term]:
+    """Return the terms of tables output over axis for the pairs, and of the products unless the settings forbid them."""
+    nodes = [
+        equidistant_grid(
+            machine, errors, axis, most=settings.max_points, step_mm=settings.step_mm[axis], loss_mm=settings.loss_mm
+        ).nodes_mm
+        for axis in range(3)
+    ]
+    if not settings.products:
+        return one_dimensional_terms(machine, errors, nodes, pairs)
+    origin = machine.reference_point_mm
+    ordinary = one_dimensional_terms(machine, errors, nodes, pairs, lever_origin_mm=origin)
+    return ordinary + product_terms(machine, errors, nodes, origin)
+
+
+def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], settings: CecSettings) -> CecTables:
+    """Return the tables that assignments make; ``files`` are looked at for the names of the tables in comments."""
+    parts: dict[int, TableParts] = {}
+    switches: dict[tuple[str, int], Assignment] = {}
+    for item in items:
+        if item.variable in PROTECTING:
+            axis_of(item, item.index[-1], settings.axis_names)
+            continue
+        index = item.index_number(0, 999)
+        if item.variable in SWITCHES:
+            switches[item.variable, index] = item
+            continue
+        part = parts.setdefault(index, TableParts(f"table {index}", item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
+    labels = labels_in(files)
+    found = {
+        index: _read_table(part, settings.axis_names, labels.get(index, "")) for index, part in sorted(parts.items())
+    }
+    for (variable, index), item in switches.items():
+        if variable == "SN_CEC_TABLE_ENABLE" and index in found:
+            found[index] = replace(found[index], enabled=item.whole(0, 1) == 1)
+        elif index in found:
+            found[index] = replace(found[index], weight=item.number())
+        elif item.number() != 0:
+            raise item.fail(f"the files hold no table {index}")
+    return CecTables(found)
 
 
 def _read_table(part: TableParts, axis_names: Sequence[str], label: str) -> CecTable:
@@ -298,8 +263,8 @@ def _read_table(part: TableParts, axis_names: Sequence[str], label: str) -> CecT
         table,
         direction,
         multiplier,
-        written_decimals(table),
-        label,
+        decimals=written_decimals(table),
+        label=label,
     )
 
 
@@ -312,7 +277,7 @@ def _axis_value(item: Assignment, axis_names: Sequence[str]) -> int:
 
 def _output(entry: CecTable, points: Points) -> FloatArray:
     """Interpolated value of one table at the points, zero where its direction of travel is not the last one."""
-    value = entry.table.at(points.position_mm[:, entry.input_axis])
+    value = entry.at(points.position_mm[:, entry.input_axis])
     if entry.direction == 0:
         return value
     travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, entry.input_axis])

@@ -15,10 +15,13 @@ from typing import Any
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
-from compgen.controllers.grids import equidistant_grid, take_loss_mm
+from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.siemens_profiles import PROFILES
 from compgen.controllers.siemens_reversal import plain_backlash_rows
-from compgen.controllers.siemens_settings import take_axis_names, take_steps
+from compgen.controllers.siemens_settings import EecSettings, take_eec_settings
 from compgen.controllers.siemens_syntax import (
+    SWITCHES,
+    Assignment,
     LinearTable,
     TableParts,
     axis_of,
@@ -27,7 +30,6 @@ from compgen.controllers.siemens_syntax import (
     table_violations,
 )
 from compgen.controllers.terms import one_dimensional_terms
-from compgen.core import tomlio
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -42,38 +44,16 @@ VARIABLES = {
     "AA_ENC_COMP_MIN": 2,
     "AA_ENC_COMP_MAX": 2,
     "AA_ENC_COMP_IS_MODULO": 2,
+    "MA_ENC_COMP_ENABLE": 2,
 }
 BYTES_PER_VALUE = 8
-_NODES_OF_808D = 200
-
-
-@dataclass(frozen=True)
-class EecSettings:
-    """Settings ``[controllers.siemens-eec]``.
-
-    Parameters
-    ----------
-    encoder : 0 for measuring system 1, 1 for measuring system 2.
-    axis_names : names of X, Y, Z on the control.
-    step_mm : node distances that the user asks for, or None.
-    loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
-    max_points : nodes that the control can hold per axis and measuring system.
-    decimals : digits after the point of the values in mm.
-    """
-
-    encoder: int
-    axis_names: tuple[str, str, str]
-    step_mm: tuple[float | None, ...]
-    loss_mm: float
-    max_points: int
-    decimals: int
 
 
 @dataclass(frozen=True)
 class EecTables:
-    """Tables by axis 0..2; the values are errors in mm (actual minus nominal), as the file has them."""
+    """Tables by (axis 0..2, encoder); the values are errors in mm (actual minus nominal), as the file has them."""
 
-    tables: Mapping[int, LinearTable]
+    tables: Mapping[tuple[int, int], LinearTable]
 
 
 class SiemensEec(Controller[EecSettings, EecTables]):
@@ -85,34 +65,13 @@ class SiemensEec(Controller[EecSettings, EecTables]):
     def read_settings(self, machine: Machine) -> EecSettings:
         """Check the settings; all have defaults."""
         section = machine.controller_settings(self.name)
-        max_points = section.take("max_points", tomlio.whole(3, 100_000), 5000)
-        settings = EecSettings(
-            encoder=section.take("encoder", tomlio.whole(0, 1), 0),
-            axis_names=take_axis_names(section),
-            step_mm=take_steps(section, machine, max_points),
-            loss_mm=take_loss_mm(section),
-            max_points=max_points,
-            decimals=section.take("decimals", tomlio.whole(3, 9), 6),
-        )
+        settings = take_eec_settings(section, machine)
         section.finish()
         return settings
 
     def basis(self, machine: Machine, settings: EecSettings, errors: ErrorTable) -> list[Term]:
         """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node."""
-        nodes = [
-            equidistant_grid(
-                machine,
-                errors,
-                axis,
-                most=settings.max_points,
-                step_mm=settings.step_mm[axis],
-                anchor=True,
-                loss_mm=settings.loss_mm,
-                output=axis,
-            ).nodes_mm
-            for axis in range(3)
-        ]
-        return one_dimensional_terms(machine, errors, nodes, [(axis, axis) for axis in range(3)], anchored=True)
+        return eec_terms(machine, settings, errors)
 
     def build(
         self, machine: Machine, settings: EecSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
@@ -124,7 +83,9 @@ class SiemensEec(Controller[EecSettings, EecTables]):
             quantum = 10**settings.decimals
             counts = np.rint(-np.asarray(values[term.name]) * quantum).astype(np.int64)
             numbers = tuple(Decimal(int(count)).scaleb(-settings.decimals) for count in counts)
-            tables[term.carrier[0].output] = LinearTable(start, step, last, numbers)
+            axis = term.carrier[0].output
+            for encoder in settings.encoders[axis]:
+                tables[axis, encoder] = LinearTable(start, step, last, numbers)
         return EecTables(tables)
 
     def context(self, machine: Machine, settings: EecSettings, tables: EecTables) -> dict[str, Any]:
@@ -133,24 +94,29 @@ class SiemensEec(Controller[EecSettings, EecTables]):
             "sign_statement": self._sign_statement(settings, tables),
             "parameters": self._parameters(settings, tables),
             "warnings": self._warnings(machine, settings, tables),
-            "encoder": settings.encoder,
+            "container": settings.container.kind,
+            "program_enables": settings.container.enables,
+            "active": [
+                f"{name}: {encoder + 1}" for name, encoder in zip(settings.axis_names, settings.active, strict=True)
+            ],
             "decimals": settings.decimals,
             "tables": [
                 {
                     "letter": AXES[axis],
                     "axis": settings.axis_names[axis],
+                    "encoder": encoder,
                     "minimum_mm": float(table.start_mm),
                     "maximum_mm": float(table.last_mm),
                     "step_mm": float(table.step_mm),
                     "modulo": int(table.modulo),
                     "values_mm": [float(value) for value in table.values],
                 }
-                for axis, table in sorted(tables.tables.items())
+                for (axis, encoder), table in sorted(tables.tables.items())
             ],
         }
 
     def _sign_statement(self, settings: EecSettings, tables: EecTables) -> str:
-        axis, table = max(tables.tables.items(), key=lambda item: float(np.max(np.abs(item[1].numbers))))
+        (axis, _), table = max(tables.tables.items(), key=lambda item: float(np.max(np.abs(item[1].numbers))))
         node = int(np.argmax(np.abs(table.numbers)))
         value = float(table.values[node])
         return (
@@ -162,11 +128,11 @@ class SiemensEec(Controller[EecSettings, EecTables]):
 
     def _parameters(self, settings: EecSettings, tables: EecTables) -> list[dict[str, str]]:
         rows = []
-        for axis, table in sorted(tables.tables.items()):
+        for (axis, encoder), table in sorted(tables.tables.items()):
             name, count = settings.axis_names[axis], len(table.values)
             rows.append(
                 {
-                    "name": f"MD38000 $MA_MM_ENC_COMP_MAX_POINTS[{settings.encoder},{name}]",
+                    "name": f"MD38000 $MA_MM_ENC_COMP_MAX_POINTS[{encoder},{name}]",
                     "value": f">= {count}",
                     "meaning": f"reserved nodes; {count * BYTES_PER_VALUE} bytes of static memory, which the change "
                     "re-formats: save all data first",
@@ -174,7 +140,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
             )
             rows.append(
                 {
-                    "name": f"MD32700 $MA_ENC_COMP_ENABLE[{settings.encoder}] of {name}",
+                    "name": f"MD32700 $MA_ENC_COMP_ENABLE[{encoder}] of {name}",
                     "value": "0, then 1",
                     "meaning": "0 while the file is loaded; 1 makes the table act and write-protects it",
                 }
@@ -182,64 +148,116 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         return rows
 
     def _warnings(self, machine: Machine, settings: EecSettings, tables: EecTables) -> list[str]:
-        found = []
-        for axis, table in sorted(tables.tables.items()):
+        found, small = [], PROFILES["808D"].eec_nodes
+        for (axis, encoder), table in sorted(tables.tables.items()):
+            name = settings.axis_names[axis]
             at_reference = float(table.at(np.array([machine.reference_point_mm[axis]]))[0])
             if abs(at_reference) > self.resolution_mm(settings):
                 found.append(
-                    f"{settings.axis_names[axis]}: the table holds {at_reference:+.6f} mm at the reference point; the "
-                    "axis jumps by it when the compensation is enabled"
+                    f"{name}: the table holds {at_reference:+.6f} mm at the reference point; the axis jumps by it when "
+                    "the compensation is enabled"
                 )
-            if len(table.values) > _NODES_OF_808D:
+            if len(table.values) > small and settings.max_points > small:
+                found.append(f"{name}: {len(table.values)} nodes; a SINUMERIK 808D holds {small}")
+            if encoder != settings.active[axis]:
                 found.append(
-                    f"{settings.axis_names[axis]}: {len(table.values)} nodes; a SINUMERIK 808D holds {_NODES_OF_808D}"
+                    f"{name}: the table of measuring system {encoder + 1} holds the same errors as that of measuring "
+                    f"system {settings.active[axis] + 1}; it is right only if they were measured with either, or the "
+                    "errors are those of the guideway"
                 )
+        if not settings.max_points_known:
+            found.append(
+                f"how many nodes this model holds is not documented; {settings.max_points} are taken as the limit, the "
+                "smallest number documented for any model: state max_points"
+            )
         return found
 
     def parse(self, machine: Machine, settings: EecSettings, files: Sequence[SourceFile]) -> EecTables:
         """Read the tables of the machine's axes; an axis without any assignment has no table."""
-        parts: dict[int, TableParts] = {}
-        for item in read_assignments(files, VARIABLES):
-            encoder = item.index_number(0, 1)
-            if encoder != settings.encoder:
-                raise item.fail(f"belongs to encoder {encoder}; the machine file has encoder = {settings.encoder}")
-            axis = axis_of(item, item.index[-1], settings.axis_names)
-            part = parts.setdefault(axis, TableParts(f"table of {settings.axis_names[axis]}", item.source))
-            part.add(item, item.index_number(1, 999_999) if item.variable == "AA_ENC_COMP" else None)
-        return EecTables({axis: part.table("$AA_ENC_COMP") for axis, part in sorted(parts.items())})
+        return eec_tables_from(read_assignments(files, VARIABLES), settings)
 
     def emulate(self, machine: Machine, settings: EecSettings, tables: EecTables, points: Points) -> FloatArray:
-        """Return minus the interpolated table values: the control corrects the actual position by them."""
+        """Return minus the interpolated values of the active measuring system: the actual position is corrected by it."""
         correction = np.zeros((len(points), 3))
-        for axis, table in tables.tables.items():
-            correction[:, axis] = -table.at(points.position_mm[:, axis])
+        for (axis, encoder), table in tables.tables.items():
+            if encoder == settings.active[axis]:
+                correction[:, axis] = -table.at(points.position_mm[:, axis])
         return correction
 
     def violations(self, machine: Machine, settings: EecSettings, tables: EecTables) -> list[str]:
-        """Return broken rules of the tables: whole number of steps, node count, travel."""
+        """Return broken rules of the tables: whole number of steps, node count, travel, a missing measuring system."""
         found: list[str] = []
-        for axis, table in sorted(tables.tables.items()):
+        for (axis, encoder), table in sorted(tables.tables.items()):
             what = f"the table of {settings.axis_names[axis]}"
+            what += f", measuring system {encoder + 1}" if len(settings.encoders[axis]) > 1 else ""
             found += table_violations(machine, axis, table, settings.max_points, what)
+        for axis in sorted({axis for axis, _ in tables.tables}):
+            found += [
+                f"{settings.axis_names[axis]} has no table for measuring system {encoder + 1}"
+                for encoder in settings.encoders[axis]
+                if (axis, encoder) not in tables.tables
+            ]
         return found
 
     def table_nodes_mm(self, machine: Machine, settings: EecSettings, tables: EecTables) -> tuple[FloatArray, ...]:
         """Return the nodes of each axis."""
-        return nodes_by_axis((axis, table.nodes_mm) for axis, table in tables.tables.items())
+        return nodes_by_axis((axis, table.nodes_mm) for (axis, _), table in tables.tables.items())
 
     def backlash_parameters(
         self, machine: Machine, settings: EecSettings, reversal: ReversalCurves
     ) -> list[dict[str, str]]:
         """Return MD32450 of each axis with a reversal along itself."""
-        return plain_backlash_rows(reversal, settings.axis_names, settings.encoder)
+        return plain_backlash_rows(reversal, settings.axis_names, settings.encoders)
 
     def usage(self, machine: Machine, settings: EecSettings, tables: EecTables) -> list[Usage]:
         """Return the nodes of each axis against what the control can hold."""
         return [
             Usage(f"nodes of {settings.axis_names[axis]}", len(table.values), settings.max_points, "nodes")
-            for axis, table in sorted(tables.tables.items())
+            for (axis, _), table in sorted(tables.tables.items())
         ]
 
     def resolution_mm(self, settings: EecSettings) -> float:
         """Half of the last decimal."""
         return 0.5 * 10.0**-settings.decimals
+
+
+def eec_terms(
+    machine: Machine, settings: EecSettings, errors: ErrorTable, lever_origin_mm: Sequence[float] | None = None
+) -> list[Term]:
+    """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node of their grids.
+
+    ``lever_origin_mm`` as in :func:`compgen.controllers.terms.one_dimensional_terms`.
+    """
+    nodes = [
+        equidistant_grid(
+            machine,
+            errors,
+            axis,
+            most=settings.max_points,
+            step_mm=settings.step_mm[axis],
+            anchor=True,
+            loss_mm=settings.loss_mm,
+            output=axis,
+        ).nodes_mm
+        for axis in range(3)
+    ]
+    pairs = [(axis, axis) for axis in range(3)]
+    return one_dimensional_terms(machine, errors, nodes, pairs, anchored=True, lever_origin_mm=lever_origin_mm)
+
+
+def eec_tables_from(items: Sequence[Assignment], settings: EecSettings) -> EecTables:
+    """Return the tables that assignments make; InputError for an encoder that the settings do not have."""
+    parts: dict[tuple[int, int], TableParts] = {}
+    for item in items:
+        encoder = item.index_number(0, 1)
+        axis = axis_of(item, item.index[-1], settings.axis_names)
+        own = settings.encoders[axis]
+        if encoder not in own:
+            stated = own[0] if len(own) == 1 else list(own)
+            raise item.fail(f"belongs to encoder {encoder}; the machine file has encoder = {stated}")
+        if item.variable in SWITCHES:
+            continue
+        what = f"table of {settings.axis_names[axis]}" + (f", encoder {encoder}" if len(own) > 1 else "")
+        part = parts.setdefault((axis, encoder), TableParts(what, item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AA_ENC_COMP" else None)
+    return EecTables({key: part.table("$AA_ENC_COMP") for key, part in sorted(parts.items())})

@@ -13,13 +13,12 @@ import numpy as np
 
 from compgen.controllers.base import Usage
 from compgen.controllers.siemens_products import CecMap, CecTable, sum_into_axes
+from compgen.controllers.siemens_profiles import DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT
 from compgen.controllers.siemens_syntax import table_violations
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 
-#: Defaults of MD32720 (mm) and MD32730 (%) as far as they are known.
-DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT = 1.0, 10.0
 _MOST_POSITIONS = 81
 _MOST_ACROSS = 21
 
@@ -43,7 +42,7 @@ def _sums(tables: CecMap, mode: str, positions: Sequence[FloatArray], travel: Se
     for index, entry in tables.items():
         axis = entry.input_axis
         acts = entry.direction in (0, travel[axis])
-        value = entry.table.at(positions[axis]) * float(acts)
+        value = entry.at(positions[axis]) * float(acts)
         outputs[index] = np.expand_dims(value, tuple(other for other in range(3) if other != axis))
     shape = tuple(len(along) for along in positions)
     return [np.broadcast_to(total, shape) for total in sum_into_axes(tables, mode, outputs)]
@@ -108,6 +107,43 @@ def _reference_violations(tables: CecMap, index: int, entry: CecTable, what: str
             found.append(f"{what}: MULT_BY_TABLE names table number {entry.multiplier}, which does not exist")
         elif other.table.modulo != entry.table.modulo:
             found.append(f"{what}: it and its multiplier {entry.multiplier - 1} are not both cyclic or both not")
+    factors = {other.multiplier - 1 for other in tables.values() if other.multiplier}
+    if (entry.multiplier or index in factors) and (entry.weight != 1 or not entry.enabled):
+        found.append(
+            f"{what} is a factor of a product, with SD41300 = {int(entry.enabled)} and SD41310 = {entry.weight}; what "
+            "the product is then is not documented: both must be 1"
+        )
+    return found
+
+
+def speed_percent(slopes: FloatArray, output: int, max_speed_mm_min: Sequence[float]) -> float:
+    """Return how fast the sum into an axis changes, in % of the axis' own largest speed, all bases at theirs.
+
+    Rule: largest change per travel, times the speed of the base, against MD32730 / 100 times MD32000 of the output.
+    """
+    speeds = np.asarray(max_speed_mm_min, dtype=np.float64)
+    return float(100.0 * np.sum(slopes[output] * speeds) / speeds[output])
+
+
+def stated_limit_violations(machine: Machine, tables: CecMap, limits: StatedLimits) -> list[str]:
+    """Return where the sums exceed MD32720, or change faster than MD32730, as far as these are stated."""
+    found = []
+    if limits.max_sum_mm is not None:
+        for axis, (value, place) in enumerate(largest_sums(machine, tables, limits.mult_mode)):
+            if abs(value) > limits.max_sum_mm[axis]:
+                found.append(
+                    f"the sum into {limits.axis_names[axis]} reaches {value:+.6f} mm at X {place[0]:g} Y {place[1]:g} "
+                    f"Z {place[2]:g}; MD32720 clips it at {limits.max_sum_mm[axis]:g} mm"
+                )
+    if limits.max_velo_percent is not None:
+        slopes = largest_slopes(machine, tables, limits.mult_mode)
+        for axis, allowed in enumerate(limits.max_velo_percent):
+            percent = speed_percent(slopes, axis, limits.max_speed_mm_min)
+            if percent > allowed:
+                found.append(
+                    f"the sum into {limits.axis_names[axis]} changes by up to {percent:.4f} % of the axis' largest "
+                    f"speed; MD32730 allows {allowed:g} %"
+                )
     return found
 
 
@@ -131,6 +167,14 @@ class StatedLimits(Protocol):
         """MD32720."""
 
     @property
+    def max_velo_percent(self) -> tuple[float, float, float] | None:
+        """MD32730."""
+
+    @property
+    def max_speed_mm_min(self) -> tuple[float, float, float]:
+        """MD32000."""
+
+    @property
     def axis_names(self) -> tuple[str, str, str]:
         """Names of X, Y, Z on the control."""
 
@@ -145,7 +189,8 @@ def cec_usage(machine: Machine, tables: CecMap, limits: StatedLimits) -> list[Us
     for axis in sorted({entry.output_axis for entry in tables.values()}):
         name, stated = limits.axis_names[axis], limits.max_sum_mm is not None
         most_mm = DEFAULT_MAX_SUM_MM if limits.max_sum_mm is None else limits.max_sum_mm[axis]
-        percent = 100.0 * float(np.sum(slopes[axis]))
+        percent, velo = speed_percent(slopes, axis, limits.max_speed_mm_min), limits.max_velo_percent
+        most_percent = DEFAULT_MAX_VELO_PERCENT if velo is None else velo[axis]
         found.append(Usage(f"sum into {name} (MD32720)", abs(sums[axis][0]), most_mm, "mm", stated))
-        found.append(Usage(f"change of the sum of {name} (MD32730)", percent, DEFAULT_MAX_VELO_PERCENT, "%", False))
+        found.append(Usage(f"change of the sum of {name} (MD32730)", percent, most_percent, "%", velo is not None))
     return found

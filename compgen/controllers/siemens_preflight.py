@@ -7,15 +7,13 @@ from typing import Protocol
 
 import numpy as np
 
-from compgen.controllers.siemens_limits import DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT, largest_slopes
+from compgen.controllers.siemens_limits import largest_slopes, speed_percent
 from compgen.controllers.siemens_products import CecMap, sum_into_axes
+from compgen.controllers.siemens_profiles import DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT, PROFILES
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 
 Sums = Sequence[tuple[float, tuple[float, float, float]]]
-
-#: SINUMERIK 828D (K3-2013, p. 264).
-_TABLES_OF_828D, _NODES_OF_828D = 8, 200
 
 
 class CecLimits(Protocol):
@@ -32,6 +30,14 @@ class CecLimits(Protocol):
     @property
     def max_sum_mm(self) -> tuple[float, float, float] | None:
         """MD32720."""
+
+    @property
+    def max_velo_percent(self) -> tuple[float, float, float] | None:
+        """MD32730."""
+
+    @property
+    def max_speed_mm_min(self) -> tuple[float, float, float]:
+        """MD32000."""
 
 
 #: A jump of an axis at switch-on below this is not worth a warning.
@@ -105,16 +111,20 @@ def cec_warnings(machine: Machine, names: Sequence[str], tables: CecMap, limits:
                 f"{names[axis]}: the sum reaches {value:+.4f} mm; the usual MD32720 is {DEFAULT_MAX_SUM_MM:g} mm and "
                 "would clip it"
             )
+    small = PROFILES["828D"]
     needed, nodes = max(tables) + 1, max(len(entry.table.values) for entry in tables.values())
-    if limits.tables_available is None and (needed > _TABLES_OF_828D or nodes > _NODES_OF_828D):
+    if limits.tables_available is None and (needed > (small.cec_tables or 0) or nodes > (small.cec_nodes or 0)):
         found.append(
-            f"{needed} tables with up to {nodes} nodes: a SINUMERIK 828D has {_TABLES_OF_828D} tables of "
-            f"{_NODES_OF_828D} nodes, an 840D sl twice as many tables as axes; state tables_available"
+            f"{needed} tables with up to {nodes} nodes: a SINUMERIK 828D has {small.cec_tables} tables of "
+            f"{small.cec_nodes} nodes, an 840D sl twice as many tables as axes; state profile, and nc_axes or "
+            "tables_available"
         )
-    for axis, slopes in enumerate(largest_slopes(machine, tables, limits.mult_mode)):
-        if 100.0 * float(np.sum(slopes)) > DEFAULT_MAX_VELO_PERCENT:
+    slopes = largest_slopes(machine, tables, limits.mult_mode)
+    for axis in range(3):
+        percent = speed_percent(slopes, axis, limits.max_speed_mm_min)
+        if limits.max_velo_percent is None and percent > DEFAULT_MAX_VELO_PERCENT:
             found.append(
-                f"{names[axis]}: the sum changes by up to {float(np.sum(slopes)):.3g} mm per mm of travel; the usual "
+                f"{names[axis]}: the sum changes by up to {percent / 100.0:.3g} mm per mm of travel; the usual "
                 f"MD32730 is {DEFAULT_MAX_VELO_PERCENT:g} % and would make it lag behind"
             )
     return found + _jumps(machine, names, tables, limits.mult_mode)
@@ -122,7 +132,7 @@ def cec_warnings(machine: Machine, names: Sequence[str], tables: CecMap, limits:
 
 def _jumps(machine: Machine, names: Sequence[str], tables: CecMap, mode: str) -> list[str]:
     at_reference = {
-        index: entry.table.at(np.array(machine.reference_point_mm[entry.input_axis])) for index, entry in tables.items()
+        index: entry.at(np.array(machine.reference_point_mm[entry.input_axis])) for index, entry in tables.items()
     }
     totals = [float(total) for total in sum_into_axes(tables, mode, at_reference)]
     return [

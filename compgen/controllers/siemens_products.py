@@ -50,8 +50,8 @@ _UNITS_PER_MM_QUANTUM = 10 ** (FACTOR_DECIMALS - MM_DECIMALS)
 class CecTable:
     """One table: output over input axis (0..2); ``multiplier`` is the NUMBER (index + 1) of the other factor, or 0.
 
-    ``direction`` is 0 (both), 1 or -1: the travel of the input axis in which the table acts. ``decimals`` and
-    ``label`` are for writing only.
+    ``direction`` is 0 (both), 1 or -1: the travel of the input axis in which the table acts. ``enabled`` is SD41300,
+    ``weight`` SD41310. ``decimals`` and ``label`` are for writing only.
     """
 
     input_axis: int
@@ -59,8 +59,16 @@ class CecTable:
     table: LinearTable
     direction: int = 0
     multiplier: int = 0
+    enabled: bool = True
+    weight: Decimal = Decimal(1)
     decimals: int = field(default=MM_DECIMALS, compare=False)
     label: str = field(default="", compare=False)
+
+    def at(self, position_mm: FloatArray) -> FloatArray:
+        """Weighted interpolated value at positions of any shape, 0 if the table is switched off."""
+        if not self.enabled:
+            return np.zeros(np.shape(position_mm))
+        return self.table.at(position_mm) * float(self.weight)
 
 
 CecMap = Mapping[int, CecTable]

@@ -7,6 +7,7 @@ travel, so the correction is -B/2 in the table with DIRECTION 1 and +B/2 in the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal
 
@@ -93,7 +94,9 @@ def backlash_rows(tables: CecMap, names: tuple[str, ...]) -> list[dict[str, str]
     ]
 
 
-def plain_backlash_rows(reversal: ReversalCurves, names: tuple[str, ...], encoder: int) -> list[dict[str, str]]:
+def plain_backlash_rows(
+    reversal: ReversalCurves, names: tuple[str, ...], encoders: Sequence[Sequence[int]]
+) -> list[dict[str, str]]:
     """Return MD32450 for the mean reversal of each axis along itself: positive where the tool stops short.
 
     Source: MD32450 is positive if the encoder leads the machine part (SINUMERIK parameter manuals), the usual case;
@@ -107,5 +110,6 @@ def plain_backlash_rows(reversal: ReversalCurves, names: tuple[str, ...], encode
             "value was active while the machine was measured, add this one to it",
         }
         for axis in range(3)
+        for encoder in encoders[axis]
         if abs(reversal.mean_mm(axis)) >= WORTH_MM
     ]

@@ -2,9 +2,12 @@
 
 Lexical grammar (SINUMERIK 840D sl / 828D Extended Functions K3, 03/2013, p. 242; 802D sl Function Manual, p. 222)::
 
-    file       = [ "%_N_" name "_INI" ] [ "CHANDATA(" int ")" ] { assignment | ";" comment } "M17"
+    file       = [ "%_N_" name "_INI" ] [ "CHANDATA(" int ")" ] { assignment | "NEWCONF" | ";" comment } "M17"
     assignment = "$" variable "[" index { "," index } "]" "=" value [ ";" comment ]
     value      = number without exponent | "(" axis name ")" | axis name in quotation marks
+
+The same assignments may stand in a sub-program (name ``..._SPF``) that switches the function off before them, makes
+that effective by NEWCONF, and may switch it on again behind them.
 """
 
 from __future__ import annotations
@@ -27,6 +30,17 @@ from compgen.errors import CompgenWarning, InputError
 #: Positions of nodes are written in whole multiples of this.
 POSITION_QUANTUM_MM = Decimal("0.000001")
 POSITION_DIGITS = 6
+
+#: Switches that may stand among the tables, without ``$``, with the number of their indices (K3-2013, p. 239, 245).
+SWITCHES = {
+    "MA_ENC_COMP_ENABLE": 2,
+    "MA_CEC_ENABLE": 1,
+    "SN_CEC_TABLE_ENABLE": 1,
+    "SN_CEC_TABLE_WEIGHT": 1,
+}
+#: Switches that write-protect the tables while they are 1 (MD32700, MD32710).
+PROTECTING = ("MA_ENC_COMP_ENABLE", "MA_CEC_ENABLE")
+MAKE_EFFECTIVE = "NEWCONF"
 
 _LONGEST_LINE = 1000
 _MOST_LINES = 200_000
@@ -89,26 +103,47 @@ def read_assignments(files: Sequence[SourceFile], index_counts: Mapping[str, int
     Parameters
     ----------
     files : the texts; each ends with ``M17``.
-    index_counts : the known variables, without ``$``, and how many indices each has.
+    index_counts : the known variables, without ``$``, and how many indices each has. Those of :data:`SWITCHES` may
+        be assigned several times; the last assignment is returned.
 
     Raises
     ------
     InputError
         with file and line for an unknown variable, a wrong number of indices, a second assignment to one variable,
-        text that is no assignment, a file that does not end with M17.
+        text that is no assignment, a table that is written while its function is on, a file that does not end with
+        M17.
     """
     seen: dict[tuple[str, tuple[str, ...]], Assignment] = {}
     for source in files:
-        for item in _assignments(source, index_counts):
+        for item in _unprotected(_assignments(source, index_counts)):
+            if item.variable in SWITCHES:
+                seen[item.variable, item.index] = item
+                continue
             first = seen.setdefault((item.variable, item.index), item)
             if first is not item:
                 where = (
                     f"{first.source.path}, line {first.line}" if first.source is not source else f"line {first.line}"
                 )
                 raise item.fail(f"is assigned a second time; the first is in {where}")
-    if not seen:
+    if not any(item.variable not in SWITCHES for item in seen.values()):
         raise files[0].fail("holds no table") if files else InputError("no file was given")
     return list(seen.values())
+
+
+def _unprotected(items: Iterator[Assignment]) -> Iterator[Assignment]:
+    """Pass the assignments on; a table that is written while the file itself has switched its function on is an error."""
+    on: dict[tuple[str, tuple[str, ...]], Assignment] = {}
+    for item in items:
+        if item.variable in PROTECTING:
+            on.pop((item.variable, item.index), None)
+            if item.whole(0, 1):
+                on[item.variable, item.index] = item
+        elif item.variable not in SWITCHES and on:
+            switch = next(iter(on.values()))
+            raise item.fail(
+                f"is written while {switch.label} is 1 (line {switch.line}): the control write-protects its tables then"
+            )
+        yield item
 
 
 def _code_lines(source: SourceFile) -> Iterator[tuple[int, str]]:
@@ -135,7 +170,7 @@ def _assignments(source: SourceFile, index_counts: Mapping[str, int]) -> Iterato
             raise source.fail(f"{code[:40]!r} stands after the end mark M17", number)
         if code == "M17":
             ended = True
-        elif not started and (_HEADER.fullmatch(code) or _CHANNEL.fullmatch(code)):
+        elif code == MAKE_EFFECTIVE or not started and (_HEADER.fullmatch(code) or _CHANNEL.fullmatch(code)):
             continue
         else:
             started = True

@@ -136,7 +136,7 @@ def export(
         rest = reversal.without(held)
         tables = control.with_reversal(machine, settings, tables, held) if held.curves else tables
     own = _with_backlash(control, machine, settings, control.context(machine, settings, tables), rest)
-    own = {**own, "warnings": [*own["warnings"], *machine.emphasis.notes]}
+    own = {**own, "warnings": [*own["warnings"], *control.left_out(machine, settings, errors), *machine.emphasis.notes]}
     common = export_context(machine, errors, controller, provenance or Provenance(), reversal)
     files = render_files(card, {**common, **own}, templates)
     described = [{"name": name, "sha256": sha256_of(text.encode("ascii", "replace"))} for name, text in files.items()]

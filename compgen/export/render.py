@@ -36,11 +36,15 @@ _TEMPLATE_FAULTS = (
 
 @dataclass(frozen=True)
 class FileSpec:
-    """One file of a format: its template, its name, and its line end."""
+    """One file of a format: its template, its name, and its line end.
+
+    A file with a ``variant`` is written only where the control's context says ``container = <variant>``.
+    """
 
     template: str
     name: str
     line_end: str
+    variant: str = ""
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,7 @@ def _read_format(path: Path, name: str) -> Format:
             template=section.take("template", tomlio.text),
             name=section.take("name", _file_name),
             line_end={"lf": "\n", "crlf": "\r\n"}[section.take("line_end", tomlio.choice("lf", "crlf"), "lf")],
+            variant=section.take("variant", tomlio.text, ""),
         )
         section.finish()
         files.append(spec)
@@ -222,6 +227,8 @@ def render_files(card: Format, context: Mapping[str, Any], folder: Path | None =
     """Render every file of a format and return the texts by file name, with the format's line ends."""
     texts = {}
     for spec in card.files:
+        if spec.variant and spec.variant != context.get("container"):
+            continue
         text = render(card, spec.template, context, folder)
         texts[spec.name] = text.replace("\n", spec.line_end) if spec.line_end != "\n" else text
     return texts
