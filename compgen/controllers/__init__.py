@@ -6,11 +6,12 @@ from compgen.controllers.base import AnyController, Controller, Monomial, Source
 from compgen.controllers.etalon_exchange import EtalonExchange
 from compgen.controllers.fanuc_pitch import FanucPitch
 from compgen.controllers.heidenhain_com import HeidenhainCom
+from compgen.controllers.heidenhain_kinematics import HeidenhainKinematics
 from compgen.controllers.isg_csv import IsgCsv
 from compgen.controllers.linuxcnc_comp import LinuxcncComp
 from compgen.controllers.linuxcnc_volumetric import LinuxcncVolumetric
-from compgen.controllers.pmac import Pmac
 from compgen.controllers.mitsubishi import Mitsubishi
+from compgen.controllers.pmac import Pmac
 from compgen.controllers.siemens_cec import SiemensCec
 from compgen.controllers.siemens_eec import SiemensEec
 from compgen.controllers.twincat_lists import TwincatLists
@@ -24,6 +25,7 @@ CONTROLLERS: dict[str, AnyController] = {
     "etalon-exchange": EtalonExchange(),
     "fanuc-pitch": FanucPitch(),
     "heidenhain-com": HeidenhainCom(),
+    "heidenhain-kinematics": HeidenhainKinematics(),
     "mitsubishi": Mitsubishi(),
     "siemens-cec": SiemensCec(),
     "siemens-eec": SiemensEec(),
