@@ -207,17 +207,19 @@ def grid_kernel(tilted: bool) -> Callable[..., None]:
 
     @_inline
     def four_of_row(constant: Any, slope: Any, height: Any, own: Any, y: Any, side: Any, lane: Any, at: Any) -> Row:
-        total = _plus(_four(constant, lane), _times(_four(slope, lane), height))
+        total = _plus(_four(constant, lane), _times(_four(slope, lane), _four(height, at)))
         total = _plus(total, _four(own, at))
         return _plus_times(total, y, _four(side, at)) if tilted else total
 
     def kernel(x: Any, y: Any, z: Any, along_x: Any, along_y: Any, along_z: Any, out: Any) -> None:
         constant, slope, flat, start = np.empty(12), np.empty(12), out.reshape(out.size), np.uint64(0)
-        own, side, length = np.empty(3 * len(z)), np.empty(3 * len(z)), np.uint64(3 * len(z))
-        zero, three, four, eight = np.uint64(0), np.uint64(3), np.uint64(4), np.uint64(8)
+        length, eight = np.uint64(3 * len(z)), np.uint64(8)
+        own, side, height = np.empty(3 * len(z)), np.empty(3 * len(z)), np.empty(3 * len(z))
+        zero, three, four, twelve = np.uint64(0), np.uint64(3), np.uint64(4), np.uint64(12)
         for k in range(len(z)):
             for o in range(3):
                 side[3 * k + o] = along_z[k, 2, o]
+                height[3 * k + o] = z[k]
         for i in range(len(x)):
             for k in range(len(z)):
                 for o in range(3):
@@ -227,20 +229,16 @@ def grid_kernel(tilted: bool) -> Callable[..., None]:
                 for k in range(0, 12, 3):
                     constant[k], constant[k + 1], constant[k + 2] = p0, p1, p2
                     slope[k], slope[k + 1], slope[k + 2] = q0, q1, q2
-                at = level = zero
-                while at + eight + four <= length:
-                    a, b, c, d = _four(z, level)
-                    _store(flat, start + at, four_of_row(constant, slope, (a, a, a, b), own, y[j], side, zero, at))
-                    at, level = at + four, level + four
-                    _store(flat, start + at, four_of_row(constant, slope, (b, b, c, c), own, y[j], side, four, at))
-                    at += four
-                    _store(flat, start + at, four_of_row(constant, slope, (c, d, d, d), own, y[j], side, eight, at))
-                    at += four
+                at = zero
+                while at + twelve <= length:
+                    for lane in (zero, four, eight):
+                        _store(flat, start + at, four_of_row(constant, slope, height, own, y[j], side, lane, at))
+                        at += four
                 while at < length:
                     for o in range(three):
-                        value = constant[o] + slope[o] * z[level] + own[at + o]
+                        value = constant[o] + slope[o] * height[at] + own[at + o]
                         flat[start + at + o] = value + y[j] * side[at + o] if tilted else value
-                    at, level = at + three, level + np.uint64(1)
+                    at += three
                 start += length
 
     levels = types.Array(types.float64, 1, "C", readonly=True)

@@ -21,7 +21,7 @@ from compgen.core.machine import Machine
 from compgen.core.threads import one_thread
 from compgen.errors import InputError
 from compgen.model import kernels
-from compgen.model.tables import COORDINATES, ONE, AxisTables, field_tables
+from compgen.model.tables import ONE, AxisTables, field_tables, grid_tables
 from compgen.model.volumetric import tool_of
 
 #: Points that are worked on together: their intermediate arrays stay in the cache of one core.
@@ -155,8 +155,7 @@ def volumetric_error_on_grid(
     result = checked_out(out, shape)
     if result.size == 0:
         return result
-    tables = field_tables(machine, errors, tool)
-    at_levels = [table.at(level)[:, : 1 + len(COORDINATES)] for table, level in zip(tables, levels, strict=True)]
+    at_levels = grid_tables(machine, errors, tool, levels)
     if kernels.ready(result.size >= 3 * _GRID_FOR_KERNELS):
         kernels.field_on_grid(at_levels, levels, result)
     else:

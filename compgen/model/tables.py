@@ -7,6 +7,7 @@ the motion itself, a translation and a rotation per axis (:func:`motion_tables`)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -191,6 +192,27 @@ def field_tables(machine: Machine, errors: ErrorTable, tool_mm: FloatArray | Non
             table = _carrier(tables, 1 + term.lever)
             table.values[:, 1 + term.lever, term.output] += term.sign * errors.squareness[term.error][0]
     return tables[0], tables[1], tables[2]
+
+
+def grid_tables(
+    machine: Machine, errors: ErrorTable, tool_mm: FloatArray, levels_mm: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return the tables of E = C P at the levels of a grid, (n, 4, 3) per axis: groups ``ONE`` and ``COORDINATES``.
+
+    As :func:`field_tables` at these positions, without tables for positions in between.
+    """
+    values = {name: curve.at(levels_mm[error_named(name).axis]) for name, curve in errors.curves.items()}
+    tables = [np.zeros((1 + len(COORDINATES), 3, len(level))) for level in levels_mm]
+    for term in coefficients(machine.chain, machine.squareness_reference):
+        group = ONE if term.lever is None else 1 + term.lever
+        if term.error in values:
+            factor = term.sign * (tool_mm[group - TOOL[0]] if group in TOOL else 1.0)
+            if factor != 0.0:
+                entry = tables[error_named(term.error).axis][ONE if group in TOOL else group, term.output]
+                entry += values[term.error] if factor == 1.0 else factor * values[term.error]
+        elif term.error in errors.squareness and term.lever is not None:
+            tables[0][group, term.output] += term.sign * errors.squareness[term.error][0]
+    return [np.ascontiguousarray(table.transpose(2, 0, 1)) for table in tables]
 
 
 def motion_tables(errors: ErrorTable) -> AxisTables:
