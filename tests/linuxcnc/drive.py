@@ -1,0 +1,107 @@
+#!/usr/bin/python3
+"""Client of a headless LinuxCNC session: homes, runs commands of plan.json, writes result.json and samples.f64.
+
+It stands in the INI file as [DISPLAY] DISPLAY; when it ends, LinuxCNC shuts down. It runs on the distribution's Python,
+which alone has the modules of LinuxCNC.
+"""
+
+import array
+import faulthandler
+import json
+import sys
+import time
+
+import hal
+import linuxcnc
+
+#: The session ends after this long, whatever happens; calls into LinuxCNC may block for ever.
+WATCHDOG_S = 40
+WAIT_S = 20
+
+
+def wait(condition, what):
+    end = time.monotonic() + WAIT_S
+    while not condition():
+        if time.monotonic() > end:
+            raise SystemExit(f"no end of: {what}")
+        time.sleep(0.005)
+
+
+class Session:
+    def __init__(self):
+        self.command, self.stat, self.errors = linuxcnc.command(), linuxcnc.stat(), linuxcnc.error_channel()
+        self.messages = []
+
+    def polled(self):
+        self.stat.poll()
+        found = self.errors.poll()
+        if found:
+            self.messages.append(found[1])
+        return self.stat
+
+    def start(self):
+        """Take the e-stop back and switch on; return whether that was possible."""
+        self.command.state(linuxcnc.STATE_ESTOP_RESET)
+        self.command.wait_complete(5)
+        if self.polled().estop:
+            return False
+        self.command.state(linuxcnc.STATE_ON)
+        wait(lambda: self.polled().enabled, "switching on")
+        self.command.mode(linuxcnc.MODE_MANUAL)
+        self.command.wait_complete(5)
+        self.command.home(-1)
+        wait(lambda: all(self.polled().homed[: self.stat.joints]), "homing")
+        self.command.teleop_enable(1)
+        self.command.wait_complete(5)
+        return True
+
+    def mdi(self, line):
+        self.command.mode(linuxcnc.MODE_MDI)
+        self.command.wait_complete(5)
+        self.command.mdi(line)
+        if self.command.wait_complete(WAIT_S) != linuxcnc.RCS_DONE:
+            self.messages.append(f"not done: {line}")
+
+    def program(self, path):
+        self.command.mode(linuxcnc.MODE_AUTO)
+        self.command.wait_complete(5)
+        self.command.program_open(path)
+        self.command.auto(linuxcnc.AUTO_RUN, 0)
+        wait(lambda: self.polled().interp_state != linuxcnc.INTERP_IDLE, "start of the program")
+        wait(lambda: self.polled().interp_state == linuxcnc.INTERP_IDLE and self.stat.inpos, "the program")
+
+
+def read_samples(stream):
+    found = array.array("d")
+    while True:
+        row = stream.read()
+        if row is None:
+            return found
+        found.extend(row)
+
+
+def main():
+    faulthandler.dump_traceback_later(WATCHDOG_S, exit=True)
+    with open("plan.json", encoding="ascii") as file:
+        plan = json.load(file)
+    component = hal.component("compgen-test")
+    component.ready()
+    stream = hal.stream(component, hal.sampler_base, "f" * plan["channels"])
+    session = Session()
+    result = {"started": session.start()}
+    for step in plan["steps"] if result["started"] else ():
+        session.mdi(step["mdi"]) if "mdi" in step else session.program(step["program"])
+    time.sleep(0.05)
+    session.polled()
+    samples = read_samples(stream)
+    result |= {"pins": {name: hal.get_value(name) for name in plan["pins"]}, "messages": session.messages}
+    with open("samples.f64", "wb") as file:
+        samples.tofile(file)
+    with open("result.json", "w", encoding="ascii") as file:
+        json.dump(result, file)
+    stream.close()
+    component.exit()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
