@@ -5,6 +5,7 @@ from __future__ import annotations
 from compgen.controllers.base import AnyController, Controller, Monomial, SourceFile, Term
 from compgen.controllers.etalon_exchange import EtalonExchange
 from compgen.controllers.fanuc_pitch import FanucPitch
+from compgen.controllers.fanuc_straightness import FanucStraightness
 from compgen.controllers.heidenhain_com import HeidenhainCom
 from compgen.controllers.heidenhain_kinematics import HeidenhainKinematics
 from compgen.controllers.isg_csv import IsgCsv
@@ -24,6 +25,7 @@ CONTROLLERS: dict[str, AnyController] = {
     "isg-csv": IsgCsv(),
     "etalon-exchange": EtalonExchange(),
     "fanuc-pitch": FanucPitch(),
+    "fanuc-straightness": FanucStraightness(),
     "heidenhain-com": HeidenhainCom(),
     "heidenhain-kinematics": HeidenhainKinematics(),
     "mitsubishi": Mitsubishi(),
