@@ -1,0 +1,291 @@
+"""Mitsubishi machine error compensation: the set sheet, its formulas, its limits."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import compgen
+from compgen.controllers import SourceFile, controller_named
+from compgen.controllers.mitsubishi_tables import values_of
+from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.machine import read_machine
+from compgen.core.points import Points
+from compgen.errors import CompgenWarning, InputError
+from compgen.export import export
+
+GOLDEN = Path(__file__).parent / "golden" / "mitsubishi" / "SETSHEET.CSV"
+SAMPLE = GOLDEN.read_text()
+CONTROL = controller_named("mitsubishi")
+UM = 1e-3
+ROUNDING_MM = 1e-12
+RANGES = ((-300.0, 500.0), (-90.0, 410.0), (-800.0, -20.0))
+REFERENCE = (-100.0, 10.0, -500.0)
+
+
+def machine_of(tmp_path, options="", chain="WXYFZT", ranges=RANGES, reference=REFERENCE):
+    axes = "\n".join(
+        f"[axes.{letter}]\nrange_mm = [{low}, {high}]\nnodes = {nodes}"
+        for letter, (low, high), nodes in zip("XYZ", ranges, (9, 6, 14), strict=True)
+    )
+    path = tmp_path / "machine.toml"
+    path.write_text(
+        f'name = "asymmetric"\nchain = "{chain}"\nreference_point_mm = {list(reference)}\n'
+        f"tool_offset_mm = [10.0, -20.0, -150.0]\n{axes}\n[controllers.mitsubishi]\n{options}\n"
+    )
+    return read_machine(path)
+
+
+def parse(machine, text, name="SETSHEET.CSV"):
+    return CONTROL.parse(machine, CONTROL.read_settings(machine), [SourceFile(Path(name), text)])
+
+
+def read_back(machine, made):
+    sources = [SourceFile(Path(name), text) for name, text in made.files.items()]
+    return CONTROL.parse(machine, CONTROL.read_settings(machine), sources)
+
+
+def added(machine, tables, position_mm):
+    return CONTROL.emulate(machine, CONTROL.read_settings(machine), tables, Points(np.array(position_mm, dtype=float)))
+
+
+def test_the_worked_values_of_the_formulas_push_away_from_the_reference_point(tmp_path):
+    """(100.000 - 99.990) x 2 = +20 on the positive side, (100.000 + -99.990) x 2 = +20 on the negative side."""
+    machine = machine_of(tmp_path)
+    tables = parse(machine, SAMPLE)
+    x = np.array([-300.0, -200.0, -150.0, -100.0, -50.0, 0.0, 100.0, 999.0])
+    found = added(machine, tables, np.column_stack([x, np.full(8, 10.0), np.zeros(8)]))
+    expected_counts = np.array([-16, -20, -10, 0, 10, 20, 14, 14])
+    np.testing.assert_allclose(found[:, 0], 0.5 * UM * expected_counts, atol=ROUNDING_MM)
+    assert not found[:, 1:].any()
+    # A feed of 100 mm that goes 99.990 mm comes out right on either side: the axis is 10 um short.
+    assert 99.990 + found[5, 0] == pytest.approx(100.0, abs=ROUNDING_MM)
+    assert -99.990 + found[1, 0] == pytest.approx(-100.0, abs=ROUNDING_MM)
+
+
+def test_a_relative_error_moves_another_axis_by_scale_times_count(tmp_path):
+    machine = machine_of(tmp_path)
+    y = np.array([-90.0, 10.0, 35.0, 60.0, 110.0, 400.0])
+    found = added(machine, parse(machine, SAMPLE), np.column_stack([np.full(6, -100.0), y, np.zeros(6)]))
+    np.testing.assert_allclose(found[:, 2], np.array([0, 0, 1.5, 3.0, -189.0, -189.0]) * UM, atol=ROUNDING_MM)
+    assert not found[:, :2].any()
+
+
+def test_setting_unit_and_what_is_stored_are_settings(tmp_path):
+    machine = machine_of(tmp_path, 'setting_unit_um = 0.1\nstores = "error"')
+    found = added(machine, parse(machine, SAMPLE), [[0.0, 10.0, 0.0]])
+    np.testing.assert_allclose(found, [[-1.0 * UM, 0, 0]], atol=ROUNDING_MM)
+
+
+def test_stored_values_and_curve_belong_together():
+    """A[n] = A[n-1] + v[n] above, A[n] = A[n+1] - v[n] below, by hand."""
+    curve = np.array([-16, -20, 0, 20, 14])
+    assert values_of(curve, 2) == (-4, 20, 0, 20, -6)
+    assert values_of(curve - curve[0], 0) == (0, -4, 20, 20, -6)
+    assert values_of(curve - curve[4], 4) == (-4, 20, 20, -6, 0)
+
+
+@pytest.mark.parametrize("chain", ["WXYFZT", "WFYXZT"])
+@pytest.mark.parametrize(
+    "options", ["", "relative_errors = false", "scale = 3\nsetting_unit_um = 0.5", 'stores = "error"']
+)
+def test_exported_sheets_are_read_back_and_accepted(tmp_path, make_errors, chain, options):
+    machine = machine_of(tmp_path, options, chain)
+    errors = make_errors(machine)
+    made = export(machine, errors, "mitsubishi")
+    assert made.violations == []
+    paths = made.write(tmp_path / "out")
+    result = compgen.verify(machine, compgen.read_tables(machine, paths, "mitsubishi"), errors)
+    assert result.accepted, result.reasons
+    assert result.after_rigid_removed.rms_um < result.before_rigid_removed.rms_um
+    plan = json.loads(made.files["SETSHEET.plan.json"])
+    rows = [row.split(",") for row in made.files["SETSHEET.CSV"].splitlines()[1:]]
+    assert {**plan["parameters"], **{k: str(v) for k, v in plan["values"].items()}} == {
+        row[0].removeprefix("#"): row[1] for row in rows
+    }
+
+
+@pytest.mark.parametrize("chain", ["WXYFZT", "WFYXZT"])
+def test_the_sheet_does_what_the_terms_say_to_within_half_a_count_each(tmp_path, make_errors, chain):
+    machine = machine_of(tmp_path, "", chain)
+    chosen = CONTROL.read_settings(machine)
+    basis = CONTROL.basis(machine, chosen, make_errors(machine))
+    generator = np.random.default_rng(6)
+    values = {}
+    for term in basis:
+        walk = np.cumsum(generator.normal(0.0, 4 * UM, len(term.nodes_mm)))
+        values[term.name] = walk - np.interp(term.zero_at_mm, term.nodes_mm, walk)
+    tables = CONTROL.build(machine, chosen, basis, values)
+    position = generator.uniform(machine.lower_mm, machine.upper_mm, (300, 3))
+    wanted = np.zeros((300, 3))
+    for term in basis:
+        wanted += term.carrier_field(position, np.zeros(3)) * term.curve(values[term.name], position)[:, None]
+    found = CONTROL.emulate(machine, chosen, tables, Points(position))
+    assert np.max(np.abs(found - wanted)) <= 3 * 0.25 * UM + ROUNDING_MM
+
+
+def test_the_whole_numbers_are_the_best_ones_by_brute_force(tmp_path):
+    """Of all curves within half a count of the wanted one, none misses it by less (mean square along the axis)."""
+    options = "relative_errors = false\ninterval_mm = { X = 200.0 }"
+    machine = machine_of(tmp_path, options)
+    chosen = CONTROL.read_settings(machine)
+    basis = CONTROL.basis(machine, chosen, ErrorTable())
+    term = basis[0]
+    counts = np.array([1.5, 0.0, 0.5, 2.5, 1.5])
+    values = {item.name: np.zeros(len(item.nodes_mm)) for item in basis} | {term.name: 0.5 * UM * counts}
+    built = CONTROL.build(machine, chosen, basis, values).sets[0].curve
+    dense = np.linspace(-300.0, 500.0, 3201)
+    wanted = np.interp(dense, term.nodes_mm, counts)
+
+    def missed(curve):
+        return np.mean((np.interp(dense, term.nodes_mm, curve) - wanted) ** 2)
+
+    choices = list(itertools.product(*[[0] if c == 0 else [np.floor(c), np.floor(c) + 1] for c in counts]))
+    assert len(choices) == 16
+    assert missed(built) == pytest.approx(min(missed(choice) for choice in choices), rel=1e-3)
+    assert missed(built) < 0.7 * missed(np.floor(counts + 0.5))
+
+
+def test_an_axis_that_stops_short_gets_positive_values_on_both_sides(tmp_path):
+    """10 um short over every 100 mm: EXX falls with X; so +20 per 100 mm on either side of the reference point."""
+    machine = machine_of(tmp_path, "interval_mm = { X = 100.0 }")
+    nodes = machine.axes[0].nodes_mm
+    errors = ErrorTable({"EXX": Curve(nodes, -1e-4 * (nodes + 100.0), np.full(len(nodes), np.nan))})
+    table = read_back(machine, export(machine, errors, "mitsubishi")).sets[0]
+    assert (table.base, table.output, table.interval_mm) == (0, 0, Decimal("100.000"))
+    assert table.values == (20, 20, 0, 20, 20, 20, 20, 20, 20)
+
+
+def test_a_curve_that_is_too_steep_is_said_and_not_accepted(tmp_path):
+    machine = machine_of(tmp_path, "interval_mm = { X = 400.0 }")
+    nodes = machine.axes[0].nodes_mm
+    errors = ErrorTable({"EXX": Curve(nodes, 4e-4 * (nodes + 100.0), np.full(len(nodes), np.nan))})
+    made = export(machine, errors, "mitsubishi")
+    assert any("too steep for 127 counts" in text for text in made.violations)
+    wider = machine_of(tmp_path, "interval_mm = { X = 400.0 }\nscale = 3")
+    assert export(wider, errors, "mitsubishi").violations == []
+
+
+def test_numbers_of_sets_do_not_overlap_and_fit_what_is_free(tmp_path, make_errors):
+    machine = machine_of(tmp_path, "first_number = 4800\nfirst_set = 2\nloss_um = 0.001")
+    errors = make_errors(machine)
+    made = export(machine, errors, "mitsubishi")
+    tables = read_back(machine, made)
+    numbers = [number for table in tables.sets for number in range(table.first, table.last + 1)]
+    assert numbers == list(range(4800, 4800 + len(numbers)))
+    assert numbers[-1] <= 5124
+    assert "\n#4011,X," in made.files["SETSHEET.CSV"]
+    assert "#4001," not in made.files["SETSHEET.CSV"]
+    assert made.violations == []
+
+
+def test_limits_of_a_foreign_sheet_are_named(tmp_path):
+    machine = machine_of(tmp_path)
+    text = SAMPLE.replace("#4103,0", "#4103,5").replace("#4014,4106", "#4014,4105").replace("#4006,1", "#4006,0")
+    found = " ".join(CONTROL.violations(machine, CONTROL.read_settings(machine), parse(machine, text)))
+    for part in ("value at the reference number 4103 must be 0", "overlap", "scale is 0", "covers", "Y has no table"):
+        assert part in found
+
+
+def test_a_set_of_an_axis_that_is_not_in_the_machine_file_is_left_out_with_a_warning(tmp_path):
+    machine = machine_of(tmp_path)
+    with pytest.warns(CompgenWarning, match="set 2 belongs to the axis A"):
+        tables = parse(machine, SAMPLE.replace("#4011,Y", "#4011,A"))
+    assert [(table.base, table.output) for table in tables.sets] == [(0, 0)]
+
+
+def test_order_crlf_blank_lines_and_missing_signs_do_no_harm(tmp_path):
+    machine = machine_of(tmp_path)
+    lines = SAMPLE.splitlines()
+    mixed = "\r\n".join([*(line.replace("#", "").replace(",", " , ", 1) for line in reversed(lines[1:])), "", ""])
+    assert parse(machine, mixed) == parse(machine, SAMPLE)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "line", "message"),
+    [
+        ("#4102,20,", "#4102,20.5,", 18, "whole number from -128 to 127"),
+        ("#4102,20,", "#4102,128,", 18, "whole number from -128 to 127"),
+        ("#4102,20,", "#4102,-129,", 18, "whole number from -128 to 127"),
+        ("#4102,20,", "#4102,2e1,", 18, "whole number"),
+        ("#4102,20,", "#4102,nan,", 18, "whole number"),
+        ("#4102,20,", "#4102;20;", 18, "not the number"),
+        ("#4102,20,", "#4103,20,", 19, "second time"),
+        ("#4102,20,X at -100\n", "", 7, "#4102 \\(1 in all\\) missing"),
+        ("#4102,20,X at -100", "#4102,2", 18, "is the file cut"),
+        ("#4003,4103", "#4003,4106", 5, "none of 4101 to 4105"),
+        ("#4003,4103", "#4003,", 3, "#4003 of set 1 missing"),
+        ("#4003,4103", "#4003,40", 5, "4101 to 5124"),
+        ("#4007,100.0", "#4007,1e2", 9, "interval in mm"),
+        ("#4007,100.0", "#4007,0.0", 9, "interval in mm"),
+        ("#4007,100.0", "#4007,-5.0", 9, "interval in mm"),
+        ("#4000,1", "#4000,0", 2, "absolute system"),
+        ("#4000,1", "#3999,1", 1, "#4000"),
+        ("X at -100", "X at \u2212100", 18, "not a row"),
+    ],
+)
+def test_a_malformed_sheet_is_refused_with_its_line(tmp_path, before, after, line, message):
+    text = SAMPLE.replace(before, after, 1)
+    assert text != SAMPLE
+    with pytest.raises(InputError, match=message) as caught:
+        parse(machine_of(tmp_path), text)
+    assert (caught.value.file.name, caught.value.line) == ("SETSHEET.CSV", line)
+
+
+def test_a_sheet_that_was_cut_is_refused_wherever_it_was_cut(tmp_path):
+    machine = machine_of(tmp_path)
+    for end in range(len(SAMPLE) - len(",Z at Y +100\n")):
+        with pytest.raises(InputError):
+            parse(machine, SAMPLE[:end])
+
+
+@pytest.mark.parametrize("garbage", ["\n" * 10_000_000, "A" * 100_000_000, "#4101,1,a\n" * 90_000, "#" * 900_000])
+def test_garbage_is_refused_within_a_second(tmp_path, garbage):
+    machine = machine_of(tmp_path)
+    start = time.perf_counter()
+    with pytest.raises(InputError) as caught:
+        parse(machine, garbage)
+    assert time.perf_counter() - start < 1.0
+    assert caught.value.line is not None
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        "scale = 0",
+        'stores = "both"',
+        "first_set = 3",
+        "last_number = 4110",
+        "interval_mm = { X = 0.0005 }",
+        'axis_names = { X = "Y" }',
+        "unknown = 1",
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(tmp_path, options):
+    with pytest.raises(InputError):
+        CONTROL.read_settings(machine_of(tmp_path, options))
+
+
+PIECES = ["#", "4101", ",", "\n", "-", "128", "0", "X", ".", "e", " ", "9" * 12, "\u0663"]
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    cut=st.tuples(st.integers(0, len(SAMPLE)), st.integers(0, 12)),
+    put=st.lists(st.sampled_from(PIECES), max_size=4).map("".join),
+)
+def test_any_text_is_read_or_refused(tmp_path, cut, put):
+    machine = machine_of(tmp_path)
+    try:
+        tables = parse(machine, SAMPLE[: cut[0]] + put + SAMPLE[cut[0] + cut[1] :])
+    except (InputError, CompgenWarning):
+        return
+    assert np.all(np.isfinite(added(machine, tables, [[0.0, 50.0, 0.0]])))
