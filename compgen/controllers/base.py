@@ -170,6 +170,10 @@ class Controller(ABC, Generic[Settings, Tables]):
     def resolution_mm(self, settings: Settings) -> float:
         """Return the largest correction error that rounding to the format's quantum may cause on one axis, mm."""
 
+    def anchor_mm(self, machine: Machine, settings: Settings) -> FloatArray:
+        """Return where the tables of an ``anchored`` control are zero by nature, shape (3,): the reference point."""
+        return np.array(machine.reference_point_mm, dtype=np.float64)
+
     def table_nodes_mm(self, machine: Machine, settings: Settings, tables: Tables) -> tuple[FloatArray, ...]:
         """Return the positions of X, Y and Z at which parsed tables have a node, ascending, also outside the travel.
 

@@ -22,9 +22,9 @@ from compgen.controllers.pmac_text import parse_pmac
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
-from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.names import AXES
 from compgen.core.points import Points
-from compgen.core.reversal import WORTH_MM, ReversalCurves, reversal_name
+from compgen.core.reversal import WORTH_MM, ReversalCurves
 from compgen.errors import CompgenWarning, InputError
 
 _MOST_PER_TARGET = 6
@@ -52,6 +52,10 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         """Return the tables in whole 1/16 counts."""
         return PmacTables(tuple(tables_from(machine, settings, basis, values)))
 
+    def reversal_in_tables(self, settings: PmacSettings, reversal: ReversalCurves) -> ReversalCurves:
+        """Only the reversal of an axis along itself goes into tables."""
+        return ReversalCurves({key: curve for key, curve in reversal.curves.items() if key[0] == key[1]})
+
     def with_reversal(
         self, machine: Machine, settings: PmacSettings, tables: PmacTables, reversal: ReversalCurves
     ) -> PmacTables:
@@ -60,21 +64,16 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         With the reversal B the control takes -B off after negative travel, so both directions stand at +B/2 of the
         mean; -(B - B at zero)/2 goes into the pitch table, the rest is a constant.
         """
-        lines, backlash, constants, notes = list(tables.tables), [], {}, list(tables.notes)
-        for (axis, component), curve in sorted(reversal.curves.items()):
+        lines, backlash, constants = list(tables.tables), [], {}
+        for (axis, _), curve in sorted(reversal.curves.items()):
             if np.max(np.abs(curve.value)) < WORTH_MM:
-                continue
-            if axis != component:
-                largest = reversal.largest_mm[axis, component] / MM_PER_UM
-                name = reversal_name(axis, component)
-                notes.append(f"{name} is {largest:+.1f} um; backlash tables act along their own motor: it is not held")
                 continue
             motor = settings.motors[axis]
             place = next(k for k, t in enumerate(lines) if isinstance(t, Line) and t.motor == motor)
             lines[place], table, constants[motor] = _with_backlash(machine, settings, axis, lines[place], curve)
             backlash += [table] if table is not None else []
         backlash.sort(key=lambda table: -table.motor)
-        return replace(tables, tables=tuple(lines), backlash=tuple(backlash), constants=constants, notes=tuple(notes))
+        return replace(tables, tables=tuple(lines), backlash=tuple(backlash), constants=constants)
 
     def context(self, machine: Machine, settings: PmacSettings, tables: PmacTables) -> dict[str, Any]:
         """Return the tables with their entries, the sign with a worked number, and what must be set."""
@@ -186,6 +185,10 @@ class Pmac(Controller[PmacSettings, PmacTables]):
             Usage("motors with a COMP table", len(tables.tables), settings.motors_available, "tables"),
             Usage("entries of one table", longest, settings.max_entries, "entries", stated=False),
         ]
+
+    def anchor_mm(self, machine: Machine, settings: PmacSettings) -> FloatArray:
+        """Return the motors' zero, where every table is zero."""
+        return np.array(settings.home_mm)
 
     def table_nodes_mm(self, machine: Machine, settings: PmacSettings, tables: PmacTables) -> tuple[FloatArray, ...]:
         """Return the entries' positions over the travel and one beyond, by source."""

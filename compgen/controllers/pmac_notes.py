@@ -47,7 +47,7 @@ def _parameters(settings: PmacSettings, tables: PmacTables) -> list[dict[str, ob
 
 
 def _warnings(machine: Machine, settings: PmacSettings, tables: PmacTables) -> list[str]:
-    found = list(tables.notes)
+    found: list[str] = []
     owners = [table.motor for table in tables.tables if table.motor not in settings.motors]
     if owners:
         found.append(

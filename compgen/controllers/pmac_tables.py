@@ -99,13 +99,9 @@ def rolled(counts: FloatArray, length: int, entries: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class PmacTables:
-    """What the control has: tables in the order of the file, backlash tables, Ixx86 by motor in 1/16 count, I51.
-
-    ``enabled`` is None if no file says. ``notes`` say what the tables leave out (not part of the file).
-    """
+    """What the control has: tables in the order of the file, Ixx86 by motor in 1/16 count, I51 (None: no file says)."""
 
     tables: tuple[Line | Sheet, ...]
     backlash: tuple[Backlash, ...] = ()
     constants: Mapping[int, int] = field(default_factory=dict)
     enabled: bool | None = True
-    notes: tuple[str, ...] = field(default=(), compare=False)

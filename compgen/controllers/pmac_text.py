@@ -108,7 +108,13 @@ class _Reader:
         spans = words[-2:] if two else words[-1:]
         sources = [_SOURCE.fullmatch(word) for word in words[: -len(spans)]]
         least, most = (0, 0) if backlash else (1, 3) if two else (0, 2)
-        if backlash and two or not least <= len(sources) <= most or not all(sources) or not all(map(_WHOLE.fullmatch, spans)):
+        if (
+            backlash
+            and two
+            or not least <= len(sources) <= most
+            or not all(sources)
+            or not all(map(_WHOLE.fullmatch, spans))
+        ):
             raise self.source.fail(f"{text[:80]!r} has wrong arguments; {_SYNTAX[backlash, two]} is due", line)
         if min(shape) < 1 or min(map(int, spans)) < 1 or len(spans) != 1 + two:
             raise self.source.fail(f"{text[:80]!r}: sizes and spans are whole numbers above zero", line)

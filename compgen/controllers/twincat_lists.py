@@ -30,9 +30,9 @@ from compgen.controllers.twincat_text import parse_axis_list
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
-from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.names import AXES
 from compgen.core.points import Points
-from compgen.core.reversal import WORTH_MM, ReversalCurves, reversal_name
+from compgen.core.reversal import WORTH_MM, ReversalCurves
 from compgen.errors import CompgenWarning, InputError
 
 _LARGEST_SGN32 = 2.0**31 - 1
@@ -58,24 +58,20 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         """Return the tables in 0.1 um, signs as the control stores them."""
         return TwincatTables(lists_from(machine, settings, basis, values))
 
+    def reversal_in_tables(self, settings: TwincatSettings, reversal: ReversalCurves) -> ReversalCurves:
+        """Only the reversal of an axis along itself goes into tables."""
+        return ReversalCurves({key: curve for key, curve in reversal.curves.items() if key[0] == key[1]})
+
     def with_reversal(
         self, machine: Machine, settings: TwincatSettings, tables: TwincatTables, reversal: ReversalCurves
     ) -> TwincatTables:
         """Return the tables with a bilateral leadscrew table for the reversal of each axis along itself."""
-        lists, notes = dict(tables.lists), list(tables.notes)
-        for (axis, component), curve in sorted(reversal.curves.items()):
-            if np.max(np.abs(curve.value)) < WORTH_MM:
-                continue
+        lists = dict(tables.lists)
+        for (axis, _), curve in sorted(reversal.curves.items()):
             screw = lists[axis].screw
-            if axis != component or screw is None:
-                largest = reversal.largest_mm[axis, component] / MM_PER_UM
-                notes.append(
-                    f"{reversal_name(axis, component)} is {largest:+.1f} um; only kw.ssfk knows directions, and it acts "
-                    f"along its own axis: the tables do not hold it"
-                )
-                continue
-            lists[axis] = replace(lists[axis], screw=_two_sided(settings, screw, curve))
-        return TwincatTables(lists, tuple(notes))
+            if screw is not None and np.max(np.abs(curve.value)) >= WORTH_MM:
+                lists[axis] = replace(lists[axis], screw=_two_sided(settings, screw, curve))
+        return TwincatTables(lists)
 
     def context(self, machine: Machine, settings: TwincatSettings, tables: TwincatTables) -> dict[str, Any]:
         """Return the lists with their numbers, the signs with a worked number, and what must be set."""

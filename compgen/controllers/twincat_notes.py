@@ -78,7 +78,7 @@ def _point_rows(settings: TwincatSettings, axis: int, item: AxisList) -> list[tu
 
 
 def _warnings(settings: TwincatSettings, tables: TwincatTables) -> list[str]:
-    found = list(tables.notes)
+    found: list[str] = []
     if any(item.cross or item.plane for item in tables.lists.values()):
         found.append(
             f'cross_sign = "{settings.cross_sign}": no public document says whether kw.crosscomp and kw.crosscomp2 are '

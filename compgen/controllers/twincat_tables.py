@@ -7,7 +7,7 @@ Numbers stay in the unit of the files, 0.1 um (``unit 1``). Source: Beckhoff TF5
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -98,10 +98,9 @@ class AxisList:
 
 @dataclass(frozen=True)
 class TwincatTables:
-    """The lists of the axes 0..2; ``notes`` say what the tables leave out (not part of the files)."""
+    """The lists of the axes 0..2."""
 
     lists: Mapping[int, AxisList]
-    notes: tuple[str, ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True)

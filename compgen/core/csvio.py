@@ -119,8 +119,13 @@ def read_csv(
     InputError
         for an empty file, a missing or doubled column, a row with too few or too many fields, a truncated last line.
     """
-    source = Path(path)
-    content = read_text(source)
+    return csv_table(Path(path), read_text(Path(path)), required, optional, prefixes)
+
+
+def csv_table(
+    source: Path, content: str, required: Iterable[str], optional: Iterable[str] = (), prefixes: Iterable[str] = ()
+) -> CsvTable:
+    """Read the text ``content`` of the file ``source`` as :func:`read_csv` does."""
     required, prefixes = list(required), tuple(prefixes)
     known = {*required, *optional}
     file = parse_plain(content) or parse_any(source, content)
@@ -135,7 +140,7 @@ def read_csv(
     for name in file.header:
         if not _is_allowed(name, known, prefixes):
             message = f"column {one_line(name)!r} is not known and left out; {nearest(name, known)}"
-            warnings.warn(f"{source}:{file.header_line}: {message}", CompgenWarning, stacklevel=3)
+            warnings.warn(f"{source}:{file.header_line}: {message}", CompgenWarning, stacklevel=4)
     kept = {k: name for k, name in enumerate(file.header) if _is_allowed(name, known, prefixes)}
     return CsvTable(source, {name: file.column(k) for k, name in kept.items()}, file.lines, file.metadata)
 

@@ -14,6 +14,9 @@ from compgen.core.names import CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, SQUARENESS
 from compgen.core.text import nearest
 from compgen.errors import CompgenWarning
 
+#: Columns that an ``*.errors.csv`` file must have.
+ERROR_COLUMNS = ("error", "position_mm", "value")
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -102,7 +105,11 @@ class ErrorTable:
 
 def read_errors(path: str | Path) -> ErrorTable:
     """Read an ``*.errors.csv`` file of the contract (um and urad) into an :class:`ErrorTable` (mm and rad)."""
-    table = read_csv(path, required=("error", "position_mm", "value"), optional=("u_value",))
+    return errors_of_table(read_csv(path, required=ERROR_COLUMNS, optional=("u_value",)))
+
+
+def errors_of_table(table: CsvTable) -> ErrorTable:
+    """Return the errors (mm and rad) of a CSV table with the columns of an ``*.errors.csv`` file (um and urad)."""
     names = table.text("error")
     values = table.numbers("value")
     u_values = _uncertainties(table)

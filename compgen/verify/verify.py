@@ -58,7 +58,7 @@ class ReadTables:
         if (
             self.controller.anchored
         ):  # zero at the reference point in one direction only: a constant, which does no harm
-            mean -= mean_correction(added, np.array([machine.reference_point_mm], dtype=np.float64))
+            mean -= mean_correction(added, self.controller.anchor_mm(machine, self.settings)[None])
         return mean
 
 
