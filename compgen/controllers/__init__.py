@@ -12,6 +12,7 @@ from compgen.controllers.isg_csv import IsgCsv
 from compgen.controllers.linuxcnc_comp import LinuxcncComp
 from compgen.controllers.linuxcnc_volumetric import LinuxcncVolumetric
 from compgen.controllers.mitsubishi import Mitsubishi
+from compgen.controllers.neutral import Neutral
 from compgen.controllers.pmac import Pmac
 from compgen.controllers.siemens_cec import SiemensCec
 from compgen.controllers.siemens_eec import SiemensEec
@@ -35,6 +36,7 @@ CONTROLLERS: dict[str, AnyController] = {
     "linuxcnc-volumetric": LinuxcncVolumetric(),
     "twincat-lists": TwincatLists(),
     "pmac": Pmac(),
+    "neutral": Neutral(),
 }
 
 
