@@ -21,7 +21,8 @@ from compgen.cli.emphasis_options import emphasis_options
 from compgen.cli.options_commands import explain_option
 from compgen.cli.safety_options import active_options, limits_option
 from compgen.cli.sample_options import sample_options
-from compgen.core.error_table import format_errors, read_errors
+from compgen.controllers.error_files import read_error_file
+from compgen.core.error_table import format_errors
 from compgen.core.files import OutputFolder, write_file
 from compgen.core.machine import Machine
 from compgen.core.points import format_points, read_points
@@ -74,7 +75,8 @@ def export_command(
 ) -> int:
     """Export errors to the files of a control, with manifest.json and preflight.md.
 
-    ERRORS is an *.errors.csv file (um, urad), usually the fitted one. Files that break a limit of the control are
+    ERRORS is an *.errors.csv file (um, urad), usually the fitted one, or the exchange file of a laser tracer's software
+    (Etalon, variant Vendor; mm, rad). Files that break a limit of the control are
     written as NOT-ACCEPTED-... (exit code 1). check/check-program.md says what to read at five positions of the machine.
     With --active ERRORS are those of the machine with its old tables; bare.errors.csv gets those without.
 
@@ -83,7 +85,7 @@ def export_command(
       compgen export zha-gantry fitted/fitted.errors.csv --controller siemens-cec --out tables/
     """
     OutputFolder(out)
-    table, beside = read_errors(errors), {}
+    table, beside = read_error_file(errors), {}
     both = read_reversal(reversal) if reversal else None
     if active is not None:
         table, lost_um = bare_errors(machine, table, active)
@@ -156,7 +158,7 @@ def read_command(
 @controller_option()
 @sample_options
 @click.option(
-    "--errors", required=True, type=click.Path(path_type=Path), help="*.errors.csv of the machine (um, urad)."
+    "--errors", required=True, type=click.Path(path_type=Path), help="*.errors.csv of the machine (um, urad), or an Etalon exchange file (mm, rad)."
 )
 @click.option("--points", type=click.Path(path_type=Path), help="*.points.csv (mm); default: a grid over the volume.")
 @out_option
@@ -185,7 +187,7 @@ def verify_command(
     OutputFolder(out)
     where = read_points(points) if points else None
     both = read_reversal(reversal) if reversal else None
-    parsed, table = read_tables(machine, tables, controller), read_errors(errors)
+    parsed, table = read_tables(machine, tables, controller), read_error_file(errors)
     result = verify(machine, parsed, table, where, reversal=both, limits=limits)
     write_all(out, {"result.json": json.dumps(result.summary(), indent=2) + "\n"})
     if as_json:

@@ -12,7 +12,7 @@ import click
 from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.cli.fit_options import covariance_of, covariance_options, fitting_options
 from compgen.cli.safety_options import active_options
-from compgen.core.error_table import read_errors
+from compgen.controllers.error_files import read_error_file
 from compgen.core.files import OutputFolder
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
@@ -212,7 +212,8 @@ def fit_command(
 ) -> int:
     """Fit smooth curves: straightness zero at both ends, positioning and angles zero at the reference point.
 
-    ERRORS is an *.errors.csv file (um, urad). Writes fitted.errors.csv and fit.json to DIR. If the covariance that
+    ERRORS is an *.errors.csv file (um, urad), or the exchange file of a laser tracer's software (Etalon, variant Vendor;
+    mm, rad). Writes fitted.errors.csv and fit.json to DIR. If the covariance that
     compgen identify wrote lies beside ERRORS, its correlations count, else nodes are taken as independent.
 
     \b
@@ -220,7 +221,7 @@ def fit_command(
       compgen fit zha-gantry identified/identified.errors.csv --max-abs linear=20 --out fitted/
     """
     OutputFolder(out)
-    table = read_errors(errors)
+    table = read_error_file(errors)
     known = covariance_of(errors, table, covariance, independent=independent)
     result = fit(machine, table, fitting, covariance=known)
     write_all(out, fit_files(result))

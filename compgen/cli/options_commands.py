@@ -8,8 +8,8 @@ from pathlib import Path
 import click
 
 from compgen.cli.common import Command, json_option, machine_argument, print_json, progress, stdout
+from compgen.controllers.error_files import read_error_file
 from compgen.core.emphasis import zone_of
-from compgen.core.error_table import read_errors
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.core.reversal import read_reversal
@@ -93,7 +93,7 @@ def options_command(
         show("fitting every level, exporting for every control and reading back")
         result = capability(
             machine,
-            read_errors(errors),
+            read_error_file(errors),
             tools_mm=[_tool(text) for text in tools],
             zone_mm=zone_of(zone, [axis.range_mm for axis in machine.axes]) if zone else None,
             reversal=read_reversal(reversal) if reversal else None,

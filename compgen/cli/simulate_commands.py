@@ -7,7 +7,8 @@ from pathlib import Path
 import click
 
 from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
-from compgen.core.error_table import ErrorTable, read_errors
+from compgen.controllers.error_files import read_error_file
+from compgen.core.error_table import ErrorTable
 from compgen.core.files import write_file
 from compgen.core.machine import Machine
 from compgen.core.points import format_points, read_points
@@ -71,7 +72,7 @@ def predict_command(
       compgen predict zha-gantry fitted/fitted.errors.csv --points p.points.csv --out predicted.csv
     """
     where = read_points(points)
-    table = read_errors(errors)
+    table = read_error_file(errors)
     covariance = None if uncertainty is None else _covariance(errors, table, uncertainty)
     error_mm = predict(machine, table, where, exact=exact)
     columns = {f"e{axis}_um": error_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}

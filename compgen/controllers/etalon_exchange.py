@@ -134,6 +134,15 @@ def _parameter(source: SourceFile, section: _Section) -> Parameter:
     return Parameter(name, Field((axis,), nodes, pairs[order, 1]), source, line)
 
 
+def is_exchange_text(text: str) -> bool:
+    """Whether a text begins, after comments, with a parameter name in brackets, as an exchange file does."""
+    for line in text[:20_000].split("\n"):
+        content = line.partition("//")[0].strip()
+        if content:
+            return _SECTION.match(content) is not None
+    return False
+
+
 def errors_from_etalon(text: str, path: Path | None = None) -> ErrorTable:
     """Import an exchange file that a laser tracer's software wrote ("Vendor" variant).
 
