@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any, Literal
 
-from compgen.controllers.fanuc_style import FanucStyle, take_length_unit_mm, take_style
+from compgen.controllers.fanuc_sample import take_length_unit_mm, take_style
+from compgen.controllers.fanuc_style import FanucStyle
 from compgen.controllers.grids import take_loss_mm
 from compgen.core import tomlio
 from compgen.core.machine import Machine

@@ -46,7 +46,7 @@ def straightness_context(machine: Machine, settings: StraightnessSettings, table
 
 def _common(settings: StraightnessSettings, tables: StraightTables) -> dict[int, int]:
     """Parameter number -> value of the entries."""
-    found = {}
+    found: dict[int, int] = {}
     for k, entry in enumerate(tables.entries):
         axes = (settings.axis_numbers[entry.moving], settings.axis_numbers[entry.compensated])
         found.update(zip(entry_numbers(k), (*axes, *entry.numbers, *entry.amounts), strict=True))
