@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from compgen.controllers.base import AnyController, Controller, Monomial, SourceFile, Term
 from compgen.controllers.etalon_exchange import EtalonExchange
+from compgen.controllers.fanuc_3d import Fanuc3d
 from compgen.controllers.fanuc_pitch import FanucPitch
 from compgen.controllers.fanuc_straightness import FanucStraightness
 from compgen.controllers.heidenhain_com import HeidenhainCom
@@ -26,6 +27,7 @@ CONTROLLERS: dict[str, AnyController] = {
     "isg-csv": IsgCsv(),
     "etalon-exchange": EtalonExchange(),
     "fanuc-pitch": FanucPitch(),
+    "fanuc-3d": Fanuc3d(),
     "fanuc-straightness": FanucStraightness(),
     "heidenhain-com": HeidenhainCom(),
     "heidenhain-kinematics": HeidenhainKinematics(),
