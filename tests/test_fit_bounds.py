@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
+from scipy.optimize import linprog, minimize
 from scipy.stats import multivariate_normal
 
 import compgen
@@ -235,6 +236,33 @@ def test_a_thousand_nodes_with_every_kind_of_bound_end_within_them_or_with_an_er
 
 
 # --- options ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mu", [0.1, 100.0])
+@pytest.mark.parametrize("kind", [2, 3, 4, 5, 6])
+def test_a_thousand_nodes_are_solved_in_bands_and_no_curve_within_the_bounds_is_downhill(kind, mu):
+    """The referee is a linear program: over all curves within the bounds the gradient is least at the optimum."""
+    problem = case(1001, mu, seed=kind, **KINDS[kind])
+    (found,) = solve_curves([problem])
+    assert found.solver == "interior point"
+    n, c, bounds, step = len(problem.y), found.curve, problem.bounds, np.diff(problem.position_mm)
+    bend = sp.diags_array(second_difference(problem.position_mm).T, offsets=[0, 1, 2], shape=(n - 2, n))
+    gradient = problem.weight * (c - problem.y) + mu * (bend.T @ (bend @ c))
+    slope = sp.diags_array([-1 / step, 1 / step], offsets=[0, 1], shape=(n - 1, n))
+    bent = sp.diags_array(curvature(problem.position_mm).T, offsets=[0, 1, 2], shape=(n - 2, n))
+    parts = [(sign * rows / limit, 1.0) for rows, limit in ((slope, bounds.max_slope), (bent, bounds.max_curvature))
+             for sign in (1, -1) if limit < math.inf]  # fmt: skip
+    if bounds.direction:
+        parts.append((-bounds.direction * slope * np.ptp(problem.position_mm), 0.0))
+    largest = np.full(n, min(bounds.max_abs, 2 * np.abs(c).max()))
+    largest[list(problem.held)] = 0.0
+    matrix, limit = (
+        sp.vstack([rows for rows, _ in parts]),
+        np.repeat([top for _, top in parts], [rows.shape[0] for rows, _ in parts]),
+    )
+    least = linprog(gradient, A_ub=matrix, b_ub=limit, bounds=np.stack([-largest, largest], axis=1), method="highs")
+    assert least.status == 0
+    assert gradient @ c <= least.fun + 1e-6 * np.abs(gradient * c).sum()
 
 
 def test_curvature_bounds_and_directions_come_in_file_units_and_are_reported():

@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from compgen.core.csvio import FloatArray
 from compgen.fit.bounds import Bounds, slope_limits
-from compgen.fit.stacked import Stack, band_of, curvature_rows, gather, spread, windows
+from compgen.fit.stacked import Stack, curvature_rows, windows
 
 STEPS = 60
 #: A curve is done when its complementarity is below this share of what the bounds cost.
@@ -28,7 +28,7 @@ _CLOSED = 1e-9
 _BROKEN = 1e-6
 #: Curves that are done leave the stack when they are at least this share of it.
 _SHRINK = 0.3
-_TINY = np.finfo(float).tiny
+_TINY = float(np.finfo(float).tiny)
 BoolArray = NDArray[np.bool_]
 
 
@@ -56,21 +56,39 @@ class RowStack:
     def values(self, c: FloatArray) -> FloatArray:
         """G c and -G c: (2, B, N)."""
         both = np.empty_like(self.limit)
-        both[0] = gather(self.rows, c)
+        both[0] = self.along(c)
         np.negative(both[0], out=both[1])
         return both
 
+    def along(self, c: FloatArray) -> FloatArray:
+        """G c: (B, N). Rows of kind k act on k + 1 nodes."""
+        found = self.rows[:, 0] * c
+        for kind, rows, out in zip(self.kinds, self.rows, found, strict=True):
+            for later in range(1, kind + 1):
+                out[:-later] += rows[later, :-later] * c[later:]
+        return found
+
+    def back(self, v: FloatArray) -> FloatArray:
+        """G^T v for row values (B, N): (N,)."""
+        found: FloatArray = np.zeros(v.shape[1])
+        for kind, rows, value in zip(self.kinds, self.rows, v, strict=True):
+            found += rows[0] * value
+            for later in range(1, kind + 1):
+                found[later:] += rows[later, :-later] * value[:-later]
+        return found
+
     def transposed(self, v: FloatArray) -> FloatArray:
         """G^T (v[0] - v[1]) for row values (2, B, N): (N,)."""
-        total = v[0] - v[1]
-        return np.asarray(sum(spread(rows, value) for rows, value in zip(self.rows, total, strict=True)))
+        return self.back(v[0] - v[1])
 
     def add_band(self, band: FloatArray, v: FloatArray) -> None:
-        """Add G^T diag(v[0] + v[1]) G to a lower band (3, N)."""
-        more = np.empty_like(band)
-        for rows, value in zip(self.rows, np.sqrt(v[0] + v[1]), strict=True):
-            band_of(rows * value, more)
-            band += more
+        """Add G^T diag(v) G for row values (B, N) to a lower band (3, N)."""
+        for kind, rows, value in zip(self.kinds, self.rows, v, strict=True):
+            for first in range(kind + 1):
+                part = rows[first] * value
+                for last in range(first, kind + 1):
+                    here = slice(first, None), slice(0, len(value) - first)
+                    band[last - first, here[0]] += part[here[1]] * rows[last, here[1]]
 
 
 def row_stack(stack: Stack, bounds: Sequence[Bounds], curve: FloatArray) -> RowStack:
@@ -168,13 +186,14 @@ def _sum(stack: Stack, values: FloatArray) -> FloatArray:
 
 
 def _begin(stack: Stack, rows: RowStack, free_curve: FloatArray) -> _Iterate:
-    """Start at the free curve, shrunk to half of the bounds that it breaks; monotone rows begin with open slack."""
+    """Start at the free curve, shrunk to half of the bounds that it breaks; at zero where it goes the wrong way."""
     there = rows.there
     count = _rows_of_each(stack, there)
     values = rows.values(free_curve)
     bounded = there & (rows.limit > 0)
     over = stack.largest(np.where(bounded, values / np.where(bounded, rows.limit, 1.0), 0.0).max(axis=(0, 1)))
-    c = free_curve * stack.of_each(np.minimum(1.0, 0.5 / np.maximum(over, 0.5)))
+    turned = stack.largest(np.where(there & (rows.limit == 0), values, 0.0).max(axis=(0, 1))) > 0
+    c = free_curve * stack.of_each(np.where(turned, 0.0, np.minimum(1.0, 0.5 / np.maximum(over, 0.5))))
     slack = np.where(there, np.maximum(rows.limit - rows.values(c), 0.3), 1.0)
     away = c - free_curve
     cost = stack.total(away * stack.apply(away)) + 1e-6 * stack.total(free_curve * stack.pull) + _TINY
@@ -187,44 +206,49 @@ def _rows_of_each(stack: Stack, there: BoolArray) -> FloatArray:
 
 
 def _step(stack: Stack, rows: RowStack, now: _Iterate, gap: FloatArray, moving: BoolArray) -> list[int]:
-    """One predictor and corrector step of the ``moving`` curves, in place; returns curves whose matrix broke down."""
-    there = rows.there
-    mean = gap / _rows_of_each(stack, there)
-    weight = now.multiplier / now.slack
+    """One predictor and corrector step of the ``moving`` curves, in place; returns curves whose matrix broke down.
+
+    With the slacks s, multipliers z, residual p of the bounds and the shares r = ds/s of the slacks, a step with the
+    products e s as target has dz = e - z (1 + r), so that z itself drops out of the right-hand side.
+    """
+    z, inverse = now.multiplier, rows.there / now.slack
+    weight = z * inverse
     band = stack.band()
-    rows.add_band(band, weight)
+    rows.add_band(band, weight[0] + weight[1])
     factor, bad = _factor(stack, band)
-    dual = stack.pull - stack.apply(now.c) - rows.transposed(now.multiplier)
-    primal = np.where(there, rows.limit - rows.values(now.c) - now.slack, 0.0)
-    inverse = 1 / now.slack
+    primal = np.where(rows.there, rows.limit - rows.values(now.c) - now.slack, 0.0)
+    pull = stack.pull - stack.apply(now.c) + rows.transposed(weight * primal)
 
-    def towards(target: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        push = (target - now.multiplier * primal) * inverse
-        dc = stack.free * dpbtrs(factor, dual - rows.transposed(push), lower=1)[0].ravel()
-        moved = rows.values(dc)
-        return dc, primal - moved * there, push + weight * moved
+    def towards(push: FloatArray) -> tuple[FloatArray, FloatArray]:
+        dc = stack.free * dpbtrs(factor, push, lower=1)[0].ravel()
+        share = rows.values(dc)
+        np.subtract(primal, share, out=share)
+        share *= inverse
+        return dc, share
 
-    full = now.slack * now.multiplier
-    dc, ds, dz = towards(-full)
-    length = _length(stack, now, ds, dz)
-    reach = stack.of_each(length)
-    after = _sum(stack, (now.slack + reach * ds) * (now.multiplier + reach * dz))
-    share = (after / np.maximum(_sum(stack, full), _TINY)) ** 3
-    centre = stack.of_each(np.clip(share, 1e-10, 1.0) * mean)
-    dc, ds, dz = towards((centre - full - ds * dz) * there)
-    sure = np.where(moving, np.minimum(1.0, 0.995 * _length(stack, now, ds, dz)), 0.0)
+    _, share = towards(pull)
+    reach = _length(stack, np.maximum(-share, 1 + share))
+    cross = share * (1 + share)
+    complement = z * now.slack
+    left = (1 - reach) * gap - reach**2 * _sum(stack, complement * cross)
+    centre = np.clip((left / np.maximum(gap, _TINY)) ** 3, 1e-10, 1.0) * gap / _rows_of_each(stack, rows.there)
+    target = stack.of_each(centre) * inverse + z * cross
+    dc, share = towards(pull - rows.transposed(target))
+    dz = target - z * (1 + share)
+    sure = np.where(
+        moving, np.minimum(1.0, 0.995 * _length(stack, np.maximum(-share, -dz / np.maximum(z, _TINY)))), 0.0
+    )
     sure[bad] = 0.0
-    reach = stack.of_each(sure)
-    now.c = now.c + reach * dc
-    now.slack = now.slack + reach * ds
-    now.multiplier = now.multiplier + reach * dz
+    far = stack.of_each(sure)
+    now.c = now.c + far * dc
+    now.slack = now.slack * (1 + far * share)
+    now.multiplier = z + far * dz
     return bad
 
 
-def _length(stack: Stack, now: _Iterate, ds: FloatArray, dz: FloatArray) -> FloatArray:
-    """Longest step (k,) that keeps slacks and multipliers from becoming negative; inf becomes large."""
-    fastest = np.maximum(-ds / now.slack, -dz / np.maximum(now.multiplier, _TINY)).max(axis=(0, 1))
-    return np.asarray(1.0 / np.maximum(stack.largest(fastest), 1e-3))
+def _length(stack: Stack, fastest: FloatArray) -> FloatArray:
+    """Longest step (k,) with no share (2, B, N) of a slack or multiplier gone; inf becomes large."""
+    return np.asarray(1.0 / np.maximum(stack.largest(fastest.max(axis=(0, 1))), 1e-3))
 
 
 def _factor(stack: Stack, band: FloatArray) -> tuple[FloatArray, list[int]]:

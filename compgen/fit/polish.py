@@ -18,10 +18,10 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs
 from compgen.core.csvio import FloatArray
 from compgen.fit.bounds import KEPT
 from compgen.fit.interior import RowStack
-from compgen.fit.stacked import Stack, band_of, gather, spread
+from compgen.fit.stacked import Stack
 
 ROUNDS, _PASSES = 12, 40
-_WEIGHT = 1e4
+_WEIGHT = 1e7
 _SIGN = 1e-8
 _LEFT, _EQUAL = 1e-11, 1e-11
 BoolArray = NDArray[np.bool_]
@@ -66,27 +66,20 @@ def equalities(
     norm = (rows.rows**2).sum(axis=1)
     weight = np.where(active != 0, _WEIGHT * height / np.where(norm > 0, norm, 1.0), 0.0)
     target = np.where(active > 0, rows.limit[0], np.where(active < 0, -rows.limit[1], 0.0))
-    more = np.empty_like(band)
-    for part, value in zip(rows.rows, weight, strict=True):
-        band_of(part * np.sqrt(value), more)
-        band += more
+    rows.add_band(band, weight)
     factor, info = dpbtrf(band, lower=1, overwrite_ab=1)
     if info:
         return None
     c, v, on = start.copy(), np.zeros_like(weight), active != 0
-    miss = np.where(on, gather(rows.rows, c) - target, 0.0)
+    miss = np.where(on, rows.along(c) - target, 0.0)
     for _ in range(_PASSES):
-        rest = stack.pull - stack.apply(c) - _transposed(rows, v + weight * miss)
+        rest = stack.pull - stack.apply(c) - rows.back(v + weight * miss)
         step = stack.free * dpbtrs(factor, rest, lower=1)[0].ravel()
         c = c + step
-        miss = np.where(on, gather(rows.rows, c) - target, 0.0)
+        miss = np.where(on, rows.along(c) - target, 0.0)
         v = v + weight * miss
         still = stack.largest(np.abs(step)) <= _LEFT * stack.largest(np.abs(c))
         exact = still & (stack.largest(np.abs(miss).max(axis=0)) <= _EQUAL)
         if exact.all():
             break
     return c, v, exact
-
-
-def _transposed(rows: RowStack, v: FloatArray) -> FloatArray:
-    return np.asarray(sum(spread(part, value) for part, value in zip(rows.rows, v, strict=True)))

@@ -18,8 +18,9 @@ from compgen.fit.polish import polish
 from compgen.fit.smooth import Smoother
 from compgen.fit.stacked import CurveProblem, Stack, curvatures_of
 
-#: The interior point method is broken off early: mostly the active bounds are known by then, or nearly.
-_FIRST_STEPS, _FIRST_ROUNDS = 10, 4
+#: The interior point method is broken off early, after this many steps and one more for each doubling of the nodes:
+#: mostly the active bounds are known by then, or nearly.
+_FIRST_STEPS, _FIRST_ROUNDS = 2, 4
 #: Curves are laid together up to so many nodes: more would leave the cache.
 _PORTION = 6000
 BoolArray = NDArray[np.bool_]
@@ -92,7 +93,7 @@ def _bounded(problems: Sequence[CurveProblem]) -> list[Solution]:
     stack = Stack.build(problems)
     free = stack.solve()
     rows = row_stack(stack, [problem.bounds for problem in problems], free)
-    near, multiplier, closed = interior(stack, rows, free, _FIRST_STEPS)
+    near, multiplier, closed = interior(stack, rows, free, _FIRST_STEPS + round(math.log2(stack.sizes.max())))
     curve, active, exact = polish(stack, rows, near, multiplier, _FIRST_ROUNDS)
     if not exact.all():
         again, nodes = ~exact, stack.of_each(~exact)

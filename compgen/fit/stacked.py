@@ -249,18 +249,3 @@ def spread(rows: FloatArray, v: FloatArray) -> FloatArray:
     out[1:] += (rows[1] * v)[:-1]
     out[2:] += (rows[2] * v)[:-2]
     return out
-
-
-def band_of(rows: FloatArray, out: FloatArray) -> None:
-    """Write R^T R of rows (3, N) as a lower band (3, N)."""
-    first, middle, last = rows
-    diagonal, product = first * first, middle * middle
-    diagonal[1:] += product[:-1]
-    np.multiply(last, last, out=product)
-    diagonal[2:] += product[:-2]
-    out[0] = diagonal
-    np.multiply(first, middle, out=diagonal)
-    np.multiply(middle, last, out=product)
-    diagonal[1:] += product[:-1]
-    out[1] = diagonal
-    np.multiply(first, last, out=out[2])
