@@ -235,6 +235,10 @@ def emulated(controller, texts, machine, position):
     """What the control adds (n, 3) by the test's own reading of the text, and its columns (n, 3, k)."""
     if controller == "siemens-cec":
         return cec_columns(texts["NC_CEC.INI"], machine.chain.name, position)[::-1]
+    if controller == "siemens-cec-eec":
+        columns, added = cec_columns(texts["NC_CEC.INI"], machine.chain.name, position)
+        pitch, values = straight_columns(straight_tables(controller, {"": texts["AX_EEC.INI"]}, machine), position)
+        return added + pitch @ values, np.concatenate([columns, pitch], axis=2)
     if controller in ("isg-csv", "etalon-exchange"):
         read, name = (isg_tables, "volcomp0.csv") if controller == "isg-csv" else (etalon_tables, "volcomp0.etalon.txt")
         columns, values = volumetric_columns(read(texts[name]), machine.chain.name, position)

@@ -16,6 +16,7 @@ from compgen.controllers.mitsubishi import Mitsubishi
 from compgen.controllers.neutral import Neutral
 from compgen.controllers.pmac import Pmac
 from compgen.controllers.siemens_cec import SiemensCec
+from compgen.controllers.siemens_cec_eec import SiemensCecEec
 from compgen.controllers.siemens_eec import SiemensEec
 from compgen.controllers.twincat_lists import TwincatLists
 from compgen.core.plugins import why_missing
@@ -33,6 +34,7 @@ CONTROLLERS: dict[str, AnyController] = {
     "heidenhain-kinematics": HeidenhainKinematics(),
     "mitsubishi": Mitsubishi(),
     "siemens-cec": SiemensCec(),
+    "siemens-cec-eec": SiemensCecEec(),
     "siemens-eec": SiemensEec(),
     "linuxcnc-comp": LinuxcncComp(),
     "linuxcnc-volumetric": LinuxcncVolumetric(),

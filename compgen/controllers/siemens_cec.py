@@ -109,7 +109,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         self, machine: Machine, settings: CecSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
     ) -> CecTables:
         """Return the tables with balanced folding, in whole units of the last decimal."""
-        return CecTables(folded_tables(basis, values, flip=settings.subtracts, mode=settings.mult_mode))
+        return cec_tables_of(machine, settings, basis, values)
 
     def with_reversal(
         self, machine: Machine, settings: CecSettings, tables: CecTables, reversal: ReversalCurves
@@ -222,6 +222,15 @@ def cec_terms(
     origin = machine.reference_point_mm
     ordinary = one_dimensional_terms(machine, errors, nodes, pairs, lever_origin_mm=origin)
     return ordinary + product_terms(machine, errors, nodes, origin)
+
+
+def cec_tables_of(
+    machine: Machine, settings: CecSettings, terms: Sequence[Term], values: Mapping[str, FloatArray]
+) -> CecTables:
+    """Return the tables of term values, rounded as written."""
+    travel = [axis.range_mm for axis in machine.axes]
+    mode = settings.mult_mode
+    return CecTables(folded_tables(terms, values, flip=settings.subtracts, mode=mode, travel_mm=travel))
 
 
 def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], settings: CecSettings) -> CecTables:

@@ -125,7 +125,12 @@ class _Set:
 
 
 def folded_tables(
-    terms: Sequence[Term], values: Mapping[str, FloatArray], *, flip: bool, mode: str
+    terms: Sequence[Term],
+    values: Mapping[str, FloatArray],
+    *,
+    flip: bool,
+    mode: str,
+    travel_mm: Sequence[tuple[float, float]] = (),
 ) -> dict[int, CecTable]:
     """Return the tables of a set of terms, numbered: ordinary ones, scaled angles, scaled levers.
 
@@ -135,12 +140,14 @@ def folded_tables(
     values : corrections by term name, mm and rad.
     flip : True if the control subtracts its total: the ordinary terms and the angles change sign, the levers do not.
     mode : which direct terms are folded away, a key of :data:`MULT_MODES`.
+    travel_mm : ends of the travel of X, Y, Z: the nodes of a lever over whose axis there is no term.
 
     Ordinary tables that are zero in every decimal, and products that stay below half of the last decimal in mm, are
     left out; if all are, the first ordinary table remains.
     """
     sign = -1 if flip else 1
-    nodes = {term.axis: term.nodes_mm for term in terms if term.axis is not None}
+    nodes = {axis: np.array(ends, dtype=np.float64) for axis, ends in enumerate(travel_mm)}
+    nodes |= {term.axis: term.nodes_mm for term in terms if term.axis is not None}
     work = _Set()
     products: dict[tuple[int, int], list[Term]] = {}
     for term in terms:

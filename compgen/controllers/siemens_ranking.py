@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import lstsq
 
 from compgen.controllers.base import Term
-from compgen.controllers.siemens_products import MULT_MODES
+from compgen.controllers.siemens_products import MULT_MODES, IntArray
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -85,7 +85,14 @@ def table_count(terms: Sequence[Term], mode: str) -> int:
     return len(ordinary) + len(levers) + angles
 
 
-def chosen_terms(machine: Machine, errors: ErrorTable, terms: Sequence[Term], mode: str, allowed: int | None) -> Choice:
+def chosen_terms(
+    machine: Machine,
+    errors: ErrorTable,
+    terms: Sequence[Term],
+    mode: str,
+    allowed: int | None,
+    beside: Sequence[Term] = (),
+) -> Choice:
     """Return the terms that ``allowed`` tables can hold and that leave the least error.
 
     Parameters
@@ -94,13 +101,14 @@ def chosen_terms(machine: Machine, errors: ErrorTable, terms: Sequence[Term], mo
     terms : everything that the control could hold.
     mode : reading of products, a key of ``MULT_MODES``.
     allowed : number of tables, None: all of them.
+    beside : terms that tables of another kind hold in any case.
     """
     wanted = table_count(terms, mode)
     if allowed is None or wanted <= allowed:
         return Choice(list(terms), (), wanted, allowed, wanted, 0.0)
-    gains = [_Gains.of(machine, errors, terms, output) for output in range(3)]
+    gains = [_Gains.of(machine, errors, terms, beside, output) for output in range(3)]
     picked = _best_sets(gains, mode, allowed)
-    names = {term.name for part in picked for term in part}
+    names = {term.name for part in picked for term in part} or {terms[0].name}
     kept = [term for term in terms if term.name in names]
     left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, picked, strict=True))
     dropped = [item for gain, part in zip(gains, picked, strict=True) for item in gain.missed(part)]
@@ -109,17 +117,27 @@ def chosen_terms(machine: Machine, errors: ErrorTable, terms: Sequence[Term], mo
 
 @dataclass(frozen=True)
 class _Gains:
-    """Least squares of the terms of one output axis; ``taken`` is in mm^2, the mean over the volume."""
+    """Least squares of the terms of one output axis; ``taken`` is in mm^2, the mean over the volume.
+
+    ``beside`` are terms that are there in any case and take no table.
+    """
 
     terms: tuple[Term, ...]
+    beside: tuple[Term, ...]
     normal: FloatArray
     right: FloatArray
-    columns: Mapping[str, slice]
+    columns: Mapping[str, IntArray]
 
     @classmethod
-    def of(cls, machine: Machine, errors: ErrorTable, terms: Sequence[Term], output: int) -> _Gains:
+    def of(
+        cls, machine: Machine, errors: ErrorTable, terms: Sequence[Term], beside: Sequence[Term], output: int
+    ) -> _Gains:
         nodes = tuple(
-            np.unique(np.concatenate([machine.axes[axis].nodes_mm, *(t.nodes_mm for t in terms if t.axis == axis)]))
+            np.unique(
+                np.concatenate(
+                    [machine.axes[axis].nodes_mm, *(t.nodes_mm for t in [*terms, *beside] if t.axis == axis)]
+                )
+            )
             for axis in range(3)
         )
         sample = volume_sample(machine, nodes, _MOST_POINTS, machine.emphasis)
@@ -127,16 +145,21 @@ class _Gains:
         wanted = -volumetric_error(machine, errors, sample.position_mm)[:, output]
         own = [term for term in terms if term.carrier[0].output == output]
         own = [term for term in own if _moves(machine, term)]
-        parts, columns, first = [], {}, 0
-        for term in own:
+        given = [term for term in beside if term.carrier[0].output == output]
+        parts: list[FloatArray] = []
+        columns: dict[str, IntArray] = {}
+        first = 0
+        for term in [*own, *given]:
             carrier = term.carrier_field(sample.position_mm, tool_mm)[:, output]
             parts.append(term.curve_matrix(sample.position_mm) * carrier[:, None])
-            columns[term.name] = slice(first, first + len(term.nodes_mm))
+            columns[term.name] = np.arange(first, first + len(term.nodes_mm))
             first += len(term.nodes_mm)
         design = np.hstack(parts) if parts else np.zeros((len(wanted), 0))
         scale = 1.0 / np.maximum(np.sqrt(np.sum(weight[:, None] * design**2, axis=0)), 1e-12)
         design = design * scale
-        return cls(tuple(own), design.T @ (weight[:, None] * design), design.T @ (weight * wanted), columns)
+        return cls(
+            tuple(own), tuple(given), design.T @ (weight[:, None] * design), design.T @ (weight * wanted), columns
+        )
 
     @property
     def of_all(self) -> float:
@@ -145,9 +168,10 @@ class _Gains:
 
     def taken(self, terms: Sequence[Term]) -> float:
         """Squares that a set of terms takes out, mm^2."""
-        if not terms:
+        held = [*terms, *self.beside]
+        if not held:
             return 0.0
-        where = np.concatenate([np.arange(*self.columns[t.name].indices(len(self.right))) for t in terms])
+        where = np.concatenate([self.columns[term.name] for term in held])
         solution = lstsq(self.normal[np.ix_(where, where)], self.right[where], cond=_UNDETERMINED)[0]
         return float(self.right[where] @ solution)
 
@@ -162,7 +186,7 @@ class _Gains:
 
     def by_count(self, mode: str, allowed: int) -> dict[int, tuple[float, tuple[Term, ...]]]:
         """Return the best set for every number of tables: (mm^2, terms)."""
-        best: dict[int, tuple[float, tuple[Term, ...]]] = {0: (0.0, ())}
+        best: dict[int, tuple[float, tuple[Term, ...]]] = {0: (self.taken(()), ())}
         for size in range(1, len(self.terms) + 1):
             for part in combinations(self.terms, size):
                 count = table_count(part, mode)
