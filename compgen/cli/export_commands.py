@@ -158,7 +158,10 @@ def read_command(
 @controller_option()
 @sample_options
 @click.option(
-    "--errors", required=True, type=click.Path(path_type=Path), help="*.errors.csv of the machine (um, urad), or an Etalon exchange file (mm, rad)."
+    "--errors",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="*.errors.csv of the machine (um, urad), or an Etalon exchange file (mm, rad).",
 )
 @click.option("--points", type=click.Path(path_type=Path), help="*.points.csv (mm); default: a grid over the volume.")
 @out_option
