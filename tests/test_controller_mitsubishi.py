@@ -164,6 +164,16 @@ def test_an_axis_that_stops_short_gets_positive_values_on_both_sides(tmp_path):
     assert table.values == (20, 20, 0, 20, 20, 20, 20, 20, 20)
 
 
+def test_steep_squareness_gets_shorter_intervals(tmp_path, make_errors):
+    """2.9 mm over a metre: 127 counts of 0.5 um hold 22 mm of it."""
+    machine = machine_of(tmp_path)
+    errors = make_errors(machine, squareness_rad=(2.9e-3, -1e-4, 3e-4))
+    made = export(machine, errors, "mitsubishi")
+    assert made.violations == []
+    intervals = {(t.output, t.base): float(t.interval_mm) for t in read_back(machine, made).sets}
+    assert 0.5 * 22.0 < intervals[0, 1] < 22.0
+
+
 def test_a_curve_that_is_too_steep_is_said_and_not_accepted(tmp_path):
     machine = machine_of(tmp_path, "interval_mm = { X = 400.0 }")
     nodes = machine.axes[0].nodes_mm

@@ -6,13 +6,13 @@ What the control is taken to do, and how sure that is, stands in ``templates/mit
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from decimal import ROUND_CEILING, Decimal
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from typing import Any
 
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
-from compgen.controllers.grids import Grid, equidistant_grid
+from compgen.controllers.grids import Grid, curve_nodes_mm, equidistant_grid
 from compgen.controllers.integers import IntegerCurve, best_integers, section_weights
 from compgen.controllers.mitsubishi_context import sheet_context
 from compgen.controllers.mitsubishi_settings import (
@@ -35,6 +35,9 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.points import Points
+
+#: The final curve may be steeper than the estimate by this factor: angular errors are spread over the volume.
+STEEPER = 1.1
 
 
 class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
@@ -110,23 +113,45 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
 
 
 def _grid(machine: Machine, settings: MitsubishiSettings, errors: ErrorTable, axis: int) -> Grid:
-    """Division points of a base axis: equal intervals in whole 0.001 mm, an equal share of the numbers for each set."""
+    """Division points of a base axis: equal intervals in whole 0.001 mm, an equal share of the numbers for each set.
+
+    The interval is the user's, else the widest that loses nothing that matters and keeps every value, with a margin,
+    within its range, as far as the numbers suffice.
+    """
     most = (settings.last_number - settings.first_number + 1) // len(settings.pairs)
-    output = None if settings.relative else axis
+
+    def grid_of(step_mm: float | None) -> Grid:
+        output = None if settings.relative else axis
+        return equidistant_grid(
+            machine, errors, axis, most=most, step_mm=step_mm, anchor=True, loss_mm=settings.loss_mm, output=output
+        )
+
     asked = settings.interval_mm[axis]
-    loss_mm = settings.loss_mm
-    grid = equidistant_grid(
-        machine, errors, axis, most=most, step_mm=asked, anchor=True, loss_mm=loss_mm, output=output
-    )
-    if grid.step % INTERVAL_QUANTUM_MM:
-        step = (grid.step / INTERVAL_QUANTUM_MM).to_integral_value(rounding=ROUND_CEILING) * INTERVAL_QUANTUM_MM
-        grid = equidistant_grid(machine, errors, axis, most=most, step_mm=float(step), anchor=True)
-    return grid
+    if asked is not None:
+        return grid_of(asked)
+    grid = grid_of(None)
+    largest = _largest_step(machine, settings, errors, axis, grid)
+    share = min(1.0, (HIGHEST_VALUE - 1) / max(STEEPER * largest, 1e-9))
+    if share == 1.0 and not grid.step % INTERVAL_QUANTUM_MM:
+        return grid
+    rounding = ROUND_CEILING if share == 1.0 else ROUND_FLOOR
+    quanta = (grid.step * Decimal(repr(share)) / INTERVAL_QUANTUM_MM).to_integral_value(rounding=rounding)
+    # Two nodes less: with the reference point as a node the ends may need one more on either side.
+    least = Decimal(repr(machine.axes[axis].length_mm)) / max(most - 3, 1) / INTERVAL_QUANTUM_MM
+    return grid_of(float(max(quanta, least.to_integral_value(rounding=ROUND_CEILING)) * INTERVAL_QUANTUM_MM))
+
+
+def _largest_step(machine: Machine, settings: MitsubishiSettings, errors: ErrorTable, axis: int, grid: Grid) -> float:
+    """Largest change of a wanted correction over one interval, in counts; it stays in proportion to the interval."""
+    fine = np.unique(np.concatenate([grid.nodes_mm, curve_nodes_mm(machine, errors, axis)]))
+    pairs = [pair for pair in settings.pairs if pair[1] == axis]
+    terms = one_dimensional_terms(machine, errors, [fine] * 3, pairs)
+    steepest = max(float(np.max(np.abs(np.diff(term.start) / np.diff(fine)))) for term in terms)
+    return steepest * float(grid.step) / settings.count_mm
 
 
 def _interval(nodes_mm: FloatArray) -> Decimal:
-    step = Decimal(repr(float(nodes_mm[1] - nodes_mm[0]))).quantize(INTERVAL_QUANTUM_MM)
-    return step
+    return Decimal(repr(float(nodes_mm[1] - nodes_mm[0]))).quantize(INTERVAL_QUANTUM_MM)
 
 
 def _best_counts(
