@@ -70,8 +70,10 @@ def _without_bounds(problems: Sequence[CurveProblem]) -> list[Solution | None]:
     """Fit without bounds; None for the curves that would break theirs."""
     stack = Stack.build(problems)
     curve = stack.solve()
-    breaks = _breaks(stack, [problem.bounds for problem in problems], curve).tolist()
-    return [None if bad else Solution(part) for part, bad in zip(stack.split(curve), breaks, strict=True)]
+    found: list[Solution | None] = [Solution(part) for part in stack.split(curve)]
+    for k in np.flatnonzero(_breaks(stack, [problem.bounds for problem in problems], curve)):
+        found[k] = None
+    return found
 
 
 def _breaks(stack: Stack, bounds: Sequence[Bounds], curve: FloatArray) -> BoolArray:

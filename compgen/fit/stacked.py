@@ -78,7 +78,7 @@ class Stack:
         starts = ends - sizes
         mean = (position[ends - 1] - position[starts]) / np.maximum(sizes - 1, 1)
         per_mm = _inverse_steps(position, ends)
-        level = np.array([2 * problem.mu for problem in problems]) * mean**3
+        level = np.array([2 * problem.mu for problem in problems]) * mean * mean * mean
         return cls(starts, sizes, held, per_mm, weight, _stiffness(per_mm, level.repeat(sizes)), pull)
 
     @cached_property
