@@ -158,7 +158,7 @@ def test_the_files_do_what_the_terms_say(tmp_path, make_errors, chain, options):
 
 
 @pytest.mark.parametrize("chain", ["WXYFZT", "WFYXZT"])
-@pytest.mark.parametrize("options", ["", 'sign = "correction"', 'generation = "power-of-two"'])
+@pytest.mark.parametrize("options", ["", 'sign = "correction"', 'generation = "power-of-two"\nmax_points = 60'])
 def test_exported_files_are_read_back_and_accepted(tmp_path, make_errors, chain, options):
     machine = machine_of(tmp_path, options, chain)
     errors = make_errors(machine)
@@ -320,6 +320,25 @@ def test_the_name_in_the_first_line_follows_the_file_if_that_is_wanted(tmp_path,
     assert made.files["AXIS_X.COM"].startswith("BEGIN AXIS_X .COM MM\r\nNR      AXISPOS")
 
 
+def test_words_behind_the_unit_and_lines_before_the_header_of_a_saved_table_stay(tmp_path, make_errors):
+    content = EMPTY.replace(b" MM\r\n", b" MM VERSION:2\r\n#TABLE of the control\r\n")
+    machine = with_template(tmp_path, content, 'begin_name = "file"')
+    made = export(machine, make_errors(machine), "heidenhain-com")
+    expected = "BEGIN AXIS_Y .COM MM VERSION:2\r\n#TABLE of the control\r\nNR      AXISPOS"
+    assert made.files["AXIS_Y.COM"].startswith(expected)
+    assert sorted(read_back(CONTROL, machine, made).tables) == [0, 1, 2]
+
+
+def test_an_assignment_saved_on_the_control_is_filled_in_too(tmp_path, make_errors):
+    saved = tmp_path / "SAVED.CMA"
+    saved.write_bytes(b"BEGIN CONF .CMA MM\r\nNR  ACTIVE  A           X               Y               Z\r\n[END]\r\n")
+    machine = machine_of(tmp_path, 'cma_template_from = "SAVED.CMA"')
+    made = export(machine, make_errors(machine), "heidenhain-com")
+    row = "0   *                   AXIS_X.COM      AXIS_Y.COM      AXIS_Z.COM"
+    assert made.files["CONFIG.CMA"] == saved.read_bytes().decode().replace("[END]", row + "\r\n[END]")
+    assert sorted(read_back(CONTROL, machine, made).tables) == [0, 1, 2]
+
+
 def test_a_saved_table_without_positions_needs_datum_and_spacing(tmp_path, make_errors):
     old = b"BEGIN Y .COM MM\nNR     X           Y           Z\n[END]\n"
     start = 'generation = "power-of-two"\n'
@@ -405,7 +424,7 @@ def test_columns_carry_the_names_of_the_control(tmp_path, make_errors):
         ("0.0030     0.0060\n[END]\n", "0.0030     0.00", 6, "truncated"),
         ("BEGIN", "ANFANG", 1, "first line"),
         (" MM", " INCH", 1, "inches"),
-        (" MM", "", 1, "first line|unit"),
+        (" MM", "", 1, "names no unit"),
         ("NR   AXISPOS", "NO   AXISPOS", 2, "header row"),
         ("     Z\n", "     Y\n", 2, "twice"),
         ("     Z\n", "     Q\n", 3, "no axis of the machine file"),

@@ -83,9 +83,7 @@ class HeidenhainSettings:
     def _named(self, layout: Layout, name: str) -> Layout:
         if self.keep_name:
             return layout
-        words = layout.before[0].split()
-        kind = re.sub(r"^.*\.", ".", words[-2])
-        first = f"BEGIN {name} {kind} MM" if words[-2].startswith(".") else f"BEGIN {name}{kind} MM"
+        first = re.sub(r"^(\s*BEGIN\s+)[^\s.]+", rf"\g<1>{name}", layout.before[0])
         return Layout((first, *layout.before[1:]), layout.columns, layout.after, layout.crlf, layout.source)
 
 

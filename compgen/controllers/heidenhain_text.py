@@ -21,6 +21,7 @@ from compgen.errors import InputError
 #: No table of a control is anywhere near this long, has lines of this length, or so much before its header.
 MOST_CHARACTERS, MOST_IN_LINE, MOST_BEFORE_HEADER = 2_000_000, 1000, 200
 BEGIN, END, NUMBER_COLUMN = "BEGIN", "[END]", "NR"
+UNITS = ("MM", "INCH", "IN")
 
 _WORD = re.compile(r"[^ \t]+")
 _NUMBER = re.compile(r"[+-]?\d{1,7}(?:\.\d{1,9})?", re.ASCII)
@@ -67,7 +68,8 @@ class TextTable:
     @property
     def kind(self) -> str:
         """Extension of the table's name in its first line, e.g. ``COM``; empty if there is none."""
-        found = re.search(r"\.([A-Za-z]{1,4})$", " ".join(self.words[1:-1]))
+        unit = next(k for k in range(2, len(self.words)) if self.words[k].upper() in UNITS)
+        found = re.search(r"\.([A-Za-z]{1,4})$", self.words[unit - 1])
         return found.group(1).upper() if found else ""
 
     def number(self, row: Row, column: str) -> Decimal:
@@ -128,11 +130,11 @@ def _first_line(file: SourceFile, lines: Sequence[str]) -> tuple[str, ...]:
     words = tuple(lines[0].split())
     if len(words) < 3 or words[0] != BEGIN:
         raise file.fail(f"{one_line(lines[0])[:40]!r} is not a first line such as 'BEGIN AXIS_Y .COM MM'", 1)
-    unit = words[-1].upper()
+    unit = next((word.upper() for word in words[2:] if word.upper() in UNITS), "")
     if unit in ("INCH", "IN"):
         raise file.fail("the table is in inches; only tables in mm are read", 1)
     if unit != "MM":
-        raise file.fail(f"the first line ends with {one_line(words[-1])[:20]!r}; the unit MM is due there", 1)
+        raise file.fail("the first line names no unit; MM is due behind the name", 1)
     return words
 
 
