@@ -181,8 +181,10 @@ def _list_of(
         _units(cross_term.nodes_mm),
         rounded(settings, settings.cross_factor * values[cross_term.name]),
     )
-    masters = _masters_of(settings, slave, plane_terms, cross.master)
-    plane = _plane_table(machine, settings, masters, plane_terms, values) if plane_terms else None
+    plane = None
+    if plane_terms:
+        masters = _masters_of(settings, slave, plane_terms, cross.master)
+        plane = _plane_table(machine, settings, masters, plane_terms, values)
     nodes = _units(screw_term.nodes_mm)
     return AxisList(
         Screw(
