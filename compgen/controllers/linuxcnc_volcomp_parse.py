@@ -61,11 +61,13 @@ class _Words:
 
     def number(self, what: str) -> float:
         """Return the next word as a finite number."""
-        return number_in(self.source, self.line, self.take(what), what)
+        word = self.take(what)  # first: it may stand in the next line
+        return number_in(self.source, self.line, word, what)
 
     def whole(self, what: str, low: int, high: int) -> int:
         """Return the next word as a whole number from ``low`` to ``high``."""
-        return whole_in(self.source, self.line, self.take(what), what, (low, high))
+        word = self.take(what)
+        return whole_in(self.source, self.line, word, what, (low, high))
 
     def step(self) -> float:
         """Return the next word as a number above zero."""

@@ -134,13 +134,14 @@ def write_file(path: str | Path, content: str | bytes) -> Path:
     return folder.commit()[target.name]
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """Return the contents of ``path`` or raise an InputError that says why not."""
+def read_bytes(path: str | Path, most: int = -1) -> bytes:
+    """Return the contents of ``path``, at most ``most`` bytes of it, or raise an InputError that says why not."""
     source = Path(path)
     try:
         if source.is_dir():
             raise InputError("is a folder; a file is needed", file=source)
-        return source.read_bytes()
+        with source.open("rb") as stream:
+            return stream.read(most)
     except FileNotFoundError as error:
         raise InputError("no such file", file=source) from error
     except OSError as error:

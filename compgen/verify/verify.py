@@ -29,6 +29,9 @@ from compgen.verify.safety import Safety, SafetyLimits, safety_of
 #: Errors that stay uncorrected by less than this are not named.
 NAMED_FROM_MM = 0.1 * MM_PER_UM
 
+#: Largest controller file that is read; the largest tables that the controls take have some 200 000 rows.
+MOST_BYTES, MOST_LINES = 20_000_000, 250_000
+
 #: A control that cannot express more than this share of the largest error gives a partial compensation.
 PARTIAL_SHARE = 0.1
 
@@ -81,20 +84,35 @@ def read_tables(machine: Machine, paths: Sequence[str | Path] | str | Path, cont
     files = [Path(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
     if not files:
         raise InputError("no table file was given")
-    contents = [(path, read_bytes(path)) for path in files]
+    contents = [(path, _read_limited(path)) for path in files]
     sources = [SourceFile(path, _decode(path, content)) for path, content in contents]
     tables = control.parse(machine, settings, sources)
     return ReadTables(control, settings, tables, tuple((path.name, sha256_of(content)) for path, content in contents))
 
 
+def _read_limited(path: Path) -> bytes:
+    """Contents of a file; one that is far larger than any table is refused before anybody looks for numbers in it."""
+    content = read_bytes(path, MOST_BYTES + 1)
+    lines = content.count(b"\n")
+    if len(content) <= MOST_BYTES and lines <= MOST_LINES:
+        return content
+    _decode(path, content)
+    what = f"{MOST_LINES} lines" if lines > MOST_LINES else f"{MOST_BYTES // 1_000_000} MB"
+    message = f"goes on beyond {what}; no controller table does"
+    raise InputError(message, file=path, line=min(lines, MOST_LINES) + 1)
+
+
 def _decode(path: Path, content: bytes) -> str:
     try:
-        return content.decode("ascii")
+        text = content.decode("ascii")
+        at = text.find("\0")
     except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        raise InputError(
-            "holds a byte that is not ASCII; controller tables are ASCII text", file=path, line=line
-        ) from None
+        text, at = "", error.start
+    if at < 0:
+        return text
+    what = "a NUL character" if text else "a byte that is not ASCII"
+    line = content[:at].count(b"\n") + 1
+    raise InputError(f"holds {what}; controller tables are ASCII text", file=path, line=line)
 
 
 @dataclass(frozen=True)
