@@ -92,7 +92,7 @@ def test_spacing_counts_and_positions_are_those_of_the_manual():
 
 
 def test_a_table_with_datum_and_spacing_of_the_manual_stands_on_its_positions(tmp_path, make_errors):
-    options = 'generation = "power-of-two"\nspacing_exponent = { Y = 16 }\ndatum_mm = { Y = -90.0 }'
+    options = 'generation = "power-of-two"\nspacing_exponent = { X = 20, Y = 16, Z = 20 }\ndatum_mm = { Y = -90.0 }'
     machine = machine_of(tmp_path, options)
     made = export(machine, make_errors(machine), "heidenhain-com")
     positions = [line.split()[1] for line in made.files["AXIS_Y.COM"].splitlines()[2:-1]]
@@ -344,7 +344,7 @@ def test_a_saved_table_without_positions_needs_datum_and_spacing(tmp_path, make_
     start = 'generation = "power-of-two"\n'
     with pytest.raises(InputError, match="datum_mm"):
         CONTROL.read_settings(with_template(tmp_path, old, start))
-    stated = "datum_mm = { X = -320.0, Y = -100.0, Z = -810.0 }\nspacing_exponent = { X = 17, Y = 16, Z = 17 }"
+    stated = "datum_mm = { X = -320.0, Y = -100.0, Z = -810.0 }\nspacing_exponent = { X = 20, Y = 16, Z = 20 }"
     machine = with_template(tmp_path, old, start + stated)
     errors = make_errors(machine)
     made = export(machine, errors, "heidenhain-com")
