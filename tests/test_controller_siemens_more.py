@@ -620,6 +620,82 @@ def test_a_measured_error_goes_into_the_encoder_table_as_it_is():
     assert -199.0 + 0.010 + moved[0, 0] == pytest.approx(-199.0, abs=ARITHMETIC)
 
 
+# --- volumetric compensation whose format is not public ------------------------------------------------------------
+
+VCS = """{% for error in errors21 %}
+{{ error.name }} {{ error.kind }} {{ error.axis or "-" }} {{ error.unit }} {{ error.known }}
+{% for value in error.value %}
+{{ (error.position_mm[loop.index0] if error.position_mm else 0) | fixed(3) }} {{ value | fixed(9) }}
+{% endfor %}
+{% endfor %}
+; {{ machine_name }} {{ chain }} {{ input_sha256[:12] }}
+"""
+
+
+def vcs_folder(folder, name="VCS.DAT.j2", text=VCS):
+    path = folder / "siemens-cec-eec" / "companion" / name
+    path.parent.mkdir(parents=True)
+    path.write_text(text)
+    return folder
+
+
+def test_a_template_of_the_user_gets_the_21_errors_and_stands_beside_the_verified_files(tmp_path):
+    machine = machine_with("WFYXZT")
+    errors = errors_of(machine).only("EXX", "EBY", "EC0Y")
+    made = export(machine, errors, "siemens-cec-eec", templates=vcs_folder(tmp_path / "own"))
+    text = made.companions["VCS.DAT"]
+    blocks = {line.split()[0]: line.split()[1:] for line in text.splitlines() if re.match(r"E[A-C X-Z0][A-Z0]", line)}
+    assert len(blocks) == 21
+    assert blocks["EXX"] == ["linear", "X", "mm", "True"]
+    assert blocks["EBY"] == ["angular", "Y", "rad", "True"]
+    assert blocks["EA0Z"] == ["squareness", "-", "rad", "False"]
+    lines = text.splitlines()
+    first = lines.index("EXX linear X mm True")
+    for row, position, value in zip(
+        lines[first + 1 : first + 8], errors.curves["EXX"].position_mm, errors.curves["EXX"].value, strict=True
+    ):
+        written = [float(cell) for cell in row.split()]
+        assert written[0] == pytest.approx(position, abs=5.1e-4)  # as the template rounds
+        assert written[1] == pytest.approx(value, abs=5.1e-10)
+    assert lines[lines.index("EC0Y squareness - rad True") + 1] == "0.000 0.000070000"
+    paths = made.write(tmp_path / "out")
+    assert sorted(path.name for path in paths) == ["AX_EEC.INI", "NC_CEC.INI"]
+    assert (tmp_path / "out" / "VCS.DAT").read_text() == text
+    assert [item["name"] for item in made.manifest["companions"]] == ["VCS.DAT"]
+    assert any("VCS.DAT comes from a template of yours: it is not read back" in note for note in made.warnings)
+    assert verify(machine, read_tables(machine, paths, "siemens-cec-eec"), errors).reasons == ()
+
+
+def test_line_ends_of_a_users_file_follow_the_name_of_its_template(tmp_path):
+    machine = machine_with()
+    folder = vcs_folder(tmp_path, "V.TXT.crlf.j2", "a\nb\n")
+    assert export(machine, errors_of(machine), "siemens-cec-eec", templates=folder).companions == {
+        "V.TXT": "a\r\nb\r\n"
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("NC_CEC.INI.j2", "x", "'NC_CEC.INI' is no free file name"),
+        ("result.json.j2", "x", "'result.json' is no free file name"),
+        ("V.TXT.j2", "{{ errors21[0].valu }}", "has no attribute 'valu'"),
+        ("V.TXT.j2", "{{ errors22 }}", "'errors22' is undefined"),
+        ("V.TXT.j2", "{% for %}", "the template cannot be rendered"),
+    ],
+)
+def test_wrong_templates_of_a_user_are_errors(tmp_path, name, text, message):
+    machine = machine_with()
+    with pytest.raises(InputError) as caught:
+        export(machine, errors_of(machine), "siemens-cec-eec", templates=vcs_folder(tmp_path, name, text))
+    assert message in str(caught.value)
+
+
+def test_the_control_without_public_format_is_refused_with_the_way_round():
+    with pytest.raises(InputError, match="no controller is named 'siemens-vcs': the file format .* is not public"):
+        export(machine_with(), errors_of(machine_with()), "siemens-vcs")
+
+
 # --- malformed files -----------------------------------------------------------------------------------------------
 
 

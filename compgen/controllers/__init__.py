@@ -44,8 +44,17 @@ CONTROLLERS: dict[str, AnyController] = {
 }
 
 
+#: Controls that are asked for and whose file format no public document describes: what there is instead.
+NOT_PUBLIC = {
+    "siemens-vcs": "the file format of the SINUMERIK volumetric compensation system is not public; export with another "
+    "control and --templates FOLDER, where FOLDER/<control>/companion/<file name>.j2 is your own template with the 21 errors",
+}
+
+
 def controller_named(name: str) -> AnyController:
     """Return the control ``name`` or raise an InputError that lists what there is."""
+    if name in NOT_PUBLIC and name not in CONTROLLERS:
+        raise InputError(f"no controller is named {name!r}: {NOT_PUBLIC[name]}")
     if name not in CONTROLLERS:
         raise InputError(f"no controller is named {name!r}; {nearest(name, CONTROLLERS)}{why_missing('control', name)}")
     return CONTROLLERS[name]

@@ -16,6 +16,7 @@ from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.reversal import WORTH_MM, ReversalCurves, format_reversal, reversal_name
 from compgen.errors import InputError
+from compgen.export.companions import companion_files, errors_context
 from compgen.export.render import Format, load_format, render, render_files
 from compgen.export.synthesis import synthesize
 
@@ -43,6 +44,7 @@ class Export:
     preflight : text of ``preflight.md``.
     violations : limits of the control that the tables break; not empty means not acceptable.
     warnings : what the user should know.
+    companions : text of files that the user's own templates make beside those of the control; never read back.
     """
 
     controller: str
@@ -51,6 +53,7 @@ class Export:
     preflight: str
     violations: Sequence[str] = ()
     warnings: Sequence[str] = ()
+    companions: Mapping[str, str] = field(default_factory=dict)
 
     def write(
         self, folder: str | Path, *, accepted: bool | None = None, beside: Mapping[str, str] | None = None
@@ -63,7 +66,7 @@ class Export:
         good = not self.violations if accepted is None else accepted
         prefix = "" if good else REJECTED_PREFIX
         output = OutputFolder(folder)
-        for name, text in self.files.items():
+        for name, text in {**self.files, **self.companions}.items():
             output.add(prefix + name, text.encode("ascii", "replace"))
         manifest = {**self.manifest, "accepted": good, "file_prefix": prefix}
         output.add("manifest.json", json.dumps(manifest, indent=2) + "\n")
@@ -71,7 +74,7 @@ class Export:
         for name, text in (beside or {}).items():
             output.add(name, text)
         paths = output.commit()
-        for name in self.files:
+        for name in (*self.files, *self.companions):
             stale = output.folder / (name if prefix else REJECTED_PREFIX + name)
             if stale.exists():
                 stale.replace(output.folder / f"PREVIOUS-{stale.name}")
@@ -139,11 +142,27 @@ def export(
     own = {**own, "warnings": [*own["warnings"], *control.left_out(machine, settings, errors), *machine.emphasis.notes]}
     common = export_context(machine, errors, controller, provenance or Provenance(), reversal)
     files = render_files(card, {**common, **own}, templates)
-    described = [{"name": name, "sha256": sha256_of(text.encode("ascii", "replace"))} for name, text in files.items()]
+    with_errors = {**common, **own, "errors21": errors_context(machine, errors)}
+    companions = companion_files(card, with_errors, files, templates)
+    own = {**own, "warnings": [*own["warnings"], *_not_read_back(companions)]}
+    described = _described(files)
     violations = control.violations(machine, settings, tables)
     preflight = render(card, "preflight.md.j2", {**common, **own, "files": described}, templates)
-    manifest = _manifest(common, card, own, described, machine)
-    return Export(controller, files, {**manifest, "violations": violations}, preflight, violations, own["warnings"])
+    manifest = {**_manifest(common, card, own, described, machine), "violations": violations}
+    if companions:
+        manifest["companions"] = _described(companions)
+    return Export(controller, files, manifest, preflight, violations, own["warnings"], companions)
+
+
+def _described(files: Mapping[str, str]) -> list[dict[str, str]]:
+    return [{"name": name, "sha256": sha256_of(text.encode("ascii", "replace"))} for name, text in files.items()]
+
+
+def _not_read_back(companions: Mapping[str, str]) -> list[str]:
+    return [
+        f"{name} comes from a template of yours: it is not read back, and nothing in it is verified"
+        for name in companions
+    ]
 
 
 def rerender(

@@ -39,7 +39,7 @@ VARIANTS: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]] = {
 }
 #: Settings that the machine file must state for an export, and what a comparison may take instead: both signs leave
 #: the same residual.
-ASSUMED: Mapping[str, Mapping[str, Any]] = {"siemens-cec": {"sign": "error"}}
+ASSUMED: Mapping[str, Mapping[str, Any]] = {"siemens-cec": {"sign": "error"}, "siemens-cec-eec": {"sign": "error"}}
 
 
 @dataclass(frozen=True)
@@ -260,10 +260,20 @@ class _Variant:
     notes: tuple[str, ...]
 
 
+def _readable(machine: Machine, name: str) -> bool:
+    """Whether the machine file says all that a control must know."""
+    try:
+        controller_named(name).read_settings(machine)
+    except CompgenError:
+        return False
+    return True
+
+
 def _variants(machine: Machine, name: str) -> list[_Variant]:
     section = machine.controller_settings(name)
     stated = dict(section.data)
-    assumed = {key: value for key, value in ASSUMED.get(name, {}).items() if key not in stated}
+    assumed = {} if _readable(machine, name) else ASSUMED.get(name, {})
+    assumed = {key: value for key, value in assumed.items() if key not in stated}
     notes = tuple(f"{key} is not stated in the machine file; {value!r} is taken here" for key, value in assumed.items())
     found = []
     for words, changes in VARIANTS.get(name, (("", {}),)):
