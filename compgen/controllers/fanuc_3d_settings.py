@@ -70,7 +70,7 @@ def read_volume_settings(machine: Machine) -> VolumeSettings:
         interval_mm=_per_axis(section.section("interval_mm", required=False), _interval, (None, None, None)),
         loss_mm=take_loss_mm(section),
         most_points=section.take("most_points", tomlio.whole(2, 1000), 25),
-        most_in_all=section.take("most_in_all", tomlio.whole(8, 100_000), 15625),
+        most_in_all=section.take("most_in_all", tomlio.whole(8, 50_000), 15625),
         value_low=section.take("value_low", tomlio.whole(-32768, -1), -128),
         value_high=section.take("value_high", tomlio.whole(1, 32767), 127),
         order=section.take("order", _order, (0, 1, 2)),

@@ -58,7 +58,7 @@ def read_volume_style(path: Path) -> VolumeStyle:
 def volume_style_of(file: SourceFile) -> VolumeStyle:
     """Return the style of punched data from their text; see :func:`read_volume_style`."""
     records = list(read_records(file))
-    data = [record for record in records if record.number not in PARAMETERS]
+    parameters, data = parted(records)
     if not data:
         raise file.fail("holds no compensation data; punch the table of three-dimensional compensation", 1)
     form = form_of(data[0])
@@ -70,7 +70,6 @@ def volume_style_of(file: SourceFile) -> VolumeStyle:
     style = spacing_of(frame_of(file, records, data), data)
     texts = [text for record in data for letter, text in record.words() if letter in "PXYZ"]
     padded = [text.lstrip("+-").rstrip(".") for text in texts]
-    parameters = [record for record in records if record.number in PARAMETERS]
     style = replace(
         style,
         point_digits=width_of(data, 5),
@@ -85,6 +84,22 @@ def volume_style_of(file: SourceFile) -> VolumeStyle:
         "the order of the points cannot be told from the sample; `order` in the machine file says it",
     )
     return VolumeStyle(style, form, data[0].number, bool(parameters), notes)
+
+
+def parted(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
+    """Split records into parameters 10800 ... 10814 and data, whose numbers may run through those as well.
+
+    A record of type Q1 is a parameter, one of type Q0 is data. Without type words a number of that range is data if
+    the records of the numbers before and behind the range are there too.
+    """
+    numbers = {record.number for record in records}
+    through = {PARAMETERS[0] - 1, PARAMETERS[-1] + 1} <= numbers
+    found: tuple[list[Record], list[Record]] = ([], [])
+    for record in records:
+        kind, _ = type_word(record, record.words())
+        parameter = record.number in PARAMETERS and (kind == 1 or (kind is None and not through))
+        found[0 if parameter else 1].append(record)
+    return found
 
 
 def form_of(record: Record) -> str:

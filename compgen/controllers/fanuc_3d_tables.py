@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from compgen.controllers.base import SourceFile, Usage, coverage_violations
 from compgen.controllers.fanuc_3d_settings import VolumeSettings
-from compgen.controllers.fanuc_3d_style import PARAMETERS, form_of
+from compgen.controllers.fanuc_3d_style import PARAMETERS, form_of, parted
 from compgen.controllers.fanuc_text import Record, read_records, type_word
 from compgen.controllers.grids import Grid
 from compgen.core.csvio import FloatArray
@@ -27,7 +27,7 @@ from compgen.errors import InputError
 
 COLUMNS = "point,x_mm,y_mm,z_mm,x_counts,y_counts,z_counts"
 #: No table is as long as this, nor any value beyond this.
-MOST_CHARACTERS, MOST_VALUE = 12_000_000, 1_000_000
+MOST_CHARACTERS, MOST_ROWS, MOST_VALUE = 8_000_000, 50_000, 1_000_000
 _ROW = re.compile(
     r"(\d{1,6}),(-?\d{1,6}(?:\.\d{1,6})?),(-?\d{1,6}(?:\.\d{1,6})?),(-?\d{1,6}(?:\.\d{1,6})?)((?:,-?\d{1,7}){3})"
 )
@@ -143,6 +143,8 @@ def _rows(file: SourceFile) -> tuple[dict[str, tuple[str, int]], list[Row]]:
             header = True
         elif bare:
             rows.append(_row(file, bare, line))
+            if len(rows) > MOST_ROWS:
+                raise file.fail(f"holds more than {MOST_ROWS} rows; that is no table", line)
     if not rows:
         raise file.fail("holds no vertex", len(file.text.splitlines()) or 1)
     declared = keys.get("rows", ("none", 1))
@@ -184,17 +186,15 @@ def _read_records(
     machine: Machine, settings: VolumeSettings, file: SourceFile, beside: VolumeTable | None
 ) -> VolumeTable:
     """Read records in the style of the control; the grid is that of parameters 10803 ... 10814, else of the CSV."""
-    records = list(read_records(file))
+    own, data = parted(list(read_records(file)))
     parameters: dict[int, tuple[str, Record]] = {}
-    for record in records:
-        if record.number in PARAMETERS:
-            _, words = type_word(record, record.words())
-            if len(words) != 1 or words[0][0] != "P":
-                raise record.fail("a single value word P is due, e.g. P11")
-            if record.number in parameters:
-                raise record.fail(f"stands here a second time (first in line {parameters[record.number][1].line})")
-            parameters[record.number] = words[0][1], record
-    data = [record for record in records if record.number not in PARAMETERS]
+    for record in own:
+        _, words = type_word(record, record.words())
+        if len(words) != 1 or words[0][0] != "P":
+            raise record.fail("a single value word P is due, e.g. P11")
+        if record.number in parameters:
+            raise record.fail(f"stands here a second time (first in line {parameters[record.number][1].line})")
+        parameters[record.number] = words[0][1], record
     shape = _frame(machine, file, parameters) if parameters else beside
     if shape is None:
         raise file.fail("holds no parameters 10800 to 10814; give VOLUME.csv beside it, which has the grid")
