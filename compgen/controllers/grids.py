@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import ROUND_CEILING, Decimal
 
 import numpy as np
@@ -95,6 +95,7 @@ def equidistant_grid(
     anchor: bool = False,
     loss_mm: float = NEGLIGIBLE_LOSS_MM,
     output: int | None = None,
+    products: bool = True,
 ) -> Grid:
     """Return an equidistant grid that covers the travel.
 
@@ -107,11 +108,13 @@ def equidistant_grid(
     loss_mm : loss by interpolation, as a displacement of the tool, that is worth no further node; a tenth of the
         standard uncertainty of a curve is not either.
     output : only curves that move this axis count; default all.
+    products : False if the control multiplies curves with levers itself, so that only the curves have to be held.
     """
     low, high = machine.axes[axis].range_mm
     if step_mm is not None:
         return _grid(machine, axis, Decimal(repr(step_mm)), anchor)
     curves = [_Held.of(machine, name, curve, loss_mm) for name, curve in _curves_of(errors, axis, machine, output)]
+    curves = curves if products else [replace(item, bent=False) for item in curves]
     tried: list[tuple[float, Grid]] = []
     for grid in _candidates(machine, errors, axis, anchor, most):
         nodes_mm = grid.nodes_mm

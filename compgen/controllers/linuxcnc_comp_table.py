@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.controllers.base import SourceFile
-from compgen.controllers.linuxcnc_text import SHOWN, lines_of, number_in
+from compgen.controllers.linuxcnc_text import SHOWN, check_size, lines_of, number_in
 from compgen.core.csvio import FloatArray
 
 #: Rows that LinuxCNC keeps, and characters of a line that it reads.
 MOST_ROWS, LONGEST_LINE = 256, 254
+_MOST_CHARACTERS = 1_000_000
 #: A step of the correction at standstill acts at once below the first share of a T^2, is ramped above the second, and
 #: never acts in between (a: joint acceleration, T: servo period).
 AT_ONCE, RAMPED = 0.25, 0.5
@@ -86,6 +87,7 @@ def parse_comp(source: SourceFile, file_type: int) -> CompTable:
         with the line, for what makes the control stop reading without a word (a comment, a blank line, text, a decimal
         comma), for rows that it drops (more than 256, or not increasing), and for a file that was cut.
     """
+    check_size(source, _MOST_CHARACTERS)
     rows: list[tuple[float, ...]] = []
     blank = 0
     for line, text, ended in lines_of(source):

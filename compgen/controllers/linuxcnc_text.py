@@ -10,14 +10,30 @@ from compgen.controllers.base import SourceFile
 
 #: A number as C reads it with %lf, less hexadecimal digits, ``inf`` and ``nan``.
 _NUMBER = re.compile(r"[+-]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][+-]?\d{1,4})?")
+_BLANK = re.compile(r"[ \t\r\n]*+")
 #: What is quoted of a wrong word.
 SHOWN = 40
 
 
+def check_size(source: SourceFile, most: int) -> None:
+    """Raise InputError for a text that is longer than any file of its kind."""
+    if len(source.text) > most:
+        raise source.fail(f"has {len(source.text)} characters; such a file has at most {most}: it is no table", 1)
+
+
 def lines_of(source: SourceFile) -> Iterator[tuple[int, str, bool]]:
-    """Yield number (from 1), text without its end, and whether the line has an end, of each line (LF or CRLF)."""
+    """Yield number (from 1), text without its end, and whether the line has an end, of each line (LF or CRLF).
+
+    Of blank lines behind each other, however many, only the first is yielded.
+    """
     text, start, number = source.text, 0, 1
     while start < len(text):
+        blank = _BLANK.match(text, start)
+        after = text.rfind("\n", start, blank.end() if blank else start) + 1
+        if after > start:
+            yield number, "", True
+            start, number = after, number + text.count("\n", start, after)
+            continue
         end = text.find("\n", start)
         last = len(text) if end < 0 else end
         yield number, text[start:last].removesuffix("\r"), end >= 0

@@ -19,7 +19,7 @@ from compgen.errors import InputError
 #: Factors of a term, in the words of the file.
 LEVERS = ("1", "x", "y", "z", "tx", "ty", "tz")
 #: Limits of ``volcomp.h``.
-MOST_CURVES, MOST_TERMS, MOST_NODES, MOST_VERTICES, LONGEST_NAME = 64, 512, 100_000, 4_000_000, 31
+MOST_CURVES, MOST_TERMS, MOST_NODES, MOST_VERTICES, LONGEST_NAME = 64, 512, 10_000, 100_000, 31
 #: The iteration of the inverse ends when no axis moves by more than this, or fails after so many rounds.
 LAST_STEP_MM, MOST_ROUNDS = 1e-13, 50
 
@@ -37,7 +37,7 @@ class VolCurve:
     @property
     def nodes_mm(self) -> FloatArray:
         """Positions of the values, shape (n,)."""
-        return self.first_mm + self.step_mm * np.arange(len(self.values))
+        return np.asarray(self.first_mm + self.step_mm * np.arange(len(self.values)), dtype=np.float64)
 
     def at(self, position_mm: FloatArray) -> FloatArray:
         """Value at positions (m,)."""
@@ -47,7 +47,7 @@ class VolCurve:
         right = np.minimum(left + 1, last)
         below = self.values[left]
         between = below + (ratio - left) * (self.values[right] - below)
-        return np.where(ratio >= last, self.values[last], between)
+        return np.asarray(np.where(ratio >= last, self.values[last], between))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from itertools import chain
 import numpy as np
 
 from compgen.controllers.base import SourceFile
-from compgen.controllers.linuxcnc_text import SHOWN, lines_of, number_in, whole_in
+from compgen.controllers.linuxcnc_text import SHOWN, check_size, lines_of, number_in, whole_in
 from compgen.controllers.linuxcnc_volcomp import (
     LEVERS,
     LONGEST_NAME,
@@ -30,6 +30,7 @@ from compgen.controllers.linuxcnc_volcomp import (
 from compgen.core.csvio import FloatArray
 
 _LONGEST_LINE = 4096
+_MOST_CHARACTERS = 32_000_000
 _MAGIC = ("volcomp", "1")
 
 
@@ -89,6 +90,7 @@ class _Words:
 
 def parse_volcomp(source: SourceFile) -> VolTable:
     """Read a table; InputError with the line for anything that the kinematics module refuses."""
+    check_size(source, _MOST_CHARACTERS)
     words = _Words(source)
     for due in _MAGIC:
         if (word := words.take("'volcomp 1'")) != due:

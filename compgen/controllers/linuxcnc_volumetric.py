@@ -48,6 +48,8 @@ from compgen.model.volumetric import tool_of
 
 #: Values of a grid are written with the digits of lengths; eight of them and the rounding of all curves of one axis.
 _ROUNDED_CURVES = 12
+#: Vertices of a grid along one axis: 46 x 46 x 46 is within what the module takes.
+MOST_ALONG_AXIS = 46
 #: A table whose errors change by more than this per mm of travel is refused; real machines stay below 0.01.
 STEEPEST = 0.5
 
@@ -89,9 +91,16 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         return settings
 
     def basis(self, machine: Machine, settings: VolumetricSettings, errors: ErrorTable) -> list[Term]:
-        """Return one term per error, on equidistant nodes; the module evaluates E = C P itself."""
+        """Return one term per error, on equidistant nodes; the module evaluates E = C P itself, a grid holds products."""
         nodes = [
-            equidistant_grid(machine, errors, axis, most=settings.most_nodes, loss_mm=settings.loss_mm).nodes_mm
+            equidistant_grid(
+                machine,
+                errors,
+                axis,
+                most=settings.most_nodes if settings.form == "curves" else min(settings.most_nodes, MOST_ALONG_AXIS),
+                loss_mm=settings.loss_mm,
+                products=settings.form == "grid",
+            ).nodes_mm
             for axis in range(3)
         ]
         return error_terms(machine, errors, nodes)

@@ -26,9 +26,9 @@
 
 #define VOLCOMP_CURVES 64
 #define VOLCOMP_TERMS 512
-#define VOLCOMP_NODES 100000
-#define VOLCOMP_VERTICES 4000000
-#define VOLCOMP_BYTES (512L << 20)
+#define VOLCOMP_NODES 10000
+#define VOLCOMP_VERTICES 100000
+#define VOLCOMP_BYTES (64L << 20)
 #define VOLCOMP_NAME 32
 // The iteration ends when no axis moves by more than this, mm; a table that needs more rounds is refused.
 #define VOLCOMP_STEP 1e-13
