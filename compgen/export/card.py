@@ -19,7 +19,11 @@ EXAMPLE_MACHINE = "zha-gantry"
 
 @dataclass(frozen=True)
 class Setting:
-    """One key of ``[controllers.<name>]``: ``default`` is None without one, ``allowed`` what its check expects."""
+    """One key of ``[controllers.<name>]``.
+
+    ``default`` is as a machine file would have it, None if there is none or the meaning says what it is;
+    ``allowed`` is what its check expects.
+    """
 
     key: str
     required: bool
@@ -73,10 +77,20 @@ def control_card(name: str, templates: Path | None = None) -> ControlCard:
     control, card = controller_named(name), load_format(name, templates)
     asked, problem = asked_settings(control, card.example_settings)
     settings = tuple(
-        Setting(item.key, item.required, item.default, item.allowed, _meaning(card.settings, item.key))
+        Setting(item.key, item.required, _default(item), item.allowed, _meaning(card.settings, item.key))
         for item in asked
     )
     return ControlCard(card, settings, control.anchored, control.bidirectional, problem)
+
+
+def _default(item: tomlio.Asked) -> Any:
+    """The default if a machine file could hold it; a reader may take others, in a form of its own."""
+    value = list(item.default) if isinstance(item.default, tuple) else item.default
+    try:
+        item.check(value)
+    except (ValueError, TypeError):
+        return None
+    return value
 
 
 def _meaning(meanings: Mapping[str, str], key: str) -> str:

@@ -63,7 +63,7 @@ def _settings(name: str, settings: Sequence[Setting]) -> list[RenderableType]:
 def _toml(value: Any) -> str:
     """A default as a machine file would have it."""
     if value is None:
-        return "not stated"
+        return "none"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
