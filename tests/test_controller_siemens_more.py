@@ -367,6 +367,25 @@ def test_a_model_with_few_tables_gets_accepted_ones_and_says_what_stays(tmp_path
     assert said == pytest.approx(left, rel=0.1)
 
 
+def test_a_set_that_is_nearly_as_good_is_judged_by_what_it_holds_and_a_bad_one_by_the_best(tmp_path):
+    """Straightness X(y) and Y(x) of nearly one size and room for one table: slightly other errors prefer the other."""
+    machine = machine_with("WFYXZT", {"siemens-cec": {"sign": "error", "tables_available": 1}})
+    nodes = [axis.nodes_mm for axis in machine.axes]
+    shape = np.array([0.0, 1.0, -1.0, 1.0, -1.0, 1.0, 0.0])
+
+    def errors(exy_mm, eyx_mm):
+        unknown = np.full(7, np.nan)
+        return ErrorTable(
+            {"EXY": Curve(nodes[1], exy_mm * shape, unknown), "EYX": Curve(nodes[0], eyx_mm * shape, unknown)}
+        )
+
+    made = export(machine, errors(10.1e-3, 10e-3), "siemens-cec")
+    assert "$AN_CEC_INPUT_AXIS[0]=(AX2)" in made.files["NC_CEC.INI"]
+    tables = read_tables(machine, made.write(tmp_path), "siemens-cec")
+    assert verify(machine, tables, errors(10e-3, 10.1e-3)).reasons == ()
+    assert any("correction Y" in reason for reason in verify(machine, tables, errors(6e-3, 12e-3)).reasons)
+
+
 def test_more_tables_never_leave_more():
     errors, left = None, []
     for tables in (1, 3, 6, 9, 13, 19):

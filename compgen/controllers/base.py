@@ -144,6 +144,13 @@ class Controller(ABC, Generic[Settings, Tables]):
     def basis(self, machine: Machine, settings: Settings, errors: ErrorTable) -> list[Term]:
         """Return the tables that the control would get for these errors, in correction space (mm added per unit)."""
 
+    def basis_of(self, machine: Machine, settings: Settings, errors: ErrorTable, tables: Tables) -> list[Term]:
+        """Return the basis that parsed tables are judged by: that of these errors.
+
+        A control with room for some of its tables only may take what the given tables hold, where that is as good.
+        """
+        return self.basis(machine, settings, errors)
+
     @abstractmethod
     def build(
         self, machine: Machine, settings: Settings, basis: Sequence[Term], values: Mapping[str, FloatArray]

@@ -26,9 +26,10 @@ from compgen.controllers.siemens_products import (
     folded_tables,
     labels_in,
     sum_into_axes,
+    term_names,
     written_decimals,
 )
-from compgen.controllers.siemens_ranking import Choice, chosen_terms
+from compgen.controllers.siemens_ranking import Choice, chosen_terms, terms_of_tables
 from compgen.controllers.siemens_reversal import backlash_rows, reversal_statement, with_reversal_tables
 from compgen.controllers.siemens_settings import CecSettings, take_cec_settings
 from compgen.controllers.siemens_syntax import (
@@ -63,6 +64,8 @@ VARIABLES = {
     "SN_CEC_TABLE_ENABLE": 1,
     "SN_CEC_TABLE_WEIGHT": 1,
 }
+#: (output, axis) of every table without products.
+ALL_PAIRS = [(output, axis) for output in range(3) for axis in range(3)]
 _AXIS_VALUE = re.compile(r'\(\s*([A-Z0-9_]{1,32})\s*\)|"([A-Z0-9_]{1,32})"')
 #: Every output axis has three ordinary tables and, on every chain, at most three products.
 _ORDINARY_PER_AXIS = _PRODUCTS_PER_AXIS = 3
@@ -97,12 +100,18 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         """
         return self._choice(machine, settings, errors).kept
 
+    def basis_of(self, machine: Machine, settings: CecSettings, errors: ErrorTable, tables: CecTables) -> list[Term]:
+        """Return the terms that the tables hold, if no better set fits into the control."""
+        choice = self._choice(machine, settings, errors)
+        terms = cec_terms(machine, settings, errors, ALL_PAIRS)
+        return terms_of_tables(machine, errors, terms, settings.mult_mode, choice, term_names(tables.tables))
+
     def left_out(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> list[str]:
         """Return which tables the control has no room for, and what stays uncorrected for that, in words."""
         return self._choice(machine, settings, errors).statements()
 
     def _choice(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> Choice:
-        terms = cec_terms(machine, settings, errors, [(output, axis) for output in range(3) for axis in range(3)])
+        terms = cec_terms(machine, settings, errors, ALL_PAIRS)
         return chosen_terms(machine, errors, terms, settings.mult_mode, settings.tables_usable)
 
     def build(

@@ -19,8 +19,8 @@ from compgen.controllers.siemens_cec import VARIABLES as CEC_VARIABLES
 from compgen.controllers.siemens_cec import CecTables, SiemensCec, cec_tables_from, cec_tables_of, cec_terms
 from compgen.controllers.siemens_eec import VARIABLES as EEC_VARIABLES
 from compgen.controllers.siemens_eec import EecTables, SiemensEec, eec_tables_from, eec_terms
-from compgen.controllers.siemens_products import MULT_MODES
-from compgen.controllers.siemens_ranking import Choice, chosen_terms
+from compgen.controllers.siemens_products import MULT_MODES, term_names
+from compgen.controllers.siemens_ranking import Choice, chosen_terms, terms_of_tables
 from compgen.controllers.siemens_settings import CecSettings, EecSettings, take_cec_settings, take_eec_settings
 from compgen.controllers.siemens_syntax import read_assignments
 from compgen.core.csvio import FloatArray
@@ -78,6 +78,15 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
     def basis(self, machine: Machine, settings: CecEecSettings, errors: ErrorTable) -> list[Term]:
         """Return positioning over the axis itself, the six tables over another axis, and the products."""
         return _pitch(machine, settings, errors) + self._choice(machine, settings, errors).kept
+
+    def basis_of(
+        self, machine: Machine, settings: CecEecSettings, errors: ErrorTable, tables: CecEecTables
+    ) -> list[Term]:
+        """Return positioning, and the terms that the cross tables hold if no better set fits into the control."""
+        choice, mode = self._choice(machine, settings, errors), settings.cec.mult_mode
+        terms = cec_terms(machine, settings.cec, errors, _CROSS)
+        held = terms_of_tables(machine, errors, terms, mode, choice, term_names(tables.cec.tables))
+        return _pitch(machine, settings, errors) + held
 
     def left_out(self, machine: Machine, settings: CecEecSettings, errors: ErrorTable) -> list[str]:
         """Return which CEC tables the control has no room for, and what stays uncorrected for that, in words."""

@@ -98,6 +98,18 @@ def sum_into_axes(tables: CecMap, mode: str, outputs: Mapping[int, FloatArray]) 
     return totals
 
 
+def term_names(tables: CecMap) -> set[str]:
+    """Return the names of the terms that a set of tables holds: ordinary ones by axes, products by angle and lever."""
+    factors = {entry.multiplier - 1 for entry in tables.values() if entry.multiplier}
+    names = set()
+    for index, entry in tables.items():
+        if entry.multiplier - 1 in tables:
+            names.add(product_name(entry.output_axis, entry.input_axis, tables[entry.multiplier - 1].input_axis))
+        elif entry.direction == 0 and index not in factors:
+            names.add(one_dimensional_name(entry.output_axis, entry.input_axis))
+    return names
+
+
 def balanced_scale(largest_rad: float, largest_lever_mm: float) -> float:
     """Return a = sqrt(z_max / e_max) in mm: with it a e and z / a have the same largest value, sqrt(e_max z_max)."""
     return math.sqrt(largest_lever_mm / largest_rad)

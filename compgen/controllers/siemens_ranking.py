@@ -29,6 +29,8 @@ _MOST_POINTS = 6000
 _UNDETERMINED = 1e-9
 #: Terms whose natural values move the tool by less than this are no tables.
 _NOTHING_MM = 0.5e-6
+#: Tables of another set than the best one are as good if no more than this share above its error stays.
+_AS_GOOD = 1.1
 #: What stays uncorrected by less than this is not worth a word.
 _NAMED_FROM_MM = 0.01 * MM_PER_UM
 
@@ -44,6 +46,7 @@ class Choice:
     tables, allowed : tables that the kept terms take, and that there are (None: not limited).
     wanted : tables that all terms would take.
     left_mm : rms over the volume that all terms would take out and the kept ones do not.
+    beside : terms of tables of another kind, which are there in any case.
     """
 
     kept: list[Term]
@@ -52,6 +55,7 @@ class Choice:
     allowed: int | None
     wanted: int
     left_mm: float
+    beside: tuple[Term, ...] = ()
 
     def statements(self) -> list[str]:
         """Say what is left out, largest first; nothing if everything has room."""
@@ -112,20 +116,44 @@ def chosen_terms(
     kept = [term for term in terms if term.name in names]
     left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, picked, strict=True))
     dropped = [item for gain, part in zip(gains, picked, strict=True) for item in gain.missed(part)]
-    return Choice(kept, tuple(dropped), table_count(kept, mode), allowed, wanted, float(np.sqrt(max(left, 0.0))))
+    return Choice(
+        kept, tuple(dropped), table_count(kept, mode), allowed, wanted, float(np.sqrt(max(left, 0.0))), tuple(beside)
+    )
+
+
+def terms_of_tables(
+    machine: Machine, errors: ErrorTable, terms: Sequence[Term], mode: str, choice: Choice, names: set[str]
+) -> list[Term]:
+    """Return the terms ``names`` that given tables hold if they are as good as the chosen ones, else the chosen ones.
+
+    Two sets may leave nearly the same error, so that slightly different errors prefer another one.
+    """
+    own = [term for term in terms if term.name in names]
+    if not choice.dropped or not own or table_count(own, mode) > (choice.allowed or 0):
+        return choice.kept
+    gains = [_Gains.of(machine, errors, terms, choice.beside, output) for output in range(3)]
+    left = [
+        sum(
+            gain.wanted - gain.taken([term for term in part if term.carrier[0].output == k])
+            for k, gain in enumerate(gains)
+        )
+        for part in (own, choice.kept)
+    ]
+    return own if left[0] <= _AS_GOOD**2 * left[1] else choice.kept
 
 
 @dataclass(frozen=True)
 class _Gains:
     """Least squares of the terms of one output axis; ``taken`` is in mm^2, the mean over the volume.
 
-    ``beside`` are terms that are there in any case and take no table.
+    ``beside`` are terms that are there in any case and take no table; ``wanted`` is the square of what is to be taken out.
     """
 
     terms: tuple[Term, ...]
     beside: tuple[Term, ...]
     normal: FloatArray
     right: FloatArray
+    wanted: float
     columns: Mapping[str, IntArray]
 
     @classmethod
@@ -157,9 +185,8 @@ class _Gains:
         design = np.hstack(parts) if parts else np.zeros((len(wanted), 0))
         scale = 1.0 / np.maximum(np.sqrt(np.sum(weight[:, None] * design**2, axis=0)), 1e-12)
         design = design * scale
-        return cls(
-            tuple(own), tuple(given), design.T @ (weight[:, None] * design), design.T @ (weight * wanted), columns
-        )
+        normal, right = design.T @ (weight[:, None] * design), design.T @ (weight * wanted)
+        return cls(tuple(own), tuple(given), normal, right, float(weight @ wanted**2), columns)
 
     @property
     def of_all(self) -> float:
@@ -168,7 +195,7 @@ class _Gains:
 
     def taken(self, terms: Sequence[Term]) -> float:
         """Squares that a set of terms takes out, mm^2."""
-        held = [*terms, *self.beside]
+        held = [term for term in (*terms, *self.beside) if term.name in self.columns]
         if not held:
             return 0.0
         where = np.concatenate([self.columns[term.name] for term in held])

@@ -6,6 +6,7 @@ It knows nothing of files: ``verify`` gives it what parsed tables do, the sign c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -98,10 +99,15 @@ class Judge:
         ]
 
 
-def judge_of(machine: Machine, control: AnyController, errors: ErrorTable) -> Judge:
-    """Prepare the judgement for the tables of one control on a machine with these errors."""
+def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, tables: Any = None) -> Judge:
+    """Prepare the judgement for the tables of one control on a machine with these errors.
+
+    ``tables`` are the parsed ones: where a control has room for some tables only, there is more than one good choice.
+    """
     settings = control.read_settings(machine)
-    solver = projector(machine, control.basis(machine, settings, errors), anchored=control.anchored)
+    given = (machine, settings, errors)
+    basis = control.basis(*given) if tables is None else control.basis_of(*given, tables)
+    solver = projector(machine, basis, anchored=control.anchored)
     values = best_values(machine, errors, solver)
     nodes = _nodes(machine, errors, solver)
     grid = volume_grid(machine, nodes)

@@ -208,7 +208,7 @@ def verify(
         not say from where they were approached are then looked at from both sides.
     """
     control = tables.controller
-    judge = judge_of(machine, control, errors)
+    judge = judge_of(machine, control, errors, tables.tables)
     grid_mm, solver = judge.grid.position_mm, judge.solver
     where = points or Points(grid_mm)
     if reversal is not None and where.approach is None:
