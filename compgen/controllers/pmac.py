@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
-from compgen.controllers.pmac_basis import pmac_basis, ring_of, sixteenths, tables_from
+from compgen.controllers.pmac_basis import Ring, pmac_basis, ring_of, sixteenths, tables_from
 from compgen.controllers.pmac_notes import pmac_notes, table_context
 from compgen.controllers.pmac_settings import PmacSettings, read_pmac_settings
 from compgen.controllers.pmac_tables import PER_COUNT, Backlash, IntArray, Line, PmacTables, Sheet
@@ -29,6 +29,8 @@ from compgen.errors import CompgenWarning, InputError
 
 _MOST_PER_TARGET = 6
 _SPAN_SLACK = 1e-6
+#: Spacings of a pitch table are divided into at most so many parts to hold a reversal.
+_MOST_PARTS = 64
 
 
 class Pmac(Controller[PmacSettings, PmacTables]):
@@ -258,12 +260,31 @@ def _with_backlash(
     constant = round(-PER_COUNT * scale * at_home)
     if len(curve.position_mm) == 1:
         return table, None, constant
-    step = table.length // len(table.entries)
-    ring = ring_of(machine, settings, axis, step / scale)
+    ring = _ring_for(machine, settings, axis, table, curve)
+    counts = {motor: np.zeros(ring.size) for motor in settings.motors}
+    counts[table.source] = settings.counts_per_mm[axis] * (ring.positions_mm(settings) - home)
+    pitch = np.rint(table.at(counts)).astype(np.int64)
     varying = curve.at(ring.positions_mm(settings)) - at_home
     varying[0] = 0.0
     size = np.rint(-PER_COUNT * scale * varying).astype(np.int64)
     half = sixteenths(settings, axis, -0.5 * varying)
-    entries: IntArray = table.entries + np.append(half[1:], 0)
-    own = Backlash(settings.motors[axis], table.length, np.append(size[1:], 0))
-    return replace(table, entries=entries), own if np.any(size) else None, constant
+    entries: IntArray = np.append(pitch[1:] + half[1:], 0)
+    length = ring.step * ring.size
+    own = Backlash(settings.motors[axis], length, np.append(size[1:], 0))
+    return replace(table, entries=entries, length=length), own if np.any(size) else None, constant
+
+
+def _ring_for(machine: Machine, settings: PmacSettings, axis: int, table: Line, curve: Curve) -> Ring:
+    """Return the ring of a pitch table, its spacing divided as far as the reversal needs it."""
+    scale, step = abs(settings.counts_per_mm[axis]), table.length // len(table.entries)
+    where = np.unique(np.concatenate([np.array(machine.axes[axis].range_mm), curve.position_mm]))
+    where = np.clip(where, *machine.axes[axis].range_mm)
+    rings = []
+    for part in (part for part in range(1, _MOST_PARTS + 1) if step % part == 0):
+        ring = ring_of(machine, settings, axis, step / part / scale)
+        nodes = ring.nodes_mm(settings)
+        miss = float(np.max(np.abs(np.interp(where, nodes, curve.at(nodes)) - curve.at(where))))
+        rings.append((miss, ring))
+        if miss <= WORTH_MM:
+            break
+    return min(rings, key=lambda pair: pair[0])[1]

@@ -12,7 +12,7 @@ from compgen.controllers.base import Term
 from compgen.controllers.grids import equidistant_grid
 from compgen.controllers.pmac_settings import PmacSettings
 from compgen.controllers.pmac_tables import PER_COUNT, IntArray, Line, Sheet
-from compgen.controllers.terms import one_dimensional_terms, product_terms
+from compgen.controllers.terms import continued, one_dimensional_terms, product_terms
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -95,7 +95,8 @@ def pmac_basis(machine: Machine, settings: PmacSettings, errors: ErrorTable) -> 
     sizes = [sum(_size(machine, term) ** 2 for term in group) for group in groups]
     ranked = sorted(range(len(groups)), key=lambda k: -sizes[k])[: len(settings.free_motors)]
     kept = [groups[k] for k in sorted(ranked) if sizes[k] > NOTHING_MM**2]
-    return pitch + [term for group in kept for term in group]
+    terms = pitch + [term for group in kept for term in group]
+    return [continued(term, machine.axes[term.axis or 0].range_mm) for term in terms]
 
 
 def _curve(machine: Machine, settings: PmacSettings, errors: ErrorTable, output: int, axis: int) -> Term:

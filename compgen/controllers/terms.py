@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -170,3 +171,20 @@ def _zero_ends_mm(nodes_mm: FloatArray, start: FloatArray) -> tuple[float, ...]:
 def _kept_mm(machine: Machine, axis: int, *, straightness: bool) -> tuple[float, ...]:
     """Where the fitted curves are zero: straightness at both travel ends, the others at the reference point."""
     return machine.axes[axis].range_mm if straightness else (machine.reference_point_mm[axis],)
+
+
+def continued(term: Term, range_mm: tuple[float, float]) -> Term:
+    """Return a term whose start goes straight on at a node far beyond the travel, as the synthesis makes values do.
+
+    Curves are constant outside their positions, so that a start taken from them bends there. A node counts as far out
+    if less than half of its interval lies within the travel (``LEAST_SHARE`` of ``compgen.export.synthesis``).
+    """
+    nodes, start = term.nodes_mm, np.array(term.start)
+    if len(nodes) < 3:
+        return term
+    low, high = range_mm
+    for out, inner, third, inside in ((0, 1, 2, nodes[1] - low), (-1, -2, -3, high - nodes[-2])):
+        if inside < 0.5 * abs(nodes[out] - nodes[inner]):
+            ratio = (nodes[out] - nodes[inner]) / (nodes[inner] - nodes[third])
+            start[out] = start[inner] + ratio * (start[inner] - start[third])
+    return replace(term, start=start)

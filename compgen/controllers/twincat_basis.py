@@ -14,7 +14,7 @@ import numpy as np
 
 from compgen.controllers.base import Term
 from compgen.controllers.grids import equidistant_grid, uneven_nodes_mm
-from compgen.controllers.terms import one_dimensional_terms, product_terms
+from compgen.controllers.terms import continued, one_dimensional_terms, product_terms
 from compgen.controllers.twincat_settings import TwincatSettings
 from compgen.controllers.twincat_tables import MM_PER_UNIT, AxisList, Cross, Plane, Screw, units_outwards
 from compgen.core.csvio import FloatArray
@@ -96,7 +96,7 @@ def twincat_basis(machine: Machine, settings: TwincatSettings, errors: ErrorTabl
     terms: list[Term] = []
     for layout in layouts(machine, settings, errors):
         terms += _terms(machine, settings, errors, layout)
-    return terms
+    return [continued(term, machine.axes[term.axis or 0].range_mm) for term in terms]
 
 
 def _terms(machine: Machine, settings: TwincatSettings, errors: ErrorTable, layout: Layout) -> list[Term]:
