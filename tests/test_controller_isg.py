@@ -10,8 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import compgen
+from compgen.cli import cli
+from compgen.cli.common import run_command
 from compgen.controllers import CONTROLLERS
 from compgen.controllers.base import SourceFile
+from compgen.controllers.error_files import read_error_file
 from compgen.controllers.etalon_exchange import errors_from_etalon
 from compgen.core import tomlio
 from compgen.core.error_table import Curve, ErrorTable
@@ -695,3 +699,41 @@ def test_garbage_is_read_or_refused_but_never_crashes(name, text, suffix):
     own = control.read_settings(PLAIN)
     assert np.isfinite(control.emulate(PLAIN, own, tables, Points(np.zeros((1, 3))))).all()
     control.violations(PLAIN, own, tables)
+
+
+# --- the exchange file as errors of the commands -------------------------------------------------------------------------
+
+
+def test_the_commands_take_an_exchange_file_for_errors(
+    small_machine_file, small_machine, small_errors, tmp_path, capsys
+):
+    paths = compgen.export(small_machine, small_errors, "etalon-exchange").write(tmp_path / "a")
+    exchange = next(str(path) for path in paths if path.name.endswith(".txt"))
+    machine = str(small_machine_file)
+    for words in (
+        ["fit", machine, exchange, "--out", str(tmp_path / "f")],
+        ["export", machine, exchange, "--controller", "isg-csv", "--out", str(tmp_path / "b")],
+        ["verify", machine, str(tmp_path / "b" / "volcomp0.csv"), str(tmp_path / "b" / "volcomp0.lis")]
+        + ["--controller", "isg-csv", "--errors", exchange, "--out", str(tmp_path / "v")],
+    ):
+        assert run_command(cli, words) == 0
+    read = read_error_file(exchange)
+    assert set(read.names) == set(small_errors.names)
+    position = positions_in(small_machine, 50)
+    before, after = (volumetric_error(small_machine, table, position) for table in (small_errors, read))
+    assert np.abs(before - after).max() < 0.5e-3  # tables hold what fits best, second order included
+    bad = tmp_path / "bad.txt"
+    bad.write_text("// x\n[EXX]\nGridpoints = {\n0 0.1\n1 abc\n}\n")
+    capsys.readouterr()
+    assert run_command(cli, ["fit", machine, str(bad), "--out", str(tmp_path / "g")]) == 2
+    assert "bad.txt:5" in capsys.readouterr().err
+
+
+def test_a_grid_of_several_arguments_is_written_again_as_it_was_read():
+    tables = parsed("isg-csv", PLAIN, golden("isg-csv", "x_axis_at_two_z.csv"))
+    texts = render_files(load_format("isg-csv"), context_of("isg-csv", PLAIN, tables))
+    again = parsed("isg-csv", PLAIN, {"volcomp0.csv": texts["volcomp0.csv"]})
+    assert again.fields["EXX"].axes == tables.fields["EXX"].axes == (2, 0)
+    position = positions_in(PLAIN, 50)
+    for name, item in tables.fields.items():
+        np.testing.assert_array_equal(again.fields[name].at(position), item.at(position))
