@@ -54,8 +54,11 @@ class Section:
         """What was taken so far, in its order, also in sub-sections (``axis_names.X``)."""
         found: list[Asked] = []
         for key, item in self._asked.items():
-            inner = [item] if isinstance(item, Asked) else item.asked
-            found += inner if isinstance(item, Asked) else [replace(one, key=f"{key}.{one.key}") for one in inner]
+            if isinstance(item, Asked):
+                found.append(item)
+            else:  # a sub-section; one without a key so far stands for itself
+                inner = [replace(one, key=f"{key}.{one.key}") for one in item.asked]
+                found += inner or [Asked(key, False, None, table)]
         return found
 
     def fail(self, key: str, message: str) -> InputError:
