@@ -451,7 +451,7 @@ def test_a_wrong_sign_reads_what_the_page_says(small_machine, small_errors, prog
         assert abs(wrong - right) > 10 * MICROMETRE
 
 
-PROGRAMS = ["etalon-exchange", "isg-csv", "siemens-cec", "siemens-eec"]
+PROGRAMS = ["etalon-exchange", "isg-csv", "linuxcnc-comp", "linuxcnc-volumetric", "siemens-cec", "siemens-eec"]
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -481,6 +481,7 @@ def test_the_program_moves_slowly_z_first_and_stops_five_times_and_once_more(
         else:
             assert words[0] == "G1"
             assert ("SUPA" in words) == name.startswith("siemens")
+            assert ("G53" in words) == name.startswith("linuxcnc")
             target = {word[0]: float(word[1:]) for word in words if word[0] in "XYZ"}
             feed = next(int(word[1:]) for word in words if word[0] == "F")
             near = place and all(abs(target.get(k, place[k]) - place[k]) <= 10.0 for k in "XYZ" if k in place)
@@ -488,7 +489,8 @@ def test_the_program_moves_slowly_z_first_and_stops_five_times_and_once_more(
             if "X" in target and not near:
                 assert place["Z"] == programs[name].safe_z_mm
             place |= target
-    assert {"G90", "G71", "G94", "D0"} <= set(start)
+    linuxcnc = name.startswith("linuxcnc")  # metric is G21 there, and no tool offset G49
+    assert {"G90", "G94", *(("G21", "G49") if linuxcnc else ("G71", "D0"))} <= set(start)
     assert not re.search(r"\b[TSH]\d|M0?[36]\b|G0\b|G00", "\n".join(code))
     expected = [dict(zip("XYZ", row, strict=True)) for row in programs[name].position_mm.round(3).tolist()]
     assert stopped == [{}, *expected, expected[0]]

@@ -31,7 +31,7 @@
 #define VOLCOMP_BYTES (64L << 20)
 #define VOLCOMP_NAME 32
 // The iteration ends when no axis moves by more than this, mm; a table that needs more rounds is refused.
-#define VOLCOMP_STEP 1e-13
+#define VOLCOMP_STEP 0.0000000000001
 #define VOLCOMP_ROUNDS 50
 
 typedef struct {
