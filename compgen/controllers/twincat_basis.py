@@ -128,7 +128,7 @@ def _screw_nodes_mm(machine: Machine, settings: TwincatSettings, errors: ErrorTa
         return _cross_nodes_mm(machine, settings, errors, axis)
     grid = equidistant_grid(machine, errors, axis, most=settings.most.ssfk - 1, loss_mm=settings.loss_mm, output=axis)
     start, step, count = even_units(machine, axis, float(grid.step) / MM_PER_UNIT)
-    return (start + step * np.arange(count)) * MM_PER_UNIT
+    return np.asarray((start + step * np.arange(count)) * MM_PER_UNIT, dtype=np.float64)
 
 
 def _cross_nodes_mm(machine: Machine, settings: TwincatSettings, errors: ErrorTable, axis: int) -> FloatArray:
@@ -160,7 +160,7 @@ def plane_nodes_mm(machine: Machine, settings: TwincatSettings, errors: ErrorTab
         step *= 1.02
     nodes = [np.zeros(1)] * 3
     for axis, (start, whole, count) in zip(masters, grids, strict=True):
-        nodes[axis] = (start + whole * np.arange(count)) * MM_PER_UNIT
+        nodes[axis] = np.asarray((start + whole * np.arange(count)) * MM_PER_UNIT, dtype=np.float64)
     return nodes
 
 

@@ -101,5 +101,8 @@ def _warnings(settings: TwincatSettings, tables: TwincatTables) -> list[str]:
 
 
 def _moves(item: AxisList) -> bool:
-    parts = [item.screw and item.screw.pos, item.screw and item.screw.neg]
-    return bool(item.cross or item.plane) or any(part is not None and bool(np.any(part)) for part in parts)
+    if item.cross or item.plane:
+        return True
+    return item.screw is not None and bool(
+        np.any(item.screw.pos) or (item.screw.neg is not None and np.any(item.screw.neg))
+    )

@@ -67,7 +67,9 @@ class Plane:
 
     def nodes(self, place: int) -> FloatArray:
         """Positions of the columns (``place`` 0: first master) or rows (1: second master), 0.1 um."""
-        return self.starts[place] + self.interval * np.arange(self.values.shape[1 - place])
+        return np.asarray(
+            self.starts[place] + self.interval * np.arange(self.values.shape[1 - place]), dtype=np.float64
+        )
 
     def at(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Value at positions (n,) of both masters: bilinear between four corners, values of the margin held outside."""

@@ -205,7 +205,7 @@ def _screw(body: _Body) -> Screw:
     if interval < 0:
         raise body.fail(name, "interval", f"{interval:g} is negative")
     if interval:
-        setpoints = body.number(name, "kw_startpos") + interval * np.arange(count)
+        setpoints = np.asarray(body.number(name, "kw_startpos") + interval * np.arange(count), dtype=np.float64)
         _refuse(body, name, "setpoint", "an equidistant table (interval above 0) has no setpoints")
     else:
         setpoints = _ascending(body, name, body.column(name, "setpoint", (count,)))
