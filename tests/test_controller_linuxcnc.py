@@ -302,6 +302,13 @@ def test_the_hand_written_grid_counts_x_fastest_and_holds_outside(position, erro
     assert table.error(np.array([position], dtype=float), np.zeros(3))[0] == pytest.approx(error, abs=1e-15)
 
 
+def test_the_table_in_the_documentation_is_a_table():
+    page = (Path(__file__).parents[1] / "docs" / "linuxcnc.md").read_text(encoding="utf-8")
+    text = page[page.index("volcomp 1\n") :].partition("```")[0]
+    table = parse_volcomp(SourceFile(Path("t"), text))
+    assert table.error(np.array([[-4.5, 0.0, 0.0]]), np.zeros(3))[0] == pytest.approx([0.002, 0, 0], abs=1e-15)
+
+
 @pytest.mark.parametrize("chain", CHAINS)
 def test_every_chain_is_the_error_model_inverted(chain):
     """The axes go to q with q + E(q) = P, E from the model itself, for any tool."""
