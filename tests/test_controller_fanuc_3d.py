@@ -50,7 +50,7 @@ def box(corner_values, order=(0, 1, 2), ends=((-350.0, 450.0), (-200.0, 300.0), 
 
 #: Different in every vertex and every axis.
 CORNERS = {(i, j, k): (1 + 2 * i, -3 + 5 * j + i, 10 * k - j) for i in (0, 1) for j in (0, 1) for k in (0, 1)}
-SAMPLE = box(CORNERS)
+SAMPLE = (Path(__file__).parent / "golden" / "fanuc-3d" / "VOLUME.csv").read_text()
 
 
 def parse(machine, text, name="VOLUME.csv"):
@@ -59,6 +59,10 @@ def parse(machine, text, name="VOLUME.csv"):
 
 def added(machine, tables, position_mm):
     return CONTROL.emulate(machine, CONTROL.read_settings(machine), tables, Points(np.array(position_mm, dtype=float)))
+
+
+def test_the_golden_file_is_the_box_of_these_corners():
+    assert box(CORNERS) == SAMPLE
 
 
 # --- meaning ---------------------------------------------------------------------------------------------------------

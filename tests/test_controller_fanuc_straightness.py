@@ -26,23 +26,7 @@ from compgen.verify import read_tables, verify
 CONTROL = controller_named("fanuc-straightness")
 UM = 1e-3
 #: Points 33 to 49 of X, reference point 40, every 50 mm, as in the pitch example; Y moves with X.
-SAMPLE = """%
-N03620A1P40
-N03621A1P32
-N03622A1P49
-N03624A1P50.0
-N05711P1
-N05721P2
-N05731P32
-N05732P36
-N05733P42
-N05734P49
-N05761P0
-N05762P-6
-N05763P4
-N05764P10
-%
-"""
+SAMPLE = (Path(__file__).parent / "golden" / "fanuc-straightness" / "STRAIGHT.TXT").read_text()
 
 
 def machine_of(**options):
