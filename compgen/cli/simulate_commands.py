@@ -15,7 +15,15 @@ from compgen.core.points import format_points, read_points
 from compgen.errors import InputError
 from compgen.identify import Covariance, predict_uncertainty, read_covariance
 from compgen.model import predict
-from compgen.simulate import read_scenario, simulate, write_simulation
+from compgen.simulate import (
+    Simulation,
+    SixDofMeasurement,
+    SixDofSimulation,
+    read_scenario,
+    simulate,
+    simulate_sixdof,
+    write_simulation,
+)
 from compgen.verify import residuals
 
 
@@ -28,16 +36,23 @@ from compgen.verify import residuals
 def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | None, as_json: bool) -> int:
     """Simulate a machine and its measurement: writes *.lengths.csv (mm) and truth.errors.csv (um, urad) to DIR.
 
+    A scenario whose instrument has type = "sixdof" writes *.sixdof.csv in place of lengths.
+
     \b
     Example:
       compgen simulate zha-gantry --scenario examples/zha-gantry.scenario.toml --out simulated/
     """
     with progress(quiet=as_json) as show:
         show("simulating")
-        simulation = simulate(machine, read_scenario(scenario), seed)
+        planned = read_scenario(scenario)
+        chosen = simulate_sixdof if isinstance(planned.instrument, SixDofMeasurement) else simulate
+        simulation: Simulation | SixDofSimulation = chosen(machine, planned, seed)
     paths = write_simulation(simulation, out)
     if as_json:
-        summary = {"readings": len(simulation.lengths), "stations": list(simulation.lengths.stations)}
+        if isinstance(simulation, SixDofSimulation):
+            summary = {"readings": len(simulation.readings), "stations": []}
+        else:
+            summary = {"readings": len(simulation.lengths), "stations": list(simulation.lengths.stations)}
         print_json({**summary, "files": {name: str(path) for name, path in paths.items()}})
     else:
         for path in paths.values():

@@ -2,8 +2,16 @@
 
 from compgen.simulate.effects import EFFECTS, Effect
 from compgen.simulate.laser_tracer import LaserTracer, Station
-from compgen.simulate.run import Simulation, actual_tips, simulate, write_simulation
+from compgen.simulate.run import (
+    Simulation,
+    SixDofSimulation,
+    actual_tips,
+    simulate,
+    simulate_sixdof,
+    write_simulation,
+)
 from compgen.simulate.scenario import INSTRUMENTS, Instrument, Scenario, read_scenario
+from compgen.simulate.sixdof_measurement import SixDofMeasurement
 from compgen.simulate.trajectory import Line, Stops, Trajectory, plan_stops, trajectory_points
 from compgen.simulate.truth import RandomErrors, TruthPlan, draw_truth
 
@@ -17,6 +25,8 @@ __all__ = [
     "RandomErrors",
     "Scenario",
     "Simulation",
+    "SixDofMeasurement",
+    "SixDofSimulation",
     "Station",
     "Stops",
     "Trajectory",
@@ -26,6 +36,7 @@ __all__ = [
     "plan_stops",
     "read_scenario",
     "simulate",
+    "simulate_sixdof",
     "trajectory_points",
     "write_simulation",
 ]

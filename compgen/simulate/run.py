@@ -18,8 +18,10 @@ from compgen.model.exact import tip_position
 from compgen.simulate.effects import Effect
 from compgen.simulate.laser_tracer import Station
 from compgen.simulate.scenario import Scenario
+from compgen.simulate.sixdof_measurement import SixDofMeasurement
 from compgen.simulate.trajectory import Stops, plan_stops
 from compgen.simulate.truth import child_seeds, draw_truth, random_stream
+from compgen.sixdof.readings import SixDof, format_sixdof
 
 #: Children of the seed: one for the errors, one for the noise.
 ERROR_STREAM, NOISE_STREAM = 0, 1
@@ -41,6 +43,15 @@ class Simulation:
     lengths: Lengths
     truth: ErrorTable
     stations: tuple[Station, ...]
+
+
+@dataclass(frozen=True)
+class SixDofSimulation:
+    """The six-DOF readings of a virtual machine, and its true errors in mm and rad; ``name`` begins the file names."""
+
+    name: str
+    readings: SixDof
+    truth: ErrorTable
 
 
 def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequence[Effect] = ()) -> FloatArray:
@@ -85,28 +96,55 @@ def simulate(
     """
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
+    instrument = scenario.instrument
+    if isinstance(instrument, SixDofMeasurement):
+        raise InputError("is a six-DOF instrument, which has no lengths; call simulate_sixdof", file=scenario.source)
     try:
-        stops = plan_stops(scenario.trajectory, machine, scenario.instrument.passes)
+        stops = plan_stops(scenario.trajectory, machine, instrument.passes)
     except InputError as error:
         raise InputError(error.message, file=scenario.source, field=error.field) from None
     tools_mm = np.array(scenario.trajectory.tools_mm) if scenario.trajectory.tools_mm else None
     truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), tools_mm)
     truth.warn_outside(stops.position_mm)
     tip_mm = actual_tips(machine, truth, stops, (*scenario.effects, *effects))
-    lengths = scenario.instrument.observe(stops, tip_mm, random_stream(seeds, NOISE_STREAM))
-    common = {"machine": machine.name, "seed": str(used_seed)}
-    reference = " ".join(f"{value:g}" for value in machine.reference_point_mm)
+    lengths = instrument.observe(stops, tip_mm, random_stream(seeds, NOISE_STREAM))
+    common = _common(machine, used_seed)
     return Simulation(
         name=scenario.name,
         lengths=replace(lengths, metadata={**common, **lengths.metadata}),
-        truth=truth.replace(metadata={**common, "source": "simulated truth", "reference_point_mm": reference}),
-        stations=getattr(scenario.instrument, "stations", ()),
+        truth=_described(machine, truth, used_seed),
+        stations=getattr(instrument, "stations", ()),
     )
 
 
-def write_simulation(simulation: Simulation, folder: str | Path) -> dict[str, Path]:
-    """Write ``<name>.lengths.csv`` and ``truth.errors.csv`` into ``folder`` and return their paths by file name."""
+def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = None) -> SixDofSimulation:
+    """Measure a virtual machine with the six-DOF instrument of the scenario; InputError for another instrument."""
+    used_seed = scenario.seed if seed is None else seed
+    seeds = np.random.SeedSequence(used_seed)
+    if not isinstance(scenario.instrument, SixDofMeasurement):
+        raise InputError("is no six-DOF instrument; call simulate", file=scenario.source, field="[instrument] type")
+    truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
+    readings = scenario.instrument.measure(machine, truth, random_stream(seeds, NOISE_STREAM))
+    metadata = {**_common(machine, used_seed), **readings.metadata}
+    return SixDofSimulation(scenario.name, replace(readings, metadata=metadata), _described(machine, truth, used_seed))
+
+
+def _common(machine: Machine, seed: int) -> dict[str, str]:
+    return {"machine": machine.name, "seed": str(seed)}
+
+
+def _described(machine: Machine, truth: ErrorTable, seed: int) -> ErrorTable:
+    reference = " ".join(f"{value:g}" for value in machine.reference_point_mm)
+    common = _common(machine, seed)
+    return truth.replace(metadata={**common, "source": "simulated truth", "reference_point_mm": reference})
+
+
+def write_simulation(simulation: Simulation | SixDofSimulation, folder: str | Path) -> dict[str, Path]:
+    """Write ``<name>.lengths.csv`` (or ``<name>.sixdof.csv``) and ``truth.errors.csv``; return paths by file name."""
     output = OutputFolder(folder)
-    output.add(f"{simulation.name}.lengths.csv", format_lengths(simulation.lengths))
+    if isinstance(simulation, SixDofSimulation):
+        output.add(f"{simulation.name}.sixdof.csv", format_sixdof(simulation.readings))
+    else:
+        output.add(f"{simulation.name}.lengths.csv", format_lengths(simulation.lengths))
     output.add("truth.errors.csv", format_errors(simulation.truth))
     return output.commit()

@@ -16,6 +16,7 @@ from compgen.core.lengths import Lengths
 from compgen.simulate.effects import Effect, read_effects
 from compgen.simulate.laser_tracer import read_laser_tracer
 from compgen.simulate.registration import instrument_problems
+from compgen.simulate.sixdof_measurement import SixDofMeasurement, read_sixdof_measurement
 from compgen.simulate.trajectory import Stops, Trajectory, read_trajectory
 from compgen.simulate.truth import RandomErrors, TruthPlan, read_truth_plan
 
@@ -32,14 +33,17 @@ class Instrument(Protocol):
 
 
 #: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
-INSTRUMENTS: dict[str, Callable[[tomlio.Section], Instrument]] = {"laser-tracer": read_laser_tracer}
+INSTRUMENTS: dict[str, Callable[[tomlio.Section], Instrument | SixDofMeasurement]] = {
+    "laser-tracer": read_laser_tracer,
+    "sixdof": read_sixdof_measurement,
+}
 
 
 @dataclass(frozen=True)
 class Scenario:
     """A simulated measurement; ``name`` begins the names of its files, ``seed`` starts every random number."""
 
-    instrument: Instrument
+    instrument: Instrument | SixDofMeasurement
     seed: int
     name: str = "simulated"
     errors: TruthPlan = field(default_factory=lambda: TruthPlan(random=RandomErrors()))
@@ -73,11 +77,17 @@ def read_scenario(path: str | Path) -> Scenario:
         effects=read_effects(root.sections("effects")),
     )
     root.finish()
+    if isinstance(scenario.instrument, SixDofMeasurement):
+        for key in ("trajectory", "effects"):
+            if key in root.data:
+                raise root.fail(key, "belongs to other instruments; a six-DOF instrument runs along the axes")
     return scenario
 
 
-def _instrument(kind: str, section: tomlio.Section) -> Instrument:
+def _instrument(kind: str, section: tomlio.Section) -> Instrument | SixDofMeasurement:
     made = INSTRUMENTS[kind](section)
+    if isinstance(made, SixDofMeasurement):
+        return made
     problems = instrument_problems(made)
     if problems:
         raise section.fail("type", "; ".join(problems))

@@ -37,6 +37,7 @@ def run_signals(
     along_mm: FloatArray,
     drift_rad: FloatArray | None = None,
     first_mm: float | None = None,
+    scatter: FloatArray | None = None,
 ) -> FloatArray:
     """Signals (n, 7) of one run, in mm and in the order of SIGNALS; the interferometer's with its travel.
 
@@ -48,22 +49,28 @@ def run_signals(
     along_mm : commanded positions of the axis, (n,).
     drift_rad : tilt of the beams toward unit +y, +z, (n, 2); None for no drift.
     first_mm : where ``distance_first_mm`` holds, default the first position.
+    scatter : what moves the body at the tool further, translations in mm and rotations in rad, (n, 6).
     """
     entry, optics = instrument.axes[axis], instrument.optics
     position = run_positions(machine, instrument, axis, along_mm)
     offset = np.array(entry.target_offset_mm)
     origin, turn = tool_pose(machine, truth, position)
-    moved = origin + np.einsum("nij,j->ni", turn, offset) - position - offset
+    further = np.zeros((len(along_mm), 6)) if scatter is None else scatter
+    moved = origin + np.einsum("nij,j->ni", turn, offset) - position - offset + further[:, :3]
     at_tool = expected_away(machine, instrument)[axis] > 0
     tracer = Tracer(optics, axis, 1 if at_tool else 2, entry.set_up.beam_direction, entry.systematics)
     start = along_mm[0] if first_mm is None else first_mm
     travel = entry.set_up.beam_direction * (along_mm - start)
     tilt = np.zeros((len(along_mm), 2)) if drift_rad is None else drift_rad
-    angles = Rotation.from_matrix(turn).as_rotvec()
+    angles = Rotation.from_matrix(turn).as_rotvec() + further[:, 3:]
     return np.array(
         [
             tracer.signals(
-                float(entry.distance_first_mm or 0.0), moved[k], angles[k], drift_rad=tuple(tilt[k]), travel_mm=travel[k]
+                float(entry.distance_first_mm or 0.0),
+                moved[k],
+                angles[k],
+                drift_rad=tuple(tilt[k]),
+                travel_mm=travel[k],
             )
             for k in range(len(along_mm))
         ]

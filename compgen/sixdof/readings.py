@@ -16,8 +16,10 @@ from compgen.core.names import AXES
 from compgen.errors import InputError
 
 SPOTS = ("y_qd1_mm", "z_qd1_mm", "z_qd2_mm", "y_psd1_mm", "z_psd1_mm", "y_psd2_mm", "z_psd2_mm")
-REQUIRED = ("axis", "position_mm", "run", *SPOTS, "displacement_mm")
-OPTIONAL = ("y_qd2_mm", "distance_mm", "time_s", "direction")
+REQUIRED = ("axis", "position_mm", "run", *SPOTS)
+#: Air and time, kept as covariates beside the temperatures.
+COVARIATES = ("time_s", "pressure_hpa", "humidity_percent")
+OPTIONAL = ("displacement_mm", "phase_rad", "y_qd2_mm", "distance_mm", "direction", *COVARIATES)
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class SixDof:
     signals_mm : by column name, each (n,): spots, angles times focal length, interferometer; ``y_qd2_mm`` if it is there.
     distance_mm : absolute optical distance L of each row, nan where it is not given, (n,).
     direction : sign of travel, 0 where it is not given, (n,).
-    covariates : ``time_s`` and temperatures by column name, each (n,).
+    covariates : ``time_s``, air and temperatures by column name, each (n,); ``phase_rad`` where the interferometer's
+        phase was given in place of its displacement, which then is nan until :func:`compensated` has made it.
     metadata : comments ``key = value``.
     origin : (file, line) of each row.
     """
@@ -61,7 +64,7 @@ def holds_sixdof(path: str | Path) -> bool:
     """Whether the header of a file is that of six-DOF readings."""
     lines = (line for line in read_text(Path(path)).splitlines() if line.strip() and not line.startswith("#"))
     names = {name.strip() for name in next(lines, "").split(",")}
-    return "y_psd1_mm" in names or {"axis", "displacement_mm"} <= names
+    return "y_psd1_mm" in names or {"axis", "displacement_mm"} <= names or "y_qd1_mm" in names
 
 
 def read_sixdof(paths: str | Path | Sequence[str | Path]) -> SixDof:
@@ -78,10 +81,12 @@ def read_sixdof(paths: str | Path | Sequence[str | Path]) -> SixDof:
             [table.numbers(name) if name in table.columns else np.full(len(table), empty) for table in tables]
         )
 
+    _check_alike(tables)
     signals = {name: numbers(name, np.nan) for name in (*SPOTS, "displacement_mm")}
     if all("y_qd2_mm" in table.columns for table in tables):
         signals["y_qd2_mm"] = numbers("y_qd2_mm", np.nan)
-    extra = dict.fromkeys(n for table in tables for n in table.columns if n == "time_s" or n.startswith("temp_"))
+    kept = (*COVARIATES, "phase_rad")
+    extra = dict.fromkeys(n for table in tables for n in table.columns if n in kept or n.startswith("temp_"))
     return SixDof(
         axis=np.concatenate([_axes_of(table) for table in tables]),
         position_mm=numbers("position_mm", np.nan),
@@ -105,6 +110,18 @@ def _read_table(path: str | Path) -> CsvTable:
         for row in np.flatnonzero(np.abs(values) > 50.0)[:1]:
             raise table.fail(int(row), name, f"{values[row]:g} mm is beyond any detector; is the unit mm?")
     return table
+
+
+def _check_alike(tables: Sequence[CsvTable]) -> None:
+    """The interferometer's reading is there once, and of one kind in all files."""
+    for table in tables:
+        kinds = [name for name in ("displacement_mm", "phase_rad") if name in table.columns]
+        if len(kinds) != 1:
+            message = "holds both of them" if kinds else "holds neither of them"
+            field = "columns displacement_mm, phase_rad"
+            raise InputError(f"{message}; give the one that the interferometer read", file=table.path, field=field)
+        if kinds[0] not in tables[0].columns:
+            raise InputError(f"has {kinds[0]}, but {tables[0].path} has not; give all files alike", file=table.path)
 
 
 def _axes_of(table: CsvTable) -> NDArray[np.int64]:
@@ -131,7 +148,7 @@ def format_sixdof(readings: SixDof) -> str:
         "axis": [AXES[k] for k in readings.axis],
         "position_mm": readings.position_mm,
         "run": readings.run.astype(np.float64),
-        **readings.signals_mm,
+        **{name: values for name, values in readings.signals_mm.items() if not np.isnan(values).any()},
     }
     digits = dict.fromkeys(readings.signals_mm, 9) | {"run": 0, "direction": 0}
     if not np.isnan(readings.distance_mm).any():
@@ -140,5 +157,5 @@ def format_sixdof(readings: SixDof) -> str:
         columns["direction"] = readings.direction
     for name, values in readings.covariates.items():
         columns[name] = values
-        digits[name] = 3
+        digits[name] = 6 if name == "phase_rad" else 3
     return format_csv(columns, readings.metadata, digits)
