@@ -23,6 +23,8 @@ from compgen.verify import read_tables, verify
 
 CONTROL = controller_named("fanuc-3d")
 UM = 1e-3
+#: The nodes of the errors: nothing is lost between the vertices.
+COARSE_MM = {"X": 100.0, "Y": 100.0, "Z": 50.0}
 HEADER = "point,x_mm,y_mm,z_mm,x_counts,y_counts,z_counts"
 
 
@@ -118,7 +120,7 @@ def own_emulator(text, position_mm):
     "options", [{}, {"stores": "error", "detection_unit_um": 0.5, "magnification": {"Y": 3, "Z": 2}}]
 )
 def test_the_text_holds_the_best_field_within_half_a_count(chain, options, make_errors, tmp_path):
-    machine = machine_of(chain, **options)
+    machine = machine_of(chain, interval_mm=COARSE_MM, **options)
     errors = make_errors(machine)
     made = export(machine, errors, "fanuc-3d", allow_unverified=True)
     assert made.violations == [] and list(made.files) == ["VOLUME.csv", "VOLUME.plan.json"]
@@ -162,7 +164,7 @@ def test_plan_and_csv_hold_the_same_numbers_in_the_stated_order(small_machine, s
 
 
 def test_limits_are_named_with_what_helps(make_errors):
-    machine = machine_of(value_high=20, value_low=-20, interval_mm={"X": 20.0})
+    machine = machine_of(value_high=20, value_low=-20, interval_mm={**COARSE_MM, "X": 20.0})
     made = export(machine, make_errors(machine), "fanuc-3d", allow_unverified=True)
     text = " | ".join(made.violations)
     assert "set magnification." in text and "vertices along X, at most 25" in text
@@ -171,7 +173,7 @@ def test_limits_are_named_with_what_helps(make_errors):
 
 
 def test_the_suggested_magnification_is_enough(make_errors):
-    machine = machine_of(value_high=20, value_low=-20)
+    machine = machine_of(value_high=20, value_low=-20, interval_mm=COARSE_MM)
     errors = make_errors(machine)
     found = export(machine, errors, "fanuc-3d", allow_unverified=True).violations
     needed = dict(re.findall(r"magnification\.([XYZ]) = (\d+)", " ".join(found)))
