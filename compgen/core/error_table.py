@@ -32,7 +32,8 @@ class Curve:
     def __post_init__(self) -> None:
         if not len(self.position_mm) == len(self.value) == len(self.u) > 0:
             raise ValueError(f"lengths differ: {len(self.position_mm)}, {len(self.value)}, {len(self.u)}")
-        if not np.all(np.isfinite(self.position_mm)) or np.any(np.diff(self.position_mm) <= 0):
+        ascending = self.position_mm[1:] > self.position_mm[:-1]
+        if not (ascending.all() and np.isfinite(self.position_mm).all()):
             raise ValueError("positions of a curve must be finite and ascend")
 
     def at(self, position_mm: FloatArray) -> FloatArray:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-import numpy as np
-from scipy.linalg.lapack import dtrtri
+from functools import cached_property
 
 from compgen.core.csvio import FloatArray
 from compgen.identify.solver import Factor
@@ -33,10 +31,12 @@ class Adjustment:
     sigma_mm: float
     held_weight: FloatArray | None = None
 
-    def covariance_factor(self) -> FloatArray:
-        """Upper triangular F (size, size) with F F^T the covariance of all unknowns, mm and rad.
+    @cached_property
+    def _root(self) -> FloatArray:
+        root = self.factor.inverse_root()
+        root *= self.sigma_mm
+        return root
 
-        With S the scale that gives the normal matrix a unit diagonal and L its Cholesky factor, F = sigma S L^-T.
-        """
-        inverse, _ = dtrtri(self.factor.lower, lower=1)
-        return np.asarray(self.sigma_mm * self.factor.scale[:, None] * np.tril(inverse).T)
+    def covariance_factor(self) -> FloatArray:
+        """Upper triangular F (size, size) with F F^T the covariance of all unknowns, mm and rad."""
+        return self._root

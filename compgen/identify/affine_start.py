@@ -7,12 +7,14 @@ sight of the first normal matrix are right, and its factor serves until the end.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import LinAlgError
 
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Reference
 from compgen.core.names import AXES
 from compgen.identify.grid import nominal_targets
 from compgen.identify.grid_problem import GridProblem
+from compgen.identify.solver import factorise
 from compgen.identify.state import State
 
 #: Cells of the grid that are looked at, spread over the volume.
@@ -51,7 +53,7 @@ def affine_start(problem: GridProblem, start: State) -> State:
 
 
 def _spread(count: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    return np.unique(np.round(np.linspace(0, count - 1, min(count, SAMPLE))).astype(np.int64))
+    return np.round(np.linspace(0, count - 1, min(count, SAMPLE))).astype(np.int64)
 
 
 def _fields(p: FloatArray, reference: Reference) -> FloatArray:
@@ -82,14 +84,11 @@ def _step(
     rows = (jacobian * root).reshape(-1, size)
     matrix = rows.T @ rows
     gradient = rows.T @ (residual[:, :, None] * root).ravel()
-    diagonal = np.diag(matrix)
-    if not diagonal.min() > 0:
+    try:
+        factor = factorise(matrix)
+    except LinAlgError:
         return None
-    scale = 1.0 / np.sqrt(diagonal)
-    eigenvalues, vectors = np.linalg.eigh(matrix * scale * scale[:, None])
-    if eigenvalues[0] < LEAST_RCOND * eigenvalues[-1]:
-        return None
-    return np.asarray(-scale * (vectors @ ((vectors.T @ (gradient * scale)) / eigenvalues)))
+    return None if factor.rcond < LEAST_RCOND else -factor.solve(gradient)
 
 
 def _errors(problem: GridProblem, affine: FloatArray) -> FloatArray:
@@ -100,6 +99,9 @@ def _errors(problem: GridProblem, affine: FloatArray) -> FloatArray:
         axis = curve.error.axis
         if curve.error.name == f"E{AXES[axis]}{AXES[axis]}":
             reference = parameters.machine.reference_point_mm[axis]
+            if parameters.machine.curves == "linear" and np.count_nonzero(curve.free) == curve.free.shape[1]:
+                errors[curve.columns] = affine[axis] * (curve.nodes_mm - reference) @ curve.free  # picks free nodes
+                continue
             line = affine[axis] * (problem.levels_mm[axis] - reference)
             reduced = problem.bases[axis] @ curve.free
             errors[curve.columns] = np.linalg.lstsq(reduced, line, rcond=1e-9)[0]

@@ -155,12 +155,10 @@ def with_systematic(
         )
         for k, item in enumerate(result.stations)
     )
-    response = systematic.response[: result.layout.size]
     return replace(
         result,
         errors=errors,
         stations=stations,
-        covariance=result.covariance + response @ response.T,
         worst_u=worst_uncertainty(errors),
         systematic=systematic,
     )

@@ -26,7 +26,7 @@ from compgen.identify.result import Identification, worst_uncertainty
 from compgen.identify.separation import SeparationProblem
 from compgen.identify.solver import Factor, Solution, factorise, solve
 from compgen.identify.state import State
-from compgen.identify.tables import error_table, inverse, metadata_of, unobservable
+from compgen.identify.tables import error_table, metadata_of, unobservable
 from compgen.identify.threads import one_thread
 from compgen.identify.travel import check_travel
 
@@ -179,8 +179,14 @@ def _result(
     root = float(np.sqrt(chi_square))
     u_scale = root if components.source == "assumed" else max(1.0, root)
     factor = _of_the_errors(solution.factor, layout.size)
-    covariance = inverse(factor) * u_scale**2
-    errors = error_table(layout, solution.state.errors, covariance)
+    adjustment = Adjustment(
+        state=State(solution.state.errors, np.zeros((0, 3)), np.zeros(0)),
+        factor=factor,
+        weight=accepted / components.sigma_mm**2,
+        group=np.zeros(0, dtype=np.int64),
+        sigma_mm=u_scale,
+    )
+    errors = error_table(layout, solution.state.errors, adjustment.covariance_factor())
     errors = errors.replace(metadata=metadata_of(layout.machine, deviations.metadata))
     return Identification(
         errors=errors,
@@ -201,15 +207,8 @@ def _result(
         condition=1.0 / solution.factor.rcond,
         iterations=solution.iterations,
         worst_u=worst_uncertainty(errors),
-        covariance=covariance,
         layout=layout,
-        adjustment=Adjustment(
-            state=State(solution.state.errors, np.zeros((0, 3)), np.zeros(0)),
-            factor=factor,
-            weight=accepted / components.sigma_mm**2,
-            group=np.zeros(0, dtype=np.int64),
-            sigma_mm=u_scale,
-        ),
+        adjustment=adjustment,
         method="deviations",
     )
 

@@ -1,16 +1,18 @@
-"""Readings sorted into a full grid of levels, and merged where several fall into one cell."""
+"""A full grid of levels with the merged readings on it, and the unknowns: what all parts of the fast path share."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from compgen.core.csvio import FloatArray
-from compgen.identify.level_map import Entries
+from compgen.core.names import SQUARENESS_NAMES
+from compgen.identify.motion import MotionMap
 from compgen.identify.parameters import ErrorParameters
-from compgen.identify.state import IntArray
+from compgen.identify.state import IntArray, State
+from compgen.model.exact import passing_order, travel_directions
 
 
 @dataclass(frozen=True)
@@ -30,20 +32,21 @@ class Grid:
     ----------
     parameters : the unknown errors.
     order : axes from the outermost body of the chain (the last to be passed) to the innermost.
-    levels_mm, bases, reduced : levels of X, Y, Z, the curve bases there, and these times the free coefficients.
-    motion : from the unknowns to delta and eps at the levels of X, Y, Z in a row, shape (levels * 6, size).
+    levels_mm, bases : levels of X, Y, Z, and the curve bases there.
+    motion : from the unknowns to delta and eps at the levels of X, Y, Z in a row.
     tools : the data by tool.
     station_of : station of each group (dead length).
+    memo : what was worked out before and does not depend on the weights; shared by copies with other weights.
     """
 
     parameters: ErrorParameters
     order: tuple[int, int, int]
     levels_mm: tuple[FloatArray, FloatArray, FloatArray]
     bases: tuple[FloatArray, FloatArray, FloatArray]
-    reduced: tuple[Entries, ...]
-    motion: FloatArray
+    motion: MotionMap
     tools: tuple[ToolData, ...]
     station_of: IntArray
+    memo: dict[str, Any] = field(compare=False, repr=False)
 
     @property
     def stations(self) -> int:
@@ -60,36 +63,37 @@ class Grid:
         """Number of unknowns."""
         return self.parameters.size + 3 * self.stations + self.groups
 
+    @property
+    def first_rows(self) -> list[int]:
+        """First level of X, Y and Z where they stand one after another, and the number of all."""
+        counts = [len(levels) for levels in self.levels_mm]
+        return [0, counts[0], counts[0] + counts[1], sum(counts)]
 
-def merge(
-    tools: Sequence[ToolData],
-    shape: tuple[int, ...],
-    cell: tuple[IntArray, IntArray],
-    reading_mm: FloatArray,
-    weight: FloatArray,
-) -> tuple[tuple[ToolData, ...], float]:
-    """Merge the readings of each cell into their weighted mean; also return the scatter about the means."""
-    tool, index = cell
-    count = int(np.prod(shape))
-    merged, scatter = [], 0.0
-    for k, data in enumerate(tools):
-        rows = slice(None) if len(tools) == 1 else np.flatnonzero(tool == k)
-        cells, w, reading = index[rows], weight[rows], reading_mm[rows]
-        total = np.bincount(cells, w, count).astype(np.float64)
-        mean = np.bincount(cells, w * reading, count) / np.where(total > 0, total, 1.0)
-        scatter += float(np.dot(w, (reading - mean[cells]) ** 2))
-        merged.append(replace(data, weight=total.reshape(shape), length_mm=mean.reshape(shape)))
-    return tuple(merged), scatter
+    def plan(self) -> tuple[IntArray, FloatArray, IntArray]:
+        """Return what the compiled loops want to know about the chain, the levels, and the columns of squareness.
 
+        See ``compiled_chain.carriages`` and ``compiled_chain.chain_gradient``.
+        """
+        if "plan" not in self.memo:
+            sides = dict(passing_order(self.parameters.machine))
+            counts = [len(levels) for levels in self.levels_mm]
+            side = [int(sides[axis]) for axis in range(3)]
+            chain = np.array([self.order[::-1], self.first_rows[:3], counts, side], dtype=np.int64)
+            columns = np.full(3, -1, dtype=np.int64)
+            names = self.parameters.squareness
+            for k, name in enumerate(names):
+                columns[SQUARENESS_NAMES.index(name)] = self.parameters.size - len(names) + k
+            self.memo["plan"] = (chain, np.concatenate(self.levels_mm), columns)
+        chain, levels, columns = self.memo["plan"]
+        return chain, levels, columns
 
-def levels_of(position_mm: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Distinct values (k,) of (n,) and the index of each position; a sample is tried first, sorting all is slow."""
-    sample = np.unique(position_mm[:: max(1, len(position_mm) // 1999) | 1])
-    found = np.minimum(np.searchsorted(sample, position_mm), len(sample) - 1)
-    if np.array_equal(sample[found], position_mm):
-        return sample, found
-    levels = np.unique(position_mm)
-    return levels, np.searchsorted(levels, position_mm)
+    def travel(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Directions of travel and their derivatives at the squareness of ``state``, see ``travel_directions``."""
+        values = [0.0, 0.0, 0.0]
+        names = self.parameters.squareness
+        for k, name in enumerate(names):
+            values[SQUARENESS_NAMES.index(name)] = float(state.errors[self.parameters.size - len(names) + k])
+        return travel_directions(self.parameters.machine, np.array(values))
 
 
 def nominal_targets(grid: Grid) -> list[FloatArray]:

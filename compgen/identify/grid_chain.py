@@ -10,10 +10,8 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.names import SQUARENESS_NAMES
 from compgen.identify.grid import Grid
-from compgen.identify.level_map import Entries
-from compgen.identify.parameters import ErrorParameters
 from compgen.identify.state import State
-from compgen.model.exact import level_rotations, passing_order, travel_directions
+from compgen.model.exact import level_rotations, passing_order
 
 
 @dataclass(frozen=True)
@@ -30,19 +28,10 @@ class Body:
     rows: slice
 
 
-def squareness_of(parameters: ErrorParameters, state: State) -> FloatArray:
-    """EC0Y, EB0Z, EA0Z in rad, those that are not unknown being zero."""
-    values = np.zeros(3)
-    for k, name in enumerate(parameters.squareness):
-        values[SQUARENESS_NAMES.index(name)] = state.errors[parameters.size - len(parameters.squareness) + k]
-    return values
-
-
 def bodies_at(grid: Grid, state: State) -> list[Body]:
     """Bodies in the order in which the tool point passes them (innermost first)."""
-    parameters = grid.parameters
-    directions, derivatives = travel_directions(parameters.machine, squareness_of(parameters, state))
-    motion = (grid.motion @ state.errors).reshape(-1, 6)
+    directions, derivatives = grid.travel(state)
+    motion = (grid.motion.dense @ state.errors).reshape(-1, 6)
     rotation, jacobian = level_rotations(motion[:, 3:])
     own = level_slices(grid.levels_mm)
     return [
@@ -56,7 +45,7 @@ def bodies_at(grid: Grid, state: State) -> list[Body]:
             derivatives[axis],
             own[axis],
         )
-        for axis, tool_side in passing_order(parameters.machine)
+        for axis, tool_side in passing_order(grid.parameters.machine)
     ]
 
 
@@ -64,16 +53,6 @@ def level_slices(levels_mm: Sequence[FloatArray]) -> list[slice]:
     """Rows of the levels of X, Y and Z where they stand one after another."""
     bounds = np.cumsum([0, *(len(levels) for levels in levels_mm)]).tolist()
     return [slice(bounds[axis], bounds[axis + 1]) for axis in range(3)]
-
-
-def motion_map(parameters: ErrorParameters, levels_mm: Sequence[FloatArray], reduced: Sequence[Entries]) -> FloatArray:
-    """Map from the unknowns to delta and eps at the levels of X, Y, Z in a row, shape (levels * 6, size)."""
-    own = level_slices(levels_mm)
-    matrix = np.zeros((own[2].stop, 6, parameters.size))
-    for curve, entries in zip(parameters.curves, reduced, strict=True):
-        column = curve.error.direction + (3 if curve.error.kind == "angular" else 0)
-        matrix[own[curve.error.axis].start + entries.level, column, entries.column] = entries.value
-    return matrix.reshape(-1, parameters.size)
 
 
 def points_along(bodies: Sequence[Body], tool_mm: FloatArray) -> list[FloatArray]:
@@ -109,7 +88,7 @@ def pull_back(
     """Add the gradient by the errors for forces on the tips (n_out, 3, m): back along the chain, body by body."""
     parameters = grid.parameters
     first = parameters.size - len(parameters.squareness)
-    by_motion = np.empty((len(grid.motion) // 6, 6))
+    by_motion = np.empty((grid.first_rows[3], 6))
     for body, before in zip(reversed(bodies), reversed(tips[:-1]), strict=True):
         turned = body.rotation.transpose(0, 2, 1) @ force
         arm = turned @ _flat(before).T  # [level, force component, arm component]
@@ -128,4 +107,4 @@ def pull_back(
             for k, name in enumerate(parameters.squareness):
                 gradient[first + k] += by_squareness[SQUARENESS_NAMES.index(name)]
         force = turned.sum(axis=0).reshape(3, before.shape[0], before.shape[2]).transpose(1, 0, 2)
-    gradient[: parameters.size] += by_motion.ravel() @ grid.motion
+    gradient[: parameters.size] += by_motion.ravel() @ grid.motion.dense

@@ -13,31 +13,22 @@ the data become arrays over (station, x, y, z) in which a missing reading has we
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
 from compgen.core.csvio import FloatArray
-from compgen.core.names import SQUARENESS_NAMES
-from compgen.identify.grid import Grid, ToolData, levels_of, merge
-from compgen.identify.grid_chain import (
-    Body,
-    bodies_at,
-    lengths_of,
-    level_slices,
-    motion_map,
-    points_along,
-    pull_back,
-    squareness_of,
-)
-from compgen.identify.grid_moments import BATCH, add_normal
+from compgen.identify.grid import Grid, ToolData
+from compgen.identify.grid_chain import Body, bodies_at, lengths_of, points_along, pull_back
+from compgen.identify.grid_moments import BATCH, compiled_moments, moments
+from compgen.identify.grid_normal import add_normal
+from compgen.identify.grid_readings import levels_of, merge
 from compgen.identify.kernels import compiled_loops
-from compgen.identify.level_map import reduced_entries
+from compgen.identify.motion import motion_map
 from compgen.identify.parameters import ErrorParameters
 from compgen.identify.state import IntArray, State
-from compgen.model.exact import passing_order, travel_directions
+from compgen.model.exact import passing_order
 
 
 @dataclass(frozen=True)
@@ -50,7 +41,6 @@ class GridProblem(Grid):
     reading_mm, reading_weight : the readings before merging.
     scatter : weighted square sum of the readings about their means, half of it is part of the cost.
     single : whether no cell holds more than one reading.
-    memo : geometry at the state that was looked at last; it does not depend on the weights.
     """
 
     cell: tuple[IntArray, IntArray]
@@ -58,7 +48,6 @@ class GridProblem(Grid):
     reading_weight: FloatArray
     scatter: float
     single: bool
-    memo: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def weighted(self, weight: FloatArray) -> GridProblem:
         """Return the same problem with other weights of the readings."""
@@ -87,42 +76,29 @@ class GridProblem(Grid):
 
     def _compiled(self, loops: ModuleType, state: State, gradient: FloatArray) -> float:
         """Return the cost and add the gradient, all in one compiled pass."""
-        parameters = self.parameters
-        directions, derivatives = travel_directions(parameters.machine, squareness_of(parameters, state))
-        motion = (self.motion @ state.errors).reshape(-1, 6)
-        own = level_slices(self.levels_mm)
-        travel = np.concatenate([self.levels_mm[axis][:, None] * directions[axis] for axis in range(3)])
-        sides = dict(passing_order(parameters.machine))
-        by_motion, by_group, cost = np.zeros_like(motion), np.zeros((self.groups, 4)), 0.0
+        chain, levels, squareness = self.plan()
+        motion = self.motion
+        directions, derivatives = self.travel(state)
+        cost = 0.0
         for data in self.tools:
-            by_tool = np.zeros_like(motion)
-            cost += float(
-                loops.chain_gradient(
-                    np.array(self.order[::-1]),
-                    np.array([rows.start for rows in own]),
-                    np.array([len(levels) for levels in self.levels_mm]),
-                    np.array([int(sides[axis]) for axis in range(3)]),
-                    motion,
-                    travel,
-                    data.tool_mm,
-                    state.stations_mm[self.station_of],
-                    state.dead_length_mm,
-                    data.weight,
-                    data.length_mm,
-                    by_tool,
-                    by_group,
-                )
+            cost += loops.chain_gradient(
+                chain,
+                levels,
+                directions,
+                derivatives,
+                motion.row,
+                motion.column,
+                motion.value,
+                state.errors,
+                squareness,
+                data.tool_mm,
+                state.stations_mm,
+                state.dead_length_mm,
+                self.station_of,
+                data.weight,
+                data.length_mm,
+                gradient,
             )
-            by_motion += by_tool
-        first, second = parameters.size, parameters.size + 3 * self.stations
-        gradient[:first] += by_motion.ravel() @ self.motion
-        by_direction = [self.levels_mm[axis] @ by_motion[own[axis], :3] for axis in range(3)]
-        for k, name in enumerate(parameters.squareness):
-            part = np.vdot(by_direction, derivatives[:, :, SQUARENESS_NAMES.index(name)])
-            gradient[first - len(parameters.squareness) + k] += float(part)
-        for group, station in enumerate(self.station_of.tolist()):
-            gradient[first + 3 * station : first + 3 * station + 3] += by_group[group, :3]
-        gradient[second:] += by_group[:, 3]
         return cost
 
     def _forces(self, state: State, data: ToolData, tip: FloatArray, force: FloatArray, gradient: FloatArray) -> float:
@@ -157,22 +133,47 @@ class GridProblem(Grid):
         bodies, places = self.memo["geometry"]
         return bodies, places
 
-    def predicted(self, state: State) -> list[FloatArray]:
-        """Model readings by tool, each (groups, n_out, n_mid * n_in), mm."""
+    def _distances(self, state: State) -> list[FloatArray]:
+        """Distances of stations and tips by tool, each (groups, n_out, n_mid * n_in), mm."""
+        loops = compiled_loops()
         found = []
-        for tips in self._geometry(state)[1]:
-            sight = tips[-1][None] - state.stations_mm[self.station_of][:, None, :, None]
-            found.append(lengths_of(sight) - state.dead_length_mm[:, None, None])
+        if loops is None:
+            for tips in self._geometry(state)[1]:
+                found.append(lengths_of(tips[-1][None] - state.stations_mm[self.station_of][:, None, :, None]))
+            return found
+        chain, levels, _ = self.plan()
+        motion = self.motion
+        directions, _ = self.travel(state)
+        for data in self.tools:
+            distance = np.empty(data.weight.shape)
+            loops.chain_distances(
+                chain,
+                levels,
+                directions,
+                motion.row,
+                motion.column,
+                motion.value,
+                state.errors,
+                data.tool_mm,
+                state.stations_mm,
+                self.station_of,
+                distance,
+            )
+            found.append(distance)
         return found
 
     def residuals(self, state: State) -> FloatArray:
         """Model minus reading of every reading, shape (n,), mm."""
-        return self._at_readings(self.predicted(state)) - self.reading_mm
+        parts = self._distances(state)
+        for part in parts:
+            part -= state.dead_length_mm[:, None, None]
+        residual = self._at_readings(parts)
+        residual -= self.reading_mm
+        return residual
 
     def distances(self, state: State) -> FloatArray:
         """Distance from the station of every reading, shape (n,), mm."""
-        parts = [part + state.dead_length_mm[:, None, None] for part in self.predicted(state)]
-        return self._at_readings(parts)
+        return self._at_readings(self._distances(state))
 
     def _at_readings(self, parts: Sequence[FloatArray]) -> FloatArray:
         tool, cell = self.cell
@@ -183,8 +184,13 @@ class GridProblem(Grid):
     def normal_matrix(self, state: State) -> FloatArray:
         """J^T W J (size, size) with C in place of the exact derivative."""
         matrix = np.zeros((self.size, self.size))
-        for data, tips in zip(self.tools, self._geometry(state)[1], strict=True):
-            add_normal(self, data, tips[-1], state, matrix)
+        loops = compiled_loops()
+        for k, data in enumerate(self.tools):
+            if loops is not None:
+                sums = compiled_moments(loops, self, data, state)
+            else:
+                sums = moments(self, data, self._geometry(state)[1][k][-1], state)
+            add_normal(self, sums, data.tool_mm, state, matrix, loops)
         first, second = self.parameters.size, self.parameters.size + 3 * self.stations
         matrix[first:, :first] = matrix[:first, first:].T
         matrix[second:, first:second] = matrix[first:second, second:].T
@@ -214,7 +220,7 @@ def grid_problem(
     """
     count = len(reading_mm)
     compiled_loops(count)
-    found = [levels_of(np.ascontiguousarray(position_mm[:, axis])) for axis in range(3)]
+    found = [levels_of(position_mm[:, axis]) for axis in range(3)]
     levels, at = [item[0] for item in found], [item[1] for item in found]
     if tool_mm.ndim == 1:
         tools, tool = tool_mm[None], np.zeros(count, dtype=np.int64)
@@ -227,32 +233,34 @@ def grid_problem(
         return None
     order = tuple(axis for axis, _ in reversed(passing_order(parameters.machine)))
     out, mid, inner = order
-    size_mid, size_in = len(levels[mid]), len(levels[inner])
-    index = group * len(levels[out]) + at[out]
-    index = (index * size_mid + at[mid]) * size_in + at[inner]
-    station_of = np.zeros(groups, dtype=np.int64)
-    station_of[group] = station
-    shape = (groups, len(levels[out]), size_mid * size_in)
+    shape = (groups, len(levels[out]), len(levels[mid]) * len(levels[inner]))
+    index = group * shape[1]
+    index += at[out]
+    index *= len(levels[mid])
+    index += at[mid]
+    index *= len(levels[inner])
+    index += at[inner]
+    station_of = np.arange(groups)
+    if group is not station:
+        station_of[group] = station
     bases = tuple(parameters.basis(axis, levels[axis]) for axis in range(3))
-    reduced = reduced_entries(parameters, bases)
     nothing = np.zeros((0, 0, 0))
-    empty = [ToolData(offset, nothing, nothing) for offset in tools]
-    cell = (tool.astype(np.int64), index.astype(np.int64))
+    empty = [ToolData(np.array(offset), nothing, nothing) for offset in tools]
+    cell = (tool.astype(np.int64, copy=False), index.astype(np.int64, copy=False))
     weight = np.ones(count)
     merged, scatter = merge(empty, shape, cell, reading_mm, weight)
-    single = len(tools) == 1 and int(np.bincount(cell[1]).max()) == 1
     return GridProblem(
         parameters=parameters,
         order=order,  # type: ignore[arg-type]
         levels_mm=tuple(levels),  # type: ignore[arg-type]
         bases=bases,  # type: ignore[arg-type]
-        reduced=reduced,
-        motion=motion_map(parameters, levels, reduced),
+        motion=motion_map(parameters, bases),
         tools=merged,
         station_of=station_of,
+        memo={},
         cell=cell,
         reading_mm=reading_mm,
         reading_weight=weight,
         scatter=scatter,
-        single=single,
+        single=len(tools) == 1 and float(merged[0].weight.max()) == 1.0,
     )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.identify.grid import Grid, nominal_targets
+from compgen.identify.kernels import compiled_loops
 
 
 def start_moments(grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -18,14 +21,16 @@ def start_moments(grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray, float
     -------
     moments (groups, 6, 6), offset (groups,), centre in mm (3,), scale in mm.
     """
-    targets = nominal_targets(grid)
-    centre = targets[0].mean(axis=1)
-    scale = max(float(np.ptp(targets[0], axis=1).max()), 1.0)
+    centre = np.array([levels.mean() for levels in grid.levels_mm]) + grid.tools[0].tool_mm
+    scale = max(max(float(np.ptp(levels)) for levels in grid.levels_mm), 1.0)
+    loops = compiled_loops()
+    if loops is not None:
+        return *_compiled_moments(loops, grid, centre, scale), centre, scale
     readings = np.sum([np.sum(data.length_mm * (data.weight > 0), axis=(1, 2)) for data in grid.tools], axis=0)
     counts = np.sum([np.count_nonzero(data.weight, axis=(1, 2)) for data in grid.tools], axis=0)
     offset = readings / np.maximum(counts, 1) / scale
     moments = np.zeros((grid.groups, 6, 6))
-    for data, target in zip(grid.tools, targets, strict=True):
+    for data, target in zip(grid.tools, nominal_targets(grid), strict=True):
         p = (target - centre[:, None]) / scale
         columns = np.ones((6, p.shape[1]))
         columns[:3] = 2.0 * p
@@ -37,3 +42,24 @@ def start_moments(grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray, float
             present = (data.weight[group] > 0).ravel()
             moments[group] += (columns * present) @ columns.T
     return moments, offset, centre, scale
+
+
+def _compiled_moments(loops: ModuleType, grid: Grid, centre: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:
+    """Moments (groups, 6, 6) and offsets (groups,) by the compiled loops."""
+    counts, readings = np.zeros(grid.groups), np.zeros(grid.groups)
+    for data in grid.tools:
+        loops.add_sums(data.weight, data.length_mm, counts, readings)
+    offset = readings / np.maximum(counts, 1.0) / scale
+    moments = np.zeros((grid.groups, 6, 6))
+    out, mid, inner = grid.order
+    axes = np.array(grid.order)
+    for data in grid.tools:
+        along = [(levels + data.tool_mm[k] - centre[k]) / scale for k, levels in enumerate(grid.levels_mm)]
+        plane = np.stack([np.repeat(along[mid], len(along[inner])), np.tile(along[inner], len(along[mid]))])
+        for k in range(grid.groups):
+            loops.start_sums(
+                along[out], plane, axes, data.weight[k], data.length_mm[k], scale, float(offset[k]), moments[k]
+            )
+    moments += moments.swapaxes(1, 2).copy()  # each product was entered once, on one side of the diagonal or on it
+    moments[:, np.arange(6), np.arange(6)] *= 0.5
+    return moments, offset

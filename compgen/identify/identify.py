@@ -20,6 +20,7 @@ from compgen.identify.affine_start import affine_start
 from compgen.identify.covariance import with_systematic
 from compgen.identify.determined import determined, unmirrored, weakness
 from compgen.identify.grid_problem import GridProblem
+from compgen.identify.kernels import count_identification
 from compgen.identify.known_stations import HeldStations, KnownStations, hold, locate_stations, with_known_start
 from compgen.identify.located import TracerReadings
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
@@ -58,6 +59,7 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
         if no optimum is reached.
     """
     chosen = options or IdentifyOptions()
+    count_identification()
     with one_thread():
         found = identify_at_reference(
             machine,

@@ -1,7 +1,8 @@
 """Access to the compiled inner loops of :mod:`compgen.identify.compiled`, which need numba.
 
-Loading them takes a fifth of a second. They are loaded for large data, and for a process that identifies repeatedly;
-a single small identification from the command line is faster without.
+Loading them takes a third of a second, and some seconds for the first time on a computer, when they are compiled. They
+are loaded for large data, and for a process that identifies repeatedly; a single small identification from the command
+line is faster without.
 """
 
 from __future__ import annotations
@@ -20,12 +21,15 @@ def allow(compiled: bool) -> None:
     _state["allowed"] = int(compiled)
 
 
+def count_identification() -> None:
+    """Say that an identification begins; from the second of a process on the compiled loops are loaded."""
+    _state["calls"] += 1
+
+
 def compiled_loops(readings: int = 0) -> ModuleType | None:
-    """Return the compiled module, or None where numpy serves; ``readings`` is given once for each identification."""
+    """Return the compiled module, or None where numpy serves; it is loaded where so many ``readings`` come at once."""
     if not _state["allowed"]:
         return None
-    if readings:
-        _state["calls"] += 1
     if "module" not in _loaded and (_state["calls"] > 1 or readings >= LARGE):
         try:
             _loaded["module"] = importlib.import_module("compgen.identify.compiled")

@@ -58,6 +58,13 @@ class ReadingNoise:
     proportional_um_per_m: float
     column_um: FloatArray | None = None
 
+    @property
+    def uniform_mm(self) -> float | None:
+        """Standard uncertainty in mm where it is the same for all readings, else None."""
+        if self.proportional_um_per_m or self.column_um is not None:
+            return None
+        return self.constant_um * MM_PER_UM
+
     def sigma_mm(self, distance_mm: FloatArray) -> FloatArray:
         """Standard uncertainty in mm of readings over the given distances."""
         common = (self.constant_um + self.proportional_um_per_m * distance_mm / 1000.0) * MM_PER_UM

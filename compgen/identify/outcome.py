@@ -15,8 +15,7 @@ from compgen.identify.outliers import explain_rejected
 from compgen.identify.rank import Rank
 from compgen.identify.result import Identification, StationResult, worst_uncertainty
 from compgen.identify.robust import RobustFit
-from compgen.identify.state import State
-from compgen.identify.tables import error_table, inverse, metadata_of, unobservable
+from compgen.identify.tables import error_table, metadata_of, unobservable
 from compgen.identify.task import AnyProblem, Task
 
 
@@ -48,21 +47,31 @@ def assemble(
     freedom = int(np.count_nonzero(accepted)) - problem.size + (held.observations if held else 0)
     if freedom < 1:
         raise UndeterminedError(f"{np.count_nonzero(accepted)} readings for {problem.size} unknowns", [])
-    used = residual if accepted.all() else residual[accepted]
-    square_sum = float(np.sum((used / (sigma_mm if accepted.all() else sigma_mm[accepted])) ** 2))
+    everything = bool(accepted.all())
+    used = residual if everything else residual[accepted]
+    standardised = used / (sigma_mm if everything else sigma_mm[accepted])
+    square_sum = float(standardised @ standardised)
     square_sum += held.square_sum(solution.state) / float(sigma_mm.min()) ** 2 if held else 0.0
     chi_square = square_sum / freedom
     u_scale = float(np.sqrt(chi_square)) if noise.source == "assumed" else max(1.0, float(np.sqrt(chi_square)))
-    covariance = inverse(solution.factor) * (float(sigma_mm.min()) * u_scale) ** 2
-    errors = error_table(layout, solution.state.errors, covariance[: layout.size, : layout.size])
+    least = float(sigma_mm.min())
+    adjustment = Adjustment(
+        state=solution.state,
+        factor=solution.factor,
+        weight=(least / sigma_mm) ** 2 * accepted,
+        group=task.group,
+        sigma_mm=least * u_scale,
+        held_weight=held.held_weight if held else None,
+    )
+    errors = error_table(layout, solution.state.errors, adjustment.covariance_factor()[: layout.size])
     errors = errors.replace(metadata=metadata_of(task.machine, task.lengths.metadata))
     rejected = np.flatnonzero(~accepted)
     return Identification(
         errors=errors,
-        stations=_stations(task, solution.state, covariance, residual, accepted),
+        stations=_stations(task, adjustment, residual, accepted),
         residual_mm=residual,
         accepted=accepted,
-        rms_um=float(np.sqrt(np.mean(used**2))) / MM_PER_UM,
+        rms_um=float(np.sqrt(used @ used / len(used))) / MM_PER_UM,
         degrees_of_freedom=freedom,
         reduced_chi_square=chi_square,
         u_source=noise.source,
@@ -79,28 +88,22 @@ def assemble(
         condition=1.0 / solution.factor.rcond,
         iterations=solution.iterations,
         worst_u=worst_uncertainty(errors),
-        covariance=covariance[: layout.size, : layout.size],
         layout=layout,
-        adjustment=Adjustment(
-            state=solution.state,
-            factor=solution.factor,
-            weight=(float(sigma_mm.min()) / sigma_mm) ** 2 * accepted,
-            group=task.group,
-            sigma_mm=float(sigma_mm.min()) * u_scale,
-            held_weight=held.held_weight if held else None,
-        ),
+        adjustment=adjustment,
     )
 
 
 def _stations(
-    task: Task, state: State, covariance: FloatArray, residual: FloatArray, accepted: NDArray[np.bool_]
+    task: Task, adjustment: Adjustment, residual: FloatArray, accepted: NDArray[np.bool_]
 ) -> tuple[StationResult, ...]:
-    u = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    state, factor = adjustment.state, adjustment.covariance_factor()
+    u = np.sqrt(np.einsum("ij,ij->i", factor, factor))
     first = task.problem.parameters.size
     second = first + state.stations_mm.size
     groups = len(state.dead_length_mm)
-    used = np.bincount(task.group, accepted, groups)
-    squares = np.bincount(task.group, residual**2 * accepted, groups)
+    everything = bool(accepted.all())
+    used = np.bincount(task.group, None if everything else accepted, groups)
+    squares = np.bincount(task.group, residual**2 if everything else residual**2 * accepted, groups)
     setups = task.lengths.labels.get("setup", np.zeros(len(task.lengths), dtype=np.int64))
     row_of = np.zeros(groups, dtype=np.int64)
     row_of[task.group] = np.arange(len(task.group))

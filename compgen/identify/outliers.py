@@ -23,6 +23,8 @@ LIMIT = 6.0
 LEAST_SPREAD = 0.02
 #: Residuals that scatter more than so many standard uncertainties are looked at for gross mistakes.
 LARGEST_SPREAD = 10.0
+#: Residuals that are enough to see whether they scatter that much.
+SAMPLE = 2000
 #: A reading fits another point or station when it agrees within so many standard deviations.
 CLOSE = 10.0
 #: Below this size a residual is no exchange of points: neighbours in the volume are further apart.
@@ -62,7 +64,10 @@ def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
 
 def belonging(standardised: FloatArray) -> bool:
     """Whether all readings belong: none beyond the limit, and no residuals so large that a mistake may hide in them."""
-    return bool(accepted_readings(standardised).all()) and standardised_spread(standardised[::7]) < LARGEST_SPREAD
+    return (
+        bool(accepted_readings(standardised).all())
+        and standardised_spread(standardised[:: max(7, len(standardised) // SAMPLE) | 1]) < LARGEST_SPREAD
+    )
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ def error_parameters(machine: Machine, names: Sequence[str], *, several_tools: b
     curves of the axis without any other axis in its lever arm stay free: with them comes the constant orientation
     between tool and workpiece, which the tools show.
     """
-    single_tool = observable_errors(machine)
+    single_tool = observable_errors(machine) if several_tools else ()
     bare = next(axis for axis in range(3) if not [lever for lever in machine.chain.lever_axes(axis) if lever != axis])
     curves: list[CurveParameters] = []
     known: dict[tuple[int, bool, bool], FloatArray] = {}
@@ -127,7 +127,7 @@ def _free_coefficients(machine: Machine, error: ErrorName, *, released: bool) ->
     if released:
         return np.eye(count)
     zeros = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
-    held = np.isin(axis.nodes_mm, zeros)
+    held = (axis.nodes_mm[:, None] == np.array(zeros)).any(axis=1)
     if machine.curves == "linear" and np.count_nonzero(held) == len(zeros):
         return np.eye(count)[:, ~held]
     build = spline_matrix if machine.curves == "cubic" else hat_matrix

@@ -62,7 +62,6 @@ class Identification:
     corrections : what was taken out of the readings (temperature of the scales, wavelength).
     rank, unknowns, condition, iterations : of the least-squares problem.
     worst_u : largest standard uncertainty by unit ("um", "urad") with its error.
-    covariance : of the unknown errors in the order of ``unknowns`` of the layout, mm and rad.
     layout : the unknown errors and their bases.
     adjustment : the optimum with its factor, for the joint covariance and for systematic inputs; None if there is none.
     systematic : what systematic inputs contribute, and is part of the standard uncertainties then; None if none is.
@@ -90,7 +89,6 @@ class Identification:
     condition: float
     iterations: int
     worst_u: dict[str, tuple[float, str]]
-    covariance: FloatArray
     layout: ErrorParameters
     adjustment: Adjustment | None = None
     segments: tuple[Segment, ...] = ()
@@ -101,6 +99,20 @@ class Identification:
     method: str = "joint"
     steps: Mapping[str, Any] = field(default_factory=dict)
     positions: Deviations | None = None
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of the unknown errors in the order of the layout (size, size), mm and rad; made at the first look.
+
+        Systematic inputs are part of it where they were given.
+        """
+        if self.adjustment is None:
+            raise ValueError("this identification keeps no covariance")
+        factor = self.adjustment.covariance_factor()[: self.layout.size]
+        if self.systematic is None:
+            return factor @ factor.T
+        response = self.systematic.response[: self.layout.size]
+        return factor @ factor.T + response @ response.T
 
     @cached_property
     def whiteness(self) -> Whiteness | None:

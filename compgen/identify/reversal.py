@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.names import AXES, MM_PER_UM
-from compgen.identify.grid import levels_of
+from compgen.identify.grid_readings import levels_of
 from compgen.identify.segments import time_order
 from compgen.identify.state import IntArray
 from compgen.simulate.trajectory import approach_of
@@ -196,7 +196,7 @@ def stop_cells(lengths: Lengths, group: IntArray) -> IntArray:
     columns = [*lengths.position_mm.T, *(() if lengths.tool_mm is None else lengths.tool_mm.T)]
     cell, count = group, int(group.max()) + 1
     for column in columns:
-        levels, level = levels_of(np.ascontiguousarray(column))
+        levels, level = levels_of(column)
         cell, count = cell * len(levels) + level, count * len(levels)
         if count > SPARSE * len(cell):
             present, cell = np.unique(cell, return_inverse=True)

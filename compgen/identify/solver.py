@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError
-from scipy.linalg.lapack import dpocon, dpotrf, dpotrs
+from scipy.linalg.lapack import dpocon, dpotrf, dpotrs, dtrtri
 
 from compgen.core.csvio import FloatArray
 from compgen.errors import ConvergenceError
@@ -43,6 +43,31 @@ class Factor:
         solution, _ = dpotrs(self.lower, right * scale, lower=1)
         return np.asarray(scale * solution)
 
+    def inverse_root(self) -> FloatArray:
+        """Return the upper triangular F (size, size) with F F^T the inverse of the normal matrix.
+
+        With S the scale that gives the normal matrix a unit diagonal and L its Cholesky factor, F = S L^-T.
+        """
+        inverse = np.zeros(self.lower.shape, order="F")
+        _invert_lower(self.lower, inverse)
+        return np.multiply(self.scale[:, None], inverse.T)
+
+
+#: Triangles up to this size are inverted at once; larger ones in halves, where most of the work is matrix products.
+_WHOLE = 64
+
+
+def _invert_lower(lower: FloatArray, inverse: FloatArray) -> None:
+    """Fill in the lower triangle of the inverse of a lower triangular matrix (n, n)."""
+    count = len(lower)
+    if count <= _WHOLE:
+        inverse[:] = dtrtri(lower, lower=1)[0]
+        return
+    half = count // 2
+    _invert_lower(lower[:half, :half], inverse[:half, :half])
+    _invert_lower(lower[half:, half:], inverse[half:, half:])
+    np.matmul(inverse[half:, half:], -(lower[half:, :half] @ inverse[:half, :half]), out=inverse[half:, :half])
+
 
 def factorise(matrix: FloatArray, damping: float = 0.0) -> Factor:
     """Factorise a normal matrix (size, size); LinAlgError if it is not positive definite."""
@@ -54,7 +79,7 @@ def factorise(matrix: FloatArray, damping: float = 0.0) -> Factor:
     if damping:
         scaled[np.diag_indices(len(scaled))] += damping
     norm = float(np.abs(scaled).sum(axis=0).max())
-    lower, failed = dpotrf(scaled, lower=1, overwrite_a=1)
+    lower, failed = dpotrf(scaled.T, lower=1, overwrite_a=1)  # symmetric, and in the order that needs no copy
     if failed:
         raise LinAlgError("not positive definite")
     rcond, _ = dpocon(lower, norm, uplo="L")

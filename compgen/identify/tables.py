@@ -5,32 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.linalg.lapack import dpotri
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import ERROR_NAMES
 from compgen.identify.parameters import ErrorParameters
-from compgen.identify.solver import Factor
 
 
-def inverse(factor: Factor) -> FloatArray:
-    """Return the inverse of the normal matrix that a factor belongs to, (size, size)."""
-    lower, _ = dpotri(factor.lower, lower=1)
-    full: FloatArray = np.tril(lower)
-    full += np.tril(lower, -1).T
-    full *= factor.scale
-    full *= factor.scale[:, None]
-    return full
+def error_table(layout: ErrorParameters, unknowns: FloatArray, factor: FloatArray) -> ErrorTable:
+    """Return curves and squareness for the unknown errors (size,), mm and rad.
 
-
-def error_table(layout: ErrorParameters, unknowns: FloatArray, covariance: FloatArray) -> ErrorTable:
-    """Return curves and squareness for the unknown errors (size,) and their covariance (size, size), mm and rad."""
+    ``factor`` (size, r) times its transpose is their covariance.
+    """
     positions = [layout.output_positions_mm(axis) for axis in range(3)]
     plain = layout.machine.curves == "linear"  # written at the nodes, where coefficients are values
     bases = [np.zeros((0, 0)) if plain else layout.basis(axis, positions[axis]) for axis in range(3)]
-    variance = np.diag(covariance)
+    variance = np.einsum("ij,ij->i", factor, factor)
     curves = {}
     for curve in layout.curves:
         axis, free = curve.error.axis, curve.free
@@ -41,11 +32,12 @@ def error_table(layout: ErrorParameters, unknowns: FloatArray, covariance: Float
         else:
             reduced = free if plain else bases[axis] @ free
             value = reduced @ unknowns[curve.columns]
-            square = np.sum((reduced @ covariance[curve.columns, curve.columns]) * reduced, axis=1)
-        curves[curve.error.name] = Curve(positions[axis], value, np.sqrt(np.maximum(square, 0.0)))
+            spread = reduced @ factor[curve.columns]
+            square = np.einsum("ij,ij->i", spread, spread)
+        curves[curve.error.name] = Curve(positions[axis], value, np.sqrt(square))
     first = layout.size - len(layout.squareness)
     squareness = {
-        name: (float(unknowns[first + k]), float(np.sqrt(covariance[first + k, first + k])))
+        name: (float(unknowns[first + k]), float(np.sqrt(variance[first + k])))
         for k, name in enumerate(layout.squareness)
     }
     return ErrorTable(curves, squareness)

@@ -124,6 +124,9 @@ def _start_by_search(task: Task, station: int) -> StationStart:
 
 def with_weights(task: Task, start: State, noise: ReadingNoise) -> tuple[Task, FloatArray, FloatArray]:
     """Return the task with weighted readings, their standard uncertainty in mm and their weights, each (n,)."""
+    if noise.uniform_mm is not None:  # the problem came with weights 1
+        count = len(task.lengths)
+        return task, np.full(count, noise.uniform_mm), np.ones(count)
     sigma_mm = noise.sigma_mm(task.problem.distances(start))
     weights = (sigma_mm.min() / sigma_mm) ** 2
     return replace(task, problem=task.problem.weighted(weights)), sigma_mm, weights

@@ -17,7 +17,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import CompgenWarning
-from compgen.identify.grid import levels_of
+from compgen.identify.grid_readings import levels_of
 from compgen.identify.segments import time_order
 from compgen.identify.state import IntArray
 
@@ -191,7 +191,7 @@ def _distance(z: FloatArray, distance_mm: FloatArray) -> tuple[float, list[str]]
 
 def _axis(lengths: Lengths, z: FloatArray, used: np.ndarray[Any, Any], axis: int) -> tuple[float, float]:
     """Mean square of the level means of all stations times their numbers (1 for noise, less after a fit), and limit."""
-    levels, level = levels_of(np.ascontiguousarray(lengths.position_mm[:, axis]))
+    levels, level = levels_of(lengths.position_mm[:, axis])
     if len(levels) > MOST_BINS:
         level = (level * MOST_BINS) // len(levels)
     cell = level * len(lengths.stations) + lengths.station
