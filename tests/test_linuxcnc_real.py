@@ -14,6 +14,7 @@ import signal
 import subprocess
 import tempfile
 import time
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -61,10 +62,7 @@ def why_not():
     return ""
 
 
-pytestmark = [
-    pytest.mark.xdist_group("linuxcnc"),  # its shared memory, ports and lock files exist once on a machine
-    pytest.mark.skipif(bool(why_not()), reason=why_not() or "runs"),
-]
+pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not() or "runs")
 
 # --- one session ------------------------------------------------------------------------------------------------------
 
@@ -168,32 +166,41 @@ def private():
     return tuple(words) if run(probe, "/", 20)[1] == 0 else ()
 
 
-@pytest.fixture(scope="module")
-def workshop():
-    """A folder that an ordinary user can reach, with the modules built once; one session at a time on this machine."""
-    folder = Path(tempfile.mkdtemp(prefix="compgen-linuxcnc-", dir="/var/tmp"))
+@contextmanager
+def alone():
+    """Hold LinuxCNC for one session: outside a namespace its shared memory, ports and lock files exist once."""
+    if private():
+        yield
+        return
     with open(f"/var/tmp/compgen-linuxcnc-{os.geteuid()}.lock", "w") as lock:
-        give_up = time.monotonic() + 300
+        give_up = time.monotonic() + 5 * LIMIT_S
         while True:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
-                assert time.monotonic() < give_up, "another test holds LinuxCNC"
-                time.sleep(0.2)
-        try:
-            folder.chmod(0o755)
-            modules = folder / "modules"
-            modules.mkdir()
-            for name in ("volkins.comp", "volcomp.comp", "volcomp.h"):
-                shutil.copy(SOURCES / name, modules)
-            for name in ("volkins.comp", "volcomp.comp"):
-                output, code = run(["halcompile", "--compile", name], modules)
-                assert code == 0, output
-            yield SimpleNamespace(folder=folder, modules=modules)
-        finally:
-            if run([*administrator(), "rm", "-rf", str(folder)], "/")[1]:
-                shutil.rmtree(folder, ignore_errors=True)
+                assert time.monotonic() < give_up, "another session holds LinuxCNC"
+                time.sleep(0.1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def workshop():
+    """A folder that an ordinary user can reach, with the modules built once."""
+    folder = Path(tempfile.mkdtemp(prefix="compgen-linuxcnc-", dir="/var/tmp"))
+    try:
+        folder.chmod(0o755)
+        modules = folder / "modules"
+        modules.mkdir()
+        for name in ("volkins.comp", "volcomp.comp", "volcomp.h"):
+            shutil.copy(SOURCES / name, modules)
+        for name in ("volkins.comp", "volcomp.comp"):
+            output, code = run(["halcompile", "--compile", name], modules)
+            assert code == 0, output
+        yield SimpleNamespace(folder=folder, modules=modules)
+    finally:
+        if run([*administrator(), "rm", "-rf", str(folder)], "/")[1]:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def launch(workshop, command, files):
@@ -205,7 +212,8 @@ def launch(workshop, command, files):
         shutil.copy(HELPERS / name, here)
     here.chmod(0o777)
     mode = "private" if private() else "shared"
-    output, _ = run([*administrator(), *private(), "./session.sh", mode, str(workshop.modules), *command], here)
+    with alone():
+        output, _ = run([*administrator(), *private(), "./session.sh", mode, str(workshop.modules), *command], here)
     return here, output
 
 

@@ -16,10 +16,10 @@ as_user() {
 }
 case $mode in
 private)
-    mkdir -p "$here/tmp" "$here/modules" && chmod 1777 "$here/tmp" || exit 3
-    cp -s "$system"/*.so "$here/modules" 2>/dev/null
-    mkdir -p "$here/system" && mount --bind "$system" "$here/system" || exit 3
-    for file in "$here"/modules/*.so; do ln -sf "$here/system/$(basename "$file")" "$file"; done
+    mkdir -p "$here/tmp" "$here/modules" "$here/system" && chmod 1777 "$here/tmp" || exit 3
+    mount --bind "$system" "$here/system" || exit 3
+    mount -t tmpfs tmpfs "$here/modules" && chmod 755 "$here/modules" || exit 3
+    cp -s "$here/system"/*.so "$here/modules" || exit 3
     for file in "$modules"/*.so; do [ -e "$file" ] && cp --remove-destination "$file" "$here/modules"; done
     mount --bind "$here/modules" "$system" && mount --bind "$here/tmp" /tmp || exit 3
     ip link set lo up 2>/dev/null
