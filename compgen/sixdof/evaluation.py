@@ -116,6 +116,11 @@ def evaluate(machine: Machine, instrument: Instrument, runs: Sequence[AxisRun]) 
     """Return the errors of every measured axis, and of squareness where both axes were measured."""
     measured_axes = sorted({run.axis for run in runs})
     axes = {axis: axis_errors(machine, [run for run in runs if run.axis == axis]) for axis in measured_axes}
+    return evaluate_axes(machine, instrument, axes)
+
+
+def evaluate_axes(machine: Machine, instrument: Instrument, axes: Mapping[int, AxisErrors]) -> Evaluation:
+    """Return errors and squareness from the means of each axis."""
     turns = {axis: zeroed(machine, axis, entry.position_mm, entry.eps_rad) for axis, entry in axes.items()}
     curves: dict[str, Curve] = {}
     slopes: dict[str, float] = {}

@@ -66,7 +66,7 @@ def errors_of_run(machine: Machine, instrument: Instrument, run: RelativeRun) ->
     if run.away != expected:
         return _component_run(machine, instrument, run)
     entry, at_tool = instrument.axes[run.axis], run.away < 0
-    error, turn = _of_the_unit(instrument, run) if at_tool else (run.shift_mm, run.turn_rad)
+    error, turn = motion_of_unit(instrument, run) if at_tool else (run.shift_mm, run.turn_rad)
     eps = zeroed(machine, run.axis, run.position_mm, turn)
     if at_tool:
         error = error + np.cross(eps[0], along(run.axis, run.position_mm))
@@ -87,7 +87,7 @@ def zeroed(machine: Machine, axis: int, position_mm: FloatArray, values: FloatAr
     return np.asarray(values - [np.interp(at, position_mm[order], column[order]) for column in values.T])
 
 
-def _of_the_unit(instrument: Instrument, run: RelativeRun) -> tuple[FloatArray, FloatArray]:
+def motion_of_unit(instrument: Instrument, run: RelativeRun) -> tuple[FloatArray, FloatArray]:
     """Motion of the unit relative to the target: of its reference point (n, 3) mm, and its rotation (n, 3) rad."""
     beam = instrument.axes[run.axis].set_up.beam_direction * np.eye(3)[run.axis]
     reach = (run.distance_mm + instrument.optics.lever_mm(run.axis))[:, None] * beam
@@ -104,7 +104,7 @@ def _component_run(machine: Machine, instrument: Instrument, run: RelativeRun) -
         "axes. Check mode, beam_direction and the chain: a wrong one turns signs"
     )
     warnings.warn(text, CompgenWarning, stacklevel=2)
-    delta, eps = (run.shift_mm, run.turn_rad) if set_up.mode == 1 else _of_the_unit(instrument, run)
+    delta, eps = (run.shift_mm, run.turn_rad) if set_up.mode == 1 else motion_of_unit(instrument, run)
     delta, eps = (zeroed(machine, run.axis, run.position_mm, values) for values in (delta, eps))
     return AxisRun(run.axis, run.run, run.position_mm, delta, eps, run.direction, False, text)
 

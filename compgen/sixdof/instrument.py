@@ -122,6 +122,9 @@ _CONSTANTS = (
     "prism_leg_mm",
     "exit_to_prism_mm",
     "distance_first_mm",
+    "drift_gain_percent",
+    "parallel_drift_um",
+    "displacement_ppm",
 )
 _NOISE = ("displacement_um", "qd_um", "psd_um")
 

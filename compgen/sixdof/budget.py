@@ -1,0 +1,272 @@
+"""Uncertainty of every error: scatter of the readings, and calibration, through the whole reduction by differences."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.names import AXES
+from compgen.errors import CompgenWarning
+from compgen.sixdof.chain import evaluate_readings, values_of
+from compgen.sixdof.evaluation import AxisErrors, axis_errors, evaluate_axes
+from compgen.sixdof.frames import errors_of_run, expected_away
+from compgen.sixdof.instrument import Instrument, known_systematics
+from compgen.sixdof.readings import SixDof
+from compgen.sixdof.reduction import RelativeRun, reduce_runs
+from compgen.sixdof.scatter import Scatter, moved_run, scatter_of, unit_moves
+
+#: Steps of a body's motion for its derivative: mm and rad; everything behind it is linear but the minimum zone.
+STEPS = (1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6)
+#: Parameters of the beams, one for all axes; the others belong to the prism or the target of one axis.
+SHARED = ("eps_PEy", "eps_PEz")
+#: Constants of :class:`Optics` that a budget can hold.
+OPTICS = (
+    "focal_length_mm",
+    "beam_separation_mm",
+    "glass_index",
+    "cube_side_mm",
+    "plate_thickness_mm",
+    "prism_leg_mm",
+    "exit_to_prism_mm",
+)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What makes the uncertainty of the error values.
+
+    Parameters
+    ----------
+    errors : the errors with their combined standard uncertainties.
+    factor : (k, r): ``factor @ factor.T`` is the covariance of the values in the order of the errors file, mm and rad.
+    sources : name of the source of each column, (r,).
+    """
+
+    errors: ErrorTable
+    factor: FloatArray
+    sources: tuple[str, ...]
+
+    def contributions(self) -> dict[str, dict[str, float]]:
+        """Largest standard uncertainty over the travel by error and source, and ``combined``, mm and rad."""
+        names = np.array(self.sources)
+        result = {}
+        for name, rows in _rows_of(self.errors):
+            part = {
+                source: float(np.sqrt(np.sum(self.factor[rows][:, names == source] ** 2, axis=1)).max())
+                for source in dict.fromkeys(self.sources)
+            }
+            part["combined"] = float(np.sqrt(np.sum(self.factor[rows] ** 2, axis=1)).max())
+            result[name] = part
+        return result
+
+
+def _rows_of(errors: ErrorTable) -> Iterator[tuple[str, slice]]:
+    first = 0
+    for name in errors.names:
+        size = 1 if name in errors.squareness else len(errors.curves[name].value)
+        yield name, slice(first, first + size)
+        first += size
+
+
+def uncertainty_budget(machine: Machine, readings: SixDof, instrument: Instrument) -> Budget:
+    """Propagate scatter, drift monitor and calibration through the whole reduction.
+
+    Parameters
+    ----------
+    machine, readings, instrument : as for the evaluation; the readings hold true displacements.
+
+    The scatter is that of the stated noise and of repeated runs (:mod:`scatter`); each mean of n runs has 1/sqrt(n) of
+    it. Each uncertain constant is moved up and down by its standard uncertainty, and the whole chain repeated.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        errors = evaluate_readings(machine, readings, instrument).errors
+        columns = [*_random_columns(machine, readings, instrument), *_constant_columns(machine, readings, instrument)]
+    sources = tuple(source for source, _ in columns)
+    size = len(values_of(errors))
+    factor = np.column_stack([column for _, column in columns]) if columns else np.zeros((size, 0))
+    return Budget(with_u(errors, factor), factor, sources)
+
+
+def with_u(errors: ErrorTable, factor: FloatArray) -> ErrorTable:
+    """The table with the standard uncertainties that a factor (k, r) has; nan where it has none at all."""
+    u = np.sqrt(np.einsum("ij,ij->i", factor, factor)) if factor.size else np.full(len(factor), np.nan)
+    curves, squareness = {}, {}
+    for name, rows in _rows_of(errors):
+        if name in errors.squareness:
+            squareness[name] = (errors.squareness[name][0], float(u[rows][0]))
+        else:
+            curves[name] = Curve(errors.curves[name].position_mm, errors.curves[name].value, u[rows])
+    return errors.replace(curves=curves, squareness=squareness)
+
+
+Column = tuple[str, FloatArray]
+
+
+def _random_columns(machine: Machine, readings: SixDof, instrument: Instrument) -> list[Column]:
+    """Responses of the values to the scatter of every target position of every axis."""
+    reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
+    by_axis = {axis: [run for run in reduced if run.axis == axis] for axis in sorted({run.axis for run in reduced})}
+    means = {axis: _means(machine, instrument, runs) for axis, runs in by_axis.items()}
+    columns: list[Column] = []
+    for runs in by_axis.values():
+        scatter = scatter_of(machine, readings, instrument, runs)
+        responses = _responses(machine, instrument, runs, means, scatter)
+        for source, covariance in scatter.sources.items():
+            for group, response in enumerate(responses):
+                root = _root(covariance[group] / scatter.count[group])
+                columns += [(source, column) for column in (response @ root).T if np.any(column)]
+    return columns
+
+
+def _means(machine: Machine, instrument: Instrument, runs: Sequence[RelativeRun]) -> AxisErrors:
+    return axis_errors(machine, [errors_of_run(machine, instrument, run) for run in runs])
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """A root F of a covariance (6, 6), F F^T, which may be singular."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    return np.asarray(safe[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _responses(
+    machine: Machine,
+    instrument: Instrument,
+    runs: Sequence[RelativeRun],
+    means: Mapping[int, AxisErrors],
+    scatter: Scatter,
+) -> list[FloatArray]:
+    """Derivatives (k, 6) of all values by the body's motion at each group of readings, moved in all runs at once."""
+    axis = runs[0].axis
+    at_tool = unit_moves(machine, instrument, runs[0])
+
+    def values(group: int, component: int, step: float) -> FloatArray:
+        moved = []
+        for run, rows in zip(runs, scatter.rows, strict=True):
+            change = np.zeros((len(run.rows), 6))
+            change[rows == group, component] = step
+            moved.append(moved_run(instrument, run, at_tool, change))
+        changed = {**means, axis: _means(machine, instrument, moved)}
+        return values_of(evaluate_axes(machine, instrument, changed).errors)
+
+    base = values(-1, 0, 0.0)
+    two_sided = instrument.line == "minzone"
+    found = []
+    for group in range(len(scatter.count)):
+        response = np.empty((len(base), 6))
+        for component, step in enumerate(STEPS):
+            other = values(group, component, -step) if two_sided else base
+            response[:, component] = (values(group, component, step) - other) / (step * (1 + two_sided))
+        found.append(response)
+    return found
+
+
+def _constant_columns(machine: Machine, readings: SixDof, instrument: Instrument) -> list[Column]:
+    """Half of the change of all values between each constant up and down by its standard uncertainty."""
+
+    def values(case: tuple[SixDof, Instrument]) -> FloatArray:
+        return values_of(evaluate_readings(machine, *case).errors)
+
+    columns = []
+    for source, change in _changes(readings, instrument):
+        column = 0.5 * (values(change(1.0)) - values(change(-1.0)))
+        if np.any(column):
+            columns.append((source, column))
+    return columns
+
+
+Change = Callable[[float], tuple[SixDof, Instrument]]
+
+
+def _changes(readings: SixDof, instrument: Instrument) -> Iterator[tuple[str, Change]]:
+    """Everything that calibration leaves uncertain, as changes by a number of standard uncertainties."""
+    for name in OPTICS:
+        u = instrument.u_constants.get(name, 0.0)
+        if u > 0:
+            yield name, _optics_change(readings, instrument, name, u)
+    for axis in instrument.axes:
+        u = instrument.u_constants.get("distance_first_mm", 0.0)
+        if u > 0:
+            yield f"distance of {AXES[axis]}", _distance_change(readings, instrument, axis, u)
+        for name, u_parallel in (("y", "parallel_drift_um"), ("z", "parallel_drift_um")):
+            drift = instrument.u_constants.get(u_parallel, 0.0) * 1e-3
+            if drift > 0:
+                yield "parallel drift", _ramp_change(readings, instrument, axis, name, drift)
+    gain = instrument.u_constants.get("drift_gain_percent", 0.0) / 100.0
+    if gain > 0:
+        yield "drift gain", _scaled_change(readings, instrument, ("y_psd2_mm", "z_psd2_mm"), gain)
+    scale = instrument.u_constants.get("displacement_ppm", 0.0) * 1e-6
+    if scale > 0:
+        yield "wavelength", _scaled_change(readings, instrument, ("displacement_mm",), scale)
+    yield from _systematic_changes(readings, instrument)
+
+
+def _systematic_changes(readings: SixDof, instrument: Instrument) -> Iterator[tuple[str, Change]]:
+    for name, u in instrument.u_systematics.items():
+        having = [axis for axis in instrument.axes if name in known_systematics(axis)]
+        for axes in [having] if name in SHARED else [[axis] for axis in having]:
+            where = "" if name in SHARED or len(having) == 1 else f" of {AXES[axes[0]]}"
+            if u > 0 and axes:
+                yield name + where, _systematic_change(readings, instrument, axes, name, u)
+
+
+def _optics_change(readings: SixDof, instrument: Instrument, name: str, u: float) -> Change:
+    def change(times: float) -> tuple[SixDof, Instrument]:
+        values = {name: getattr(instrument.optics, name) + times * u}
+        return readings, replace(instrument, optics=replace(instrument.optics, **values))
+
+    return change
+
+
+def _distance_change(readings: SixDof, instrument: Instrument, axis: int, u: float) -> Change:
+    def change(times: float) -> tuple[SixDof, Instrument]:
+        distance = readings.distance_mm + np.where(readings.axis == axis, times * u, 0.0)
+        entry = instrument.axes[axis]
+        first = None if entry.distance_first_mm is None else entry.distance_first_mm + times * u
+        axes = {**instrument.axes, axis: replace(entry, distance_first_mm=first)}
+        return replace(readings, distance_mm=distance), replace(instrument, axes=axes)
+
+    return change
+
+
+def _systematic_change(readings: SixDof, instrument: Instrument, on: Sequence[int], name: str, u: float) -> Change:
+    def change(times: float) -> tuple[SixDof, Instrument]:
+        axes = dict(instrument.axes)
+        for axis in on:
+            values = dict(axes[axis].systematics)
+            values[name] = values.get(name, 0.0) + times * u
+            axes[axis] = replace(axes[axis], systematics=values)
+        return readings, replace(instrument, axes=axes)
+
+    return change
+
+
+def _scaled_change(readings: SixDof, instrument: Instrument, names: Sequence[str], u: float) -> Change:
+    def change(times: float) -> tuple[SixDof, Instrument]:
+        signals = {**readings.signals_mm, **{name: readings.signals_mm[name] * (1 + times * u) for name in names}}
+        return replace(readings, signals_mm=signals), instrument
+
+    return change
+
+
+def _ramp_change(readings: SixDof, instrument: Instrument, axis: int, letter: str, drift_mm: float) -> Change:
+    """Both beams move parallel to themselves by so much from the first to the last row of each run of the axis."""
+    ramp = np.zeros(len(readings))
+    for which, _, rows in readings.runs():
+        if which == axis:
+            ramp[rows] = np.linspace(0.0, drift_mm, len(rows))
+
+    def change(times: float) -> tuple[SixDof, Instrument]:
+        names = [name for name in (f"{letter}_qd1_mm", f"{letter}_qd2_mm") if name in readings.signals_mm]
+        signals = {**readings.signals_mm, **{name: readings.signals_mm[name] - times * ramp for name in names}}
+        return replace(readings, signals_mm=signals), instrument
+
+    return change
