@@ -155,15 +155,16 @@ def _block(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     step_a: FloatArray,
     arm_b: FloatArray,
     step_b: FloatArray,
+    work: FloatArray,
     block: FloatArray,
 ) -> None:
     """Add the normal matrix of delta and eps at two levels to ``block`` (6, 6).
 
     Lever arms are ``arm`` plus the coordinate of the third axis times ``step``, ``tables`` (3, 6, ., .) the moments of
-    w u u^T at the two levels times that coordinate to the power 0, 1, 2. The derivative by eps is arm x u.
+    w u u^T at the two levels times that coordinate to the power 0, 1, 2. The derivative by eps is arm x u. ``work``
+    (5, 3, 3) is room for parts.
     """
-    first, second = np.empty((3, 3)), np.empty((3, 3))  # u (arm_b x u)^T, without and with the third coordinate
-    moment = np.empty((3, 3, 3))
+    moment, first, second = work[:3], work[3], work[4]  # the last two: u (arm_b x u)^T, times 1 and the coordinate
     for power in range(3):
         xx, yy, zz = tables[power, 0, i, j], tables[power, 1, i, j], tables[power, 2, i, j]
         xy, xz, yz = tables[power, 3, i, j], tables[power, 4, i, j], tables[power, 5, i, j]
@@ -220,7 +221,7 @@ def add_pair(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     is part of another's lever arm, zero where it is none.
     """
     a, b, t = axes[0], axes[1], axes[2]
-    arm_a, arm_b, across = np.empty(3), np.empty(3), np.empty((6, 6))
+    arm_a, arm_b, across, work = np.empty(3), np.empty(3), np.empty((6, 6)), np.empty((5, 3, 3))
     for i in range(len(levels_a)):
         at_a = 6 * (first_row[a] + i)
         for j in range(len(levels_b)):
@@ -231,17 +232,17 @@ def add_pair(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
             for p in range(6):
                 for q in range(6):
                     across[p, q] = 0.0
-            _block(tables, i, j, arm_a, levers[a, t], arm_b, levers[b, t], across)
+            _block(tables, i, j, arm_a, levers[a, t], arm_b, levers[b, t], work, across)
             for p in range(6):
                 for q in range(6):
                     matrix[at_a + p, at_b + q] = across[p, q]
                     matrix[at_b + q, at_a + p] = across[p, q]
             if own_a:
                 same = matrix[at_a : at_a + 6, at_a : at_a + 6]
-                _block(tables, i, j, arm_a, levers[a, t], arm_a, levers[a, t], same)
+                _block(tables, i, j, arm_a, levers[a, t], arm_a, levers[a, t], work, same)
             if own_b:
                 same = matrix[at_b : at_b + 6, at_b : at_b + 6]
-                _block(tables, i, j, arm_b, levers[b, t], arm_b, levers[b, t], same)
+                _block(tables, i, j, arm_b, levers[b, t], arm_b, levers[b, t], work, same)
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
