@@ -137,7 +137,7 @@ def test_what_happens_beyond_the_table_is_asked_of_the_control(small_machine, sm
     held, dropped = ends(SiemensEec()), ends(Dropping())
     assert {end.outside for end in held.ends} == {"held"}
     assert not any("drops" in warning for warning in held.warnings)
-    numbers = tables.tables[2].numbers
+    numbers = tables.tables[2, 0].numbers
     low = next(end for end in dropped.ends if end.along == "Z" and end.end_mm < -200)
     assert low.outside == "dropped"
     assert low.jump_um >= 1e3 * abs(numbers[0]) - 1e-6
@@ -248,7 +248,7 @@ def test_the_new_table_replaces_the_old_one(small_machine, small_errors, old_tab
     assert np.max(np.abs(doubled)) > 20 * MICROMETRE
 
 
-@pytest.mark.parametrize("name", ["siemens-cec", "siemens-eec"])
+@pytest.mark.parametrize("name", ["siemens-cec", "siemens-cec-eec", "siemens-eec"])
 def test_measured_deviations_lose_the_active_table_exactly(name, small_machine, small_errors, old_tables):
     """Without noise: errors as they were put in, to a nanometre over the volume."""
     active = old_tables[name]

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
 from compgen.core.emphasis import Emphasis
 from compgen.core.machine import Machine
 
-#: A full grid larger than this is replaced by a low-discrepancy sample of as many points.
+#: A full grid larger than this is thinned to about as many points.
 MOST_POINTS = 20_000
 
 
 NO_EMPHASIS = Emphasis()
 #: Gauss-Legendre points across an axis of which the own levels are taken.
 LEAST_ACROSS, MOST_ACROSS = 4, 12
+#: Fewer points than this in a plane of a thinned grid are not spread evenly enough.
+LEAST_IN_PLANE = 144
+#: Least number of intervals over an axis in a sample.
+LEAST_INTERVALS = 10
 
 
 @dataclass(frozen=True)
@@ -71,50 +77,89 @@ def volume_sample(
     most: int = MOST_POINTS,
     emphasis: Emphasis = NO_EMPHASIS,
 ) -> VolumeSample:
-    """Return points that determine tables with the given nodes over the volume: the full grid where it is not too large.
+    """Return points that determine tables with the given nodes over the volume; weighted sums are integrals over it.
 
-    Weighted sums over them are integrals over the volume.
+    Along each axis there are two Gauss-Legendre points between neighbouring nodes: what tables that are linear there can
+    hold is integrated exactly. Of the full grid of them, where it has more than ``most`` points, those (i, j, k) are taken
+    whose i + j + k is a multiple of a whole number. Each plane of the grid then has points that are spread evenly over
+    the other two axes, so that a function of one axis is orthogonal to functions of the others as it is over the
+    volume; a random sample would turn what the tables cannot hold into ragged values.
 
-    Otherwise three grids, one for each axis: its own levels by Gauss-Legendre points of the other two. On each of them
-    a function of one axis is orthogonal to functions of the others, as it is over the volume; a random sample is not,
-    and would turn what the tables cannot hold into ragged values.
-
-    The weight of the work zone of ``emphasis`` is part of them, interval by interval: its ends are levels, and the
-    Gauss-Legendre points fill each part between them, so that all grids agree on the mean over an axis.
+    The weight of the work zone of ``emphasis`` is part of the weights, interval by interval: its ends are nodes. Points
+    at the nodes, on lines along the axes through corners and middles of the travel, follow with weight 0: what is largest
+    anywhere is usually largest there.
     """
     nodes_mm = tuple(np.append(nodes, emphasis.ends_mm(axis)) for axis, nodes in enumerate(nodes_mm))
-    levels = [
-        levels_between(np.asarray(nodes), *axis.range_mm) for nodes, axis in zip(nodes_mm, machine.axes, strict=True)
-    ]
-    if np.prod([len(level) for level in levels]) <= most:
-        x, y, z = (_simpson(level, emphasis.factor(axis, level[1::2])) for axis, level in enumerate(levels))
-        position_mm = VolumeGrid((levels[0], levels[1], levels[2])).position_mm
-        return VolumeSample(position_mm, len(position_mm) * np.einsum("i,j,k->ijk", x, y, z).ravel())
+    sides = [_between_nodes(machine, axis, nodes, emphasis) for axis, nodes in enumerate(nodes_mm)]
+    counts = [len(points) for points, _ in sides]
+    every = -(-int(np.prod(counts)) // most)
+    thinned = _lattice(counts, every)
+    if (
+        every > 1
+        and min(int(np.bincount(part, minlength=n).min()) for part, n in zip(thinned, counts, strict=True))
+        < LEAST_IN_PLANE
+    ):
+        inner = _three_grids(machine, sides, most, emphasis)
+    else:
+        position_mm = np.stack([side[0][part] for side, part in zip(sides, thinned, strict=True)], axis=1)
+        weight = np.prod([side[1][part] for side, part in zip(sides, thinned, strict=True)], axis=0)
+        inner = VolumeSample(position_mm, weight)
+    lines_mm = _lines(machine, nodes_mm)
+    weight = np.concatenate([inner.weight, np.zeros(len(lines_mm))])
+    return VolumeSample(np.concatenate([inner.position_mm, lines_mm]), weight * (len(weight) / weight.sum()))
+
+
+def _lines(machine: Machine, nodes_mm: Sequence[FloatArray]) -> FloatArray:
+    """Points (m, 3) at the nodes within the travel and its ends, on nine lines along each axis."""
+    ends = [np.array([low, 0.5 * (low + high), high]) for low, high in (axis.range_mm for axis in machine.axes)]
+    found = []
+    for axis, nodes in enumerate(nodes_mm):
+        levels = list(ends)
+        levels[axis] = np.unique(np.clip(np.concatenate([nodes, ends[axis]]), *machine.axes[axis].range_mm))
+        found.append(VolumeGrid((levels[0], levels[1], levels[2])).position_mm)
+    return np.unique(np.concatenate(found), axis=0)
+
+
+def _lattice(counts: Sequence[int], every: int) -> list[NDArray[np.int64]]:
+    """Indices (m,) of the points of a grid, for its three axes, whose sum is a multiple of ``every``."""
+    kept = np.indices(tuple(counts)).sum(axis=0) % every == 0
+    return [np.asarray(part, dtype=np.int64) for part in np.nonzero(kept)]
+
+
+def _three_grids(
+    machine: Machine, sides: Sequence[tuple[FloatArray, FloatArray]], most: int, emphasis: Emphasis
+) -> VolumeSample:
+    """Three grids, one for each axis: its own points by a few Gauss-Legendre points of the other two.
+
+    For tables with so many nodes that a thinned grid would leave too few points in a plane.
+    """
     positions, weights = [], []
     for axis in range(3):
-        count = int(np.clip(np.sqrt(most / len(levels[axis])), LEAST_ACROSS, MOST_ACROSS))
-        sides = [_gauss_legendre(machine, k, emphasis, count) for k in range(3)]
-        sides[axis] = (levels[axis], _simpson(levels[axis], emphasis.factor(axis, levels[axis][1::2])))
-        grid = VolumeGrid((sides[0][0], sides[1][0], sides[2][0]))
+        count = int(np.clip(np.sqrt(most / len(sides[axis][0])), LEAST_ACROSS, MOST_ACROSS))
+        parts = [_gauss_legendre(machine, k, emphasis, count) for k in range(3)]
+        parts[axis] = sides[axis]
+        grid = VolumeGrid((parts[0][0], parts[1][0], parts[2][0]))
         positions.append(grid.position_mm)
-        weights.append(np.einsum("i,j,k->ijk", sides[0][1], sides[1][1], sides[2][1]).ravel())
+        weights.append(np.einsum("i,j,k->ijk", parts[0][1], parts[1][1], parts[2][1]).ravel())
     joined = np.concatenate(weights)
     return VolumeSample(np.concatenate(positions), joined * (len(joined) / joined.sum()))
 
 
-def _simpson(levels_mm: FloatArray, factor: FloatArray) -> FloatArray:
-    """Weights (n,), which sum to 1, of levels where every second one is the middle of its neighbours.
+def _between_nodes(
+    machine: Machine, axis: int, nodes_mm: FloatArray, emphasis: Emphasis
+) -> tuple[FloatArray, FloatArray]:
+    """Two Gauss-Legendre points in each interval between nodes within the travel; their weights sum to 1.
 
-    Exact for cubic polynomials between the nodes, so for squares of what tables hold there. ``factor`` weighs the
-    intervals.
+    Few intervals are parted, because what is to be held is not as smooth as the tables.
     """
-    part = factor * np.diff(levels_mm[::2])
-    part /= 6.0 * np.sum(part)
-    weights = np.zeros(len(levels_mm))
-    weights[1::2] = 4.0 * part
-    weights[:-1:2] += part
-    weights[2::2] += part
-    return weights
+    low, high = machine.axes[axis].range_mm
+    inside = nodes_mm[(nodes_mm > low + 1e-9) & (nodes_mm < high - 1e-9)]
+    ends = np.concatenate([[low], np.unique(inside), [high]])
+    parts = -(-LEAST_INTERVALS // (len(ends) - 1))
+    ends = np.interp(np.arange(parts * (len(ends) - 1) + 1) / parts, np.arange(len(ends)), ends)
+    middle, half = 0.5 * (ends[1:] + ends[:-1])[:, None], 0.5 * np.diff(ends)[:, None]
+    weighted = emphasis.factor(axis, middle) * half * np.ones(2)
+    return (middle + half * np.array([-1.0, 1.0]) / np.sqrt(3.0)).ravel(), weighted.ravel() / np.sum(weighted)
 
 
 def _gauss_legendre(machine: Machine, axis: int, emphasis: Emphasis, count: int) -> tuple[FloatArray, FloatArray]:
