@@ -14,9 +14,10 @@ import numpy as np
 
 from compgen.controllers import controller_named
 from compgen.core.csvio import FloatArray, format_csv
-from compgen.core.deviations import format_deviations
+from compgen.core.deviations import Deviations, format_deviations
 from compgen.core.error_table import Curve, ErrorTable, format_errors
 from compgen.core.files import OutputFolder, read_bytes, sha256_of
+from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.core.reversal import WORTH_MM, ReversalCurves, format_reversal
@@ -43,10 +44,11 @@ Progress = Callable[[str], None]
 
 
 class Checks(TypedDict, total=False):
-    """What :func:`run` may be told about safety, see there."""
+    """What :func:`run` may be told beyond the stages' options, see there."""
 
     active: ActiveTables | None
     limits: SafetyLimits | None
+    instrument: str | Path | None
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,8 @@ def identified_reversal(result: Identification) -> ReversalCurves | None:
     They belong to curves that are the means of both directions, so none is returned where the readings were not
     brought to that mean.
     """
+    if result.reversal_curves is not None:
+        return result.reversal_curves
     if result.reversal is None or not result.reversal.removed:
         return None
     curves = {}
@@ -136,7 +140,7 @@ def identified_reversal(result: Identification) -> ReversalCurves | None:
 
 
 def _errors_files(result: Identification) -> dict[str, str | bytes]:
-    if result.adjustment is None:
+    if not result.has_covariance:
         return {"identified.errors.csv": format_errors(result.errors)}
     text = format_errors(result.errors, {"covariance": covariance.FILE_NAME})
     content = covariance.format_covariance(covariance.joint_covariance(result), text)
@@ -216,6 +220,8 @@ def identify_bare(
     """
     if active is None:
         return identify_measurement(machine, measurement, options)
+    if not isinstance(measurement, Lengths | Deviations):
+        raise InputError("tables that were active (--active) can be taken out of lengths and deviations only")
     wider, moved, report = without_active(machine, measurement, active)
     result = identify_measurement(wider, moved, options)
     return replace(result, corrections={**result.corrections, "active_tables": report})
@@ -264,14 +270,15 @@ def run(
     Parameters
     ----------
     machine : the machine.
-    measurements : ``*.lengths.csv`` or ``*.deviations.csv`` files.
+    measurements : ``*.lengths.csv``, ``*.deviations.csv``, ``*.sixdof.csv`` files.
     controllers : names of the controls; with one its files stand in ``folder``, with several each has its own
         sub-folder.
     folder : output folder.
     identify_options, fit_options, templates, allow_unverified : handed to the stages.
     progress : is told the name of each stage as it begins.
-    checks : ``active``, tables that were active while the machine was measured (the new ones take their place), and
-        ``limits`` for the steps of the tables.
+    checks : ``active``, tables that were active while the machine was measured (the new ones take their place),
+        ``limits`` for the steps of the tables, and ``instrument``, the instrument file of six-DOF readings. Where these
+        contradict the machine's chain, nothing is accepted.
     """
     targets = {name: Path(folder) / name if len(set(controllers)) > 1 else Path(folder) for name in controllers}
     if not targets:
@@ -281,13 +288,13 @@ def run(
         controller_named(name).read_settings(machine)
         usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
-    measurement = read_measurement(measurements)
-    provenance = provenance_of(machine.source, *measurements)
+    measurement = read_measurement(measurements, checks.get("instrument"))
+    provenance = provenance_of(machine.source, *measurements, checks.get("instrument"))
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):
         identification = identify_bare(machine, measurement, identify_options, checks.get("active"))
     progress("fitting smooth curves")
-    known = None if identification.adjustment is None else covariance.joint_covariance(identification)
+    known = None if not identification.has_covariance else covariance.joint_covariance(identification)
     fitted = fit(machine, identification.errors, fit_options or FitOptions(), covariance=known)
     reversal = identified_reversal(identification)
     checked: dict[str, tuple[Export, Verification, Mapping[str, str]]] = {}
@@ -303,6 +310,8 @@ def run(
             reversal=reversal,
         )
         verification = _read_back(machine, exported, identification.errors, reversal, checks.get("limits"))
+        reasons = tuple(dict.fromkeys([*verification.reasons, *identification.objections]))
+        verification = replace(verification, reasons=reasons)
         beside = check_files(machine, exported, identification.errors, templates, reversal)
         checked[name] = exported, verification, beside
     write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted)})

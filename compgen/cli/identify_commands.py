@@ -58,6 +58,12 @@ METHOD_HELP = {
 }
 
 
+def sixdof_option(command: Command) -> Command:
+    """Add --instrument FILE."""
+    text = "Constants and set-up of a six-DOF laser instrument (TOML), for *.sixdof.csv files."
+    return click.option("--instrument", metavar="FILE", type=click.Path(path_type=Path), help=text)(command)
+
+
 def instrument_options(command: Command) -> Command:
     """Add what the user may say about the readings."""
     constant = click.option(
@@ -116,7 +122,7 @@ def identify_options(
 @click.command("identify")
 @machine_argument
 @click.argument("measurements", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--instrument", type=click.Path(path_type=Path), help="Constants of a six-DOF instrument (TOML).")
+@sixdof_option
 @out_option
 @instrument_options
 @systematic_options
@@ -155,18 +161,18 @@ def identify_command(
     one or two stations are enough if they determine the errors of the machine file; if not, the combinations that stay
     open are named in identify.json and no error is written.
 
+    *.sixdof.csv files hold raw readings of a six-DOF laser instrument (mm); --instrument describes it. All 21 errors come
+    from them, without stations.csv. Beside lengths or deviations of the same machine both are compared and averaged; exit
+    code 1 and a warning name the errors that disagree.
+
     \b
     Example:
       compgen identify zha-gantry examples/zha-gantry.lengths.csv --out identified/
     """
-    if instrument is not None:
-        raise InputError(
-            "--instrument belongs to six-DOF readings (*.sixdof.csv), which this version does not read yet"
-        )
     OutputFolder(out)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
-        measurement = read_measurement(measurements)
+        measurement = read_measurement(measurements, instrument)
         show(f"identifying: {describe(measurement)}")
         options = identify_options(u_length_um, u_length_um_per_m, keep_all, systematic, choices)
         with failure_reported(out):
@@ -182,7 +188,7 @@ def identify_command(
                 replicates,
                 progress=lambda k: show(f"self-check: {k} of {replicates} replicates"),
             )
-    write_all(out, identification_files(result, provenance_of(machine.source, *measurements), checked))
+    write_all(out, identification_files(result, provenance_of(machine.source, *measurements, instrument), checked))
     if as_json:
         print_json({**result.summary(), **({"monte_carlo": checked.summary()} if checked else {})})
     else:
@@ -191,7 +197,7 @@ def identify_command(
             text = f"self-check, {checked.replicates} replicates: standard deviation over stated uncertainty "
             text += f"{checked.ratio_median:.2f} ({checked.ratio_min:.2f} ... {checked.ratio_max:.2f}): "
             stdout.print(text + ("agrees" if checked.agrees else "DOES NOT AGREE"))
-    return 0
+    return 1 if result.details.get("disagree") else 0
 
 
 @click.command("fit")

@@ -23,6 +23,7 @@ from compgen.cli.identify_commands import (
     identify_options,
     instrument_options,
     method_options,
+    sixdof_option,
     systematic_options,
 )
 from compgen.cli.options_commands import explain_option, explain_run
@@ -43,6 +44,7 @@ from compgen.verify.safety import SafetyLimits
 @click.argument("measurements", nargs=-1, required=True, type=click.Path(path_type=Path))
 @controller_option(multiple=True)
 @sample_options
+@sixdof_option
 @out_option
 @instrument_options
 @systematic_options
@@ -58,6 +60,7 @@ def run_command(
     machine: Machine,
     measurements: tuple[Path, ...],
     controller: tuple[str, ...],
+    instrument: Path | None,
     out: Path,
     u_length_um: float | None,
     u_length_um_per_m: float | None,
@@ -75,7 +78,8 @@ def run_command(
     """Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.
 
     MACHINE is a name in machines/ or the path of a machine TOML; MEASUREMENTS are *.lengths.csv (mm)
-    or *.deviations.csv files. With several --controller each gets its own sub-folder of DIR.
+    or *.deviations.csv files, or *.sixdof.csv with --instrument FILE. With several --controller each gets its own
+    sub-folder of DIR.
 
     \b
     Example:
@@ -94,6 +98,7 @@ def run_command(
             active=active,
             limits=limits,
             progress=show,
+            instrument=instrument,
         )
     if explain:
         explain_run(machine, result, out, templates)

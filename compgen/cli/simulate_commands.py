@@ -16,8 +16,8 @@ from compgen.errors import InputError
 from compgen.identify import Covariance, predict_uncertainty, read_covariance
 from compgen.model import predict
 from compgen.simulate import (
+    SimulatedSixDof,
     Simulation,
-    SixDofMeasurement,
     SixDofSimulation,
     read_scenario,
     simulate,
@@ -45,7 +45,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
     with progress(quiet=as_json) as show:
         show("simulating")
         planned = read_scenario(scenario)
-        chosen = simulate_sixdof if isinstance(planned.instrument, SixDofMeasurement) else simulate
+        chosen = simulate_sixdof if isinstance(planned.instrument, SimulatedSixDof) else simulate
         simulation: Simulation | SixDofSimulation = chosen(machine, planned, seed)
     paths = write_simulation(simulation, out)
     if as_json:

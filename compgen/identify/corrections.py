@@ -22,6 +22,13 @@ from typing import Any
 
 import numpy as np
 
+from compgen.core.air import (
+    HELIUM_NEON_NM,
+    REFERENCE_C,
+    STANDARD_HUMIDITY_PERCENT,
+    STANDARD_PRESSURE_HPA,
+    refractive_index,
+)
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
@@ -32,13 +39,8 @@ from compgen.identify.state import IntArray, State
 from compgen.model.exact import tip_position
 from compgen.model.volumetric import tool_of
 
-REFERENCE_C = 20.0
 #: Temperatures that vary by more than this call for an expansion coefficient.
 NOTABLE_K = 0.5
-#: What the air is taken to be where the file does not say, and what an uncompensated instrument assumes.
-STANDARD_PRESSURE_HPA = 1013.25
-STANDARD_HUMIDITY_PERCENT = 50.0
-HELIUM_NEON_NM = 632.9913
 
 
 @dataclass(frozen=True)
@@ -180,20 +182,3 @@ def _metadata_number(lengths: Lengths, key: str, default: float, allowed: tuple[
     if not allowed[0] <= value <= allowed[1]:
         raise InputError(f"the comment {key} = {value:g} must lie within {allowed[0]:g} ... {allowed[1]:g}", file=file)
     return value
-
-
-def refractive_index(
-    temperature_c: FloatArray, pressure_hpa: float, humidity_percent: float, wavelength_nm: float = HELIUM_NEON_NM
-) -> FloatArray:
-    """Phase refractive index of air by the modified Edlen equation (Birch & Downs 1993, eq. 1-3, 1994), 450 ppm CO2.
-
-    ``wavelength_nm`` is the vacuum wavelength; the saturation pressure of water is that of Buck (1981).
-    """
-    t, pascal = np.asarray(temperature_c, dtype=np.float64), 100.0 * pressure_hpa
-    wavenumber = (1000.0 / wavelength_nm) ** 2  # squared, 1/um^2
-    standard = (8342.54 + 2406147.0 / (130.0 - wavenumber) + 15998.0 / (38.9 - wavenumber)) * 1e-8
-    compressed = (1.0 + 1e-8 * (0.601 - 0.00972 * t) * pascal) / (1.0 + 0.0036610 * t)
-    saturation = 611.21 * np.exp((18.678 - t / 234.5) * t / (257.14 + t))
-    vapour = humidity_percent / 100.0 * saturation
-    water = vapour * (3.7345 - 0.0401 * wavenumber) * 1e-10
-    return np.asarray(1.0 + standard * pascal / 96095.43 * compressed - water)

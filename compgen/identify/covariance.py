@@ -120,12 +120,25 @@ def covariance_from_factor(
 
 def joint_covariance(result: Identification) -> Covariance:
     """Return the covariance of everything that was identified, systematic inputs included."""
+    if result.values_factor is not None:
+        return _covariance_of_values(result.errors, result.values_factor, result.layout.machine.name)
     if result.adjustment is None:
         raise ValueError("this identification keeps no joint covariance")
     factor = result.adjustment.covariance_factor()
     if result.systematic is not None:
         factor = np.hstack([factor, result.systematic.response])
     return covariance_from_factor(result.layout, factor, [(item.station, item.setup) for item in result.stations])
+
+
+def _covariance_of_values(errors: ErrorTable, factor: FloatArray, machine: str) -> Covariance:
+    """Covariance of error values that a factor (k, r) in the order of the errors file describes; no stations."""
+    names: list[str] = []
+    positions = []
+    for name in errors.names:
+        at = np.array([np.nan]) if name in errors.squareness else errors.curves[name].position_mm
+        names += [name] * len(at)
+        positions.append(at)
+    return Covariance(tuple(names), np.concatenate(positions), (), np.zeros(0, dtype=np.int64), factor, machine)
 
 
 # --- systematic inputs on top of the random part -------------------------------------------------------------------

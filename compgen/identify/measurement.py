@@ -1,8 +1,9 @@
-"""One door for both kinds of measurement: tracer lengths and measured positions, told apart by their columns."""
+"""One door for all kinds of measurement: tracer lengths, measured positions and six-DOF readings, told by their columns."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from compgen.core.deviations import Deviations, holds_deviations, read_deviations
@@ -11,15 +12,56 @@ from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.identify.deviations import identify_deviations
 from compgen.identify.identify import identify
+from compgen.identify.merging import merge
 from compgen.identify.noise import IdentifyOptions
 from compgen.identify.result import Identification
+from compgen.identify.sixdof import SixDofMeasurement, identify_sixdof
 from compgen.identify.systematic import SystematicInputs
+from compgen.sixdof.instrument import read_instrument
+from compgen.sixdof.readings import holds_sixdof, read_sixdof
 
-Measurement = Lengths | Deviations
+
+@dataclass(frozen=True)
+class MixedMeasurement:
+    """Lengths or deviations, and six-DOF readings, of the same machine."""
+
+    other: Lengths | Deviations
+    sixdof: SixDofMeasurement
 
 
-def read_measurement(paths: Sequence[str | Path]) -> Measurement:
-    """Read measurement files of one kind: ``*.lengths.csv`` or ``*.deviations.csv``, by their columns."""
+Measurement = Lengths | Deviations | SixDofMeasurement | MixedMeasurement
+
+
+def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement:
+    """Read measurement files by their columns: ``*.lengths.csv``, ``*.deviations.csv``, ``*.sixdof.csv``.
+
+    Parameters
+    ----------
+    paths : files; six-DOF readings may stand beside one of the other kinds.
+    instrument : the instrument TOML of the six-DOF readings.
+
+    Raises
+    ------
+    InputError
+        for lengths beside deviations, six-DOF readings without an instrument file, or one without such readings.
+    """
+    posed = [path for path in paths if holds_sixdof(path)]
+    others = [path for path in paths if path not in posed]
+    if posed and instrument is None:
+        message = "holds six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
+        raise InputError(message, file=posed[0])
+    if instrument is not None and not posed:
+        raise InputError(
+            f"--instrument {instrument} was given, but no file holds six-DOF readings (*.sixdof.csv with axis, "
+            "position_mm, y_qd1_mm, ...)"
+        )
+    if not posed:
+        return _read_others(others)
+    sixdof = SixDofMeasurement(read_sixdof(posed), read_instrument(str(instrument)))
+    return MixedMeasurement(_read_others(others), sixdof) if others else sixdof
+
+
+def _read_others(paths: Sequence[str | Path]) -> Lengths | Deviations:
     kinds = [holds_deviations(path) for path in paths]
     if any(kinds) and not all(kinds):
         message = "holds tracer lengths, and another file deviations; identify them one after the other"
@@ -29,6 +71,10 @@ def read_measurement(paths: Sequence[str | Path]) -> Measurement:
 
 def describe(measurement: Measurement) -> str:
     """Say in words what was measured."""
+    if isinstance(measurement, MixedMeasurement):
+        return f"{describe(measurement.other)}, {describe(measurement.sixdof)}"
+    if isinstance(measurement, SixDofMeasurement):
+        return f"{len(measurement)} six-DOF readings in {len(measurement.readings.runs())} runs"
     if isinstance(measurement, Deviations):
         return f"{len(measurement)} measured positions"
     return f"{len(measurement)} lengths of {len(measurement.stations)} stations"
@@ -37,14 +83,26 @@ def describe(measurement: Measurement) -> str:
 def identify_measurement(
     machine: Machine, measurement: Measurement, options: IdentifyOptions | None = None
 ) -> Identification:
-    """Identify from either kind; InputError for options that belong to the other kind."""
+    """Identify from any kind; InputError for options that belong to another kind."""
     chosen = options or IdentifyOptions()
+    if isinstance(measurement, MixedMeasurement):
+        first = identify_measurement(machine, measurement.other, chosen)
+        return merge(machine, first, identify_sixdof(machine, measurement.sixdof))
     if isinstance(measurement, Lengths):
         if chosen.u_deviation_um is not None:
             raise InputError("an uncertainty of deviations (--u-deviation-um) was given, but the files hold lengths")
         return identify(machine, measurement, chosen)
     stated = chosen.u_length_um is not None or chosen.u_length_um_per_m is not None
-    if stated or chosen.method != "joint" or chosen.stations is not None or chosen.systematic != SystematicInputs():
+    other = stated or chosen.method != "joint" or chosen.stations is not None
+    other = other or chosen.systematic != SystematicInputs()
+    if isinstance(measurement, SixDofMeasurement):
+        if other or chosen.u_deviation_um is not None:
+            raise InputError(
+                "--method, --stations, --u-... belong to tracer lengths and deviations; the files hold six-DOF readings, "
+                "whose uncertainties stand in the instrument file ([noise], [u_constants], [u_systematics])"
+            )
+        return identify_sixdof(machine, measurement)
+    if other:
         raise InputError(
             "--method, --stations, --u-length-... and the systematic inputs belong to tracer lengths; the files hold "
             "deviations, for which --u-deviation-um counts"

@@ -14,6 +14,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.deviations import Deviations
 from compgen.core.error_table import ErrorTable
 from compgen.core.names import MM_PER_UM
+from compgen.core.reversal import ReversalCurves
 from compgen.identify.adjustment import Adjustment
 from compgen.identify.outliers import Rejected
 from compgen.identify.parameters import ErrorParameters
@@ -65,10 +66,17 @@ class Identification:
     layout : the unknown errors and their bases.
     adjustment : the optimum with its factor, for the joint covariance and for systematic inputs; None if there is none.
     systematic : what systematic inputs contribute, and is part of the standard uncertainties then; None if none is.
-    method : "joint", "two-step", or "deviations" where measured positions were given in place of lengths; then the
-        residuals are those of the components dx, dy, dz, and ``u_length_um`` is their standard uncertainty.
+    method : "joint", "two-step", "sixdof" for readings of the six-DOF instrument (the residuals are translations about
+        the mean of their position), "merged" for those and others, or "deviations" where measured positions were given
+        in place of lengths; then the residuals are those of the components dx, dy, dz, and ``u_length_um`` is their
+        standard uncertainty.
     steps : figures of the single steps of the two-step method.
     positions : the positions that it measured in the machine frame, against the commanded ones.
+    values_factor : where there is no adjustment: F (k, r) with F F^T the covariance of the error values in the order of
+        the errors file, mm and rad; None if there is none.
+    reversal_curves : reversals over the position of each axis, where the instrument shows them so.
+    details : what the method has to say beside the figures that all have in common.
+    objections : why nothing that is made of these errors may be accepted; empty if there is no such reason.
     """
 
     errors: ErrorTable
@@ -99,6 +107,15 @@ class Identification:
     method: str = "joint"
     steps: Mapping[str, Any] = field(default_factory=dict)
     positions: Deviations | None = None
+    values_factor: FloatArray | None = None
+    reversal_curves: ReversalCurves | None = None
+    details: Mapping[str, Any] = field(default_factory=dict)
+    objections: tuple[str, ...] = ()
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether the joint covariance of the errors is known."""
+        return self.adjustment is not None or self.values_factor is not None
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -154,11 +171,13 @@ class Identification:
             "stations": [asdict(station) for station in self.stations],
             "systematic": None if self.systematic is None else self.systematic.summary(),
             **({"steps": dict(self.steps)} if self.steps else {}),
+            **({self.method: dict(self.details)} if self.details else {}),
+            **({"objections": list(self.objections)} if self.objections else {}),
         }
 
     def _u_of_the_readings(self) -> dict[str, Any]:
         known = {"source": self.u_source, "constant_um": self.u_length_um}
-        if self.method == "deviations":
+        if self.method in ("deviations", "sixdof"):
             return {"u_deviation": {**known, "scaled_by": self.u_scale}}
         proportional = {"proportional_um_per_m": self.u_length_um_per_m, "scaled_by": self.u_scale}
         return {"u_length": {**known, **proportional}}
@@ -169,7 +188,7 @@ def worst_uncertainty(errors: ErrorTable) -> dict[str, tuple[float, str]]:
     worst: dict[str, tuple[float, str]] = {"um": (0.0, ""), "urad": (0.0, "")}
     for name, curve in errors.curves.items():
         unit = "um" if name[1] in "XYZ" else "urad"
-        value = float(curve.u.max()) * (1e3 if unit == "um" else 1e6)
+        value = float(np.max(curve.u)) * (1e3 if unit == "um" else 1e6)
         if value > worst[unit][0]:
             worst[unit] = (value, name)
     for name, (_, u) in errors.squareness.items():

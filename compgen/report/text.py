@@ -22,6 +22,8 @@ MOST_REASONS = 10
 
 def identification_table(result: Identification) -> Group:
     """Return the summary of an identification."""
+    if result.method == "sixdof":
+        return Group(*_sixdof_lines(result), _errors_table(result))
     lengths = result.method != "deviations"
     used = f"{int(result.accepted.sum())} of {len(result.accepted)} "
     used += (
@@ -42,6 +44,24 @@ def identification_table(result: Identification) -> Group:
     ]
     if len(result.rejected) > MOST_REASONS:
         lines.append(f"... and {len(result.rejected) - MOST_REASONS} more in identify.json")
+    if result.method == "merged":
+        worst = max(result.details["en"].items(), key=lambda item: item[1])
+        lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")
+    return Group(Text("\n".join(lines)), _errors_table(result))
+
+
+def _sixdof_lines(result: Identification) -> list[Text]:
+    """What was measured, repeatability and uncertainty in the units of the instrument."""
+    axes = result.details["axes"]
+    parts = [
+        f"{name}: mode {item['mode']}, {item['runs']} runs, {item['positions']} positions"
+        for name, item in axes.items()
+    ]
+    lines = [f"{'; '.join(parts)}; {result.details['line']} lines", *result.details["table"]]
+    return [Text("\n".join(lines))]
+
+
+def _errors_table(result: Identification) -> Table:
     table = Table(
         "error",
         "largest",
@@ -63,7 +83,7 @@ def identification_table(result: Identification) -> Group:
             k = int(abs(curve.value).argmax())
             largest, u = curve.value[k] / unit, curve.u.max() / unit
             table.add_row(name, f"{largest:+.3f}", f"{curve.position_mm[k]:g}", f"{u:.3f}", error_named(name).unit)
-    return Group(Text("\n".join(lines)), table)
+    return table
 
 
 def fit_table(result: FitResult) -> Table:

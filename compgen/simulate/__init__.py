@@ -11,7 +11,7 @@ from compgen.simulate.run import (
     write_simulation,
 )
 from compgen.simulate.scenario import INSTRUMENTS, Instrument, Scenario, read_scenario
-from compgen.simulate.sixdof_measurement import SixDofMeasurement
+from compgen.simulate.sixdof_measurement import SimulatedSixDof
 from compgen.simulate.trajectory import Line, Stops, Trajectory, plan_stops, trajectory_points
 from compgen.simulate.truth import RandomErrors, TruthPlan, draw_truth
 
@@ -25,7 +25,7 @@ __all__ = [
     "RandomErrors",
     "Scenario",
     "Simulation",
-    "SixDofMeasurement",
+    "SimulatedSixDof",
     "SixDofSimulation",
     "Station",
     "Stops",

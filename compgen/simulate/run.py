@@ -18,7 +18,7 @@ from compgen.model.exact import tip_position
 from compgen.simulate.effects import Effect
 from compgen.simulate.laser_tracer import Station
 from compgen.simulate.scenario import Scenario
-from compgen.simulate.sixdof_measurement import SixDofMeasurement
+from compgen.simulate.sixdof_measurement import SimulatedSixDof
 from compgen.simulate.trajectory import Stops, plan_stops
 from compgen.simulate.truth import child_seeds, draw_truth, random_stream
 from compgen.sixdof.readings import SixDof, format_sixdof
@@ -97,7 +97,7 @@ def simulate(
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
     instrument = scenario.instrument
-    if isinstance(instrument, SixDofMeasurement):
+    if isinstance(instrument, SimulatedSixDof):
         raise InputError("is a six-DOF instrument, which has no lengths; call simulate_sixdof", file=scenario.source)
     try:
         stops = plan_stops(scenario.trajectory, machine, instrument.passes)
@@ -121,7 +121,7 @@ def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = Non
     """Measure a virtual machine with the six-DOF instrument of the scenario; InputError for another instrument."""
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
-    if not isinstance(scenario.instrument, SixDofMeasurement):
+    if not isinstance(scenario.instrument, SimulatedSixDof):
         raise InputError("is no six-DOF instrument; call simulate", file=scenario.source, field="[instrument] type")
     truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
     readings = scenario.instrument.measure(machine, truth, random_stream(seeds, NOISE_STREAM))

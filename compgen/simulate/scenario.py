@@ -16,7 +16,7 @@ from compgen.core.lengths import Lengths
 from compgen.simulate.effects import Effect, read_effects
 from compgen.simulate.laser_tracer import read_laser_tracer
 from compgen.simulate.registration import instrument_problems
-from compgen.simulate.sixdof_measurement import SixDofMeasurement, read_sixdof_measurement
+from compgen.simulate.sixdof_measurement import SimulatedSixDof, read_sixdof_measurement
 from compgen.simulate.trajectory import Stops, Trajectory, read_trajectory
 from compgen.simulate.truth import RandomErrors, TruthPlan, read_truth_plan
 
@@ -33,7 +33,7 @@ class Instrument(Protocol):
 
 
 #: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
-INSTRUMENTS: dict[str, Callable[[tomlio.Section], Instrument | SixDofMeasurement]] = {
+INSTRUMENTS: dict[str, Callable[[tomlio.Section], Instrument | SimulatedSixDof]] = {
     "laser-tracer": read_laser_tracer,
     "sixdof": read_sixdof_measurement,
 }
@@ -43,7 +43,7 @@ INSTRUMENTS: dict[str, Callable[[tomlio.Section], Instrument | SixDofMeasurement
 class Scenario:
     """A simulated measurement; ``name`` begins the names of its files, ``seed`` starts every random number."""
 
-    instrument: Instrument | SixDofMeasurement
+    instrument: Instrument | SimulatedSixDof
     seed: int
     name: str = "simulated"
     errors: TruthPlan = field(default_factory=lambda: TruthPlan(random=RandomErrors()))
@@ -77,16 +77,16 @@ def read_scenario(path: str | Path) -> Scenario:
         effects=read_effects(root.sections("effects")),
     )
     root.finish()
-    if isinstance(scenario.instrument, SixDofMeasurement):
+    if isinstance(scenario.instrument, SimulatedSixDof):
         for key in ("trajectory", "effects"):
             if key in root.data:
                 raise root.fail(key, "belongs to other instruments; a six-DOF instrument runs along the axes")
     return scenario
 
 
-def _instrument(kind: str, section: tomlio.Section) -> Instrument | SixDofMeasurement:
+def _instrument(kind: str, section: tomlio.Section) -> Instrument | SimulatedSixDof:
     made = INSTRUMENTS[kind](section)
-    if isinstance(made, SixDofMeasurement):
+    if isinstance(made, SimulatedSixDof):
         return made
     problems = instrument_problems(made)
     if problems:

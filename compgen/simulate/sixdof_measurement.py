@@ -34,7 +34,7 @@ _NOISE = {"displacement_um": (0,), "qd_um": (1, 2, 3, 4), "psd_um": (5, 6)}
 
 
 @dataclass(frozen=True)
-class SixDofMeasurement:
+class SimulatedSixDof:
     """How the axes are measured.
 
     Parameters
@@ -138,14 +138,14 @@ def _sum(given: Mapping[str, float], further: Mapping[str, float], known: tuple[
     return {name: given.get(name, 0.0) + further.get(name, 0.0) for name in names}
 
 
-def read_sixdof_measurement(section: tomlio.Section) -> SixDofMeasurement:
+def read_sixdof_measurement(section: tomlio.Section) -> SimulatedSixDof:
     """Read the ``[instrument]`` section of a scenario of type ``sixdof``, its type taken already, strictly."""
     path = section.file("file")
     if path is None:
         raise section.fail("file", "is missing; give the instrument TOML, relative to the scenario")
     instrument = read_instrument(path)
     positions = section.section("positions_mm", required=False)
-    measurement = SixDofMeasurement(
+    measurement = SimulatedSixDof(
         instrument=instrument,
         uncalibrated=read_systematics(section.section("uncalibrated", required=False)),
         runs=section.take("runs", tomlio.whole(1, 100), 3),

@@ -19,6 +19,10 @@ from compgen.sixdof.reduction import RelativeRun, drift_of, reduce_runs
 
 #: A regression counts when its slope is so many standard errors from zero and explains so much of the variance.
 SIGNIFICANT, EXPLAINED = 6.0, 0.5
+#: Slopes of coarse and fine parts of two curves differ by less than this share where the one makes the other.
+ALIKE = 0.25
+#: An offset of L beyond this is not a slip but another set-up, mm.
+LARGEST_OFFSET_MM = 300.0
 #: Readings of a run below which no regression is made.
 LEAST = 8
 #: Curvature of Y_QD2 - Y_QD1 below which nothing is said, mm.
@@ -171,23 +175,34 @@ def _crosstalk(machine: Machine, instrument: Instrument, runs: Sequence[Relative
     delta, eps = (np.mean([getattr(run, name) for run in errors], axis=0) for name in ("delta_mm", "eps_rad"))
     position = errors[0].position_mm
     kappa = HANDEDNESS[axis]
+    at_tool = runs[0].away < 0  # only then does L enter the straightness
+    largest = LARGEST_OFFSET_MM if at_tool else 3.0 * optics.reduced_depth_mm
     arm = float(np.abs(cross_talk_arm_mm(optics, set_up, runs[0].distance_mm)).mean())
     for channel, (name, sign) in enumerate((("yaw", kappa), ("pitch", -kappa))):
-        straight = _without_line(position, delta[:, DIRECTIONS[axis][1 + channel]])
-        angle = _without_line(position, eps[:, ROTATIONS[axis][channel]])
-        found = _regression(angle, straight)
-        if not found or abs(found["slope"]) < 1.0:
+        straight, angle = delta[:, DIRECTIONS[axis][1 + channel]], eps[:, ROTATIONS[axis][channel]]
+        found = _same_at_all_orders(position, angle, straight)
+        if not found or not 1.0 < abs(found["slope"]) < largest:
             continue
         found |= {"arm_mm": arm, "expected_arm_sign": float(sign)}
-        which = "distance_offset" if set_up.mode == 2 else f"crosstalk_{name}"
+        which = "distance_offset" if at_tool else f"crosstalk_{name}"
         text = f"straightness is {found['slope']:+.1f} mm times {name} ({100 * found['explained']:.0f} % of it): " + (
-            "the distance L may be off by so much" if set_up.mode == 2 else "a wrong t or mode, or a bend of the axis"
+            "the distance L may be off by so much" if at_tool else "a wrong t or mode, or a bend of the axis"
         )
         yield Suspicion(which, AXES[axis], text, found)
 
 
-def _without_line(position_mm: FloatArray, value: FloatArray) -> FloatArray:
-    return np.asarray(value - np.polyval(np.polyfit(position_mm, value, 1), position_mm))
+def _same_at_all_orders(position_mm: FloatArray, cause: FloatArray, effect: FloatArray) -> dict[str, float] | None:
+    """The regression without lines, if it is the same without cubics: two smooth curves are alike by chance at first."""
+    span = np.ptp(position_mm)
+    along = (position_mm - position_mm.mean()) / span
+    results = []
+    for order in (1, 3):
+        left = [value - np.polyval(np.polyfit(along, value, order), along) for value in (cause, effect)]
+        results.append(_regression(*left))
+    first, fine = results
+    if not first or not fine or abs(first["slope"] - fine["slope"]) > ALIKE * abs(first["slope"]):
+        return None
+    return first
 
 
 def _regression(cause: FloatArray, effect: FloatArray) -> dict[str, float] | None:
