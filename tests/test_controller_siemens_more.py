@@ -23,6 +23,7 @@ from compgen.errors import InputError
 from compgen.export import export, wanted_correction
 from compgen.model import modelled_errors
 from compgen.model.exact import exact_error
+from compgen.model.grid import volume_sample
 from compgen.verify import read_tables, verify
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -259,6 +260,30 @@ def test_the_file_leaves_hardly_more_than_the_optimum_in_its_basis_at_points_tha
     left = [rms(exact_error(machine, errors, unseen + field) + field) for field in (added, best)]
     print(chain, angle_rad, left, left[0] / left[1])
     assert left[0] <= 1.05 * left[1]
+
+
+@pytest.mark.parametrize("counts", [(21, 21, 21), (61, 41, 41), (81, 41, 64), (3000, 3000, 3000), (2, 2, 5000)])
+def test_points_over_the_volume_integrate_what_tables_hold_whatever_their_number_of_nodes(counts):
+    """Means of 1, x, y^2, x y and z x^2 over the box by hand; every table interval has points."""
+    machine = machine_with()
+    nodes = tuple(np.linspace(*axis.range_mm, n) for axis, n in zip(machine.axes, counts, strict=True))
+    sample = volume_sample(machine, nodes)
+    assert len(sample.position_mm) < 1_000_000
+    low, high = machine.lower_mm, machine.upper_mm
+    middle, square = 0.5 * (low + high), (low**2 + low * high + high**2) / 3.0
+    x, y, z = sample.position_mm.T
+    weight = sample.weight / sample.weight.sum()
+    for values, mean, size in (
+        (x, middle[0], 450.0),
+        (y**2, square[1], 300.0**2),
+        (x * y, middle[0] * middle[1], 450.0 * 300.0),
+        (z * x**2, middle[2] * square[0], 400.0 * 450.0**2),
+    ):
+        assert weight @ values == pytest.approx(mean, abs=2e-3 * size)
+    assert np.mean(sample.weight) == pytest.approx(1.0)
+    for axis in range(3):
+        inside = sample.position_mm[sample.weight > 0, axis]
+        assert np.all(np.histogram(inside, nodes[axis])[0] > 0)
 
 
 def columns_of(term, position):

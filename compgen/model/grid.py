@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -92,15 +93,11 @@ def volume_sample(
     nodes_mm = tuple(np.append(nodes, emphasis.ends_mm(axis)) for axis, nodes in enumerate(nodes_mm))
     sides = [_between_nodes(machine, axis, nodes, emphasis) for axis, nodes in enumerate(nodes_mm)]
     counts = [len(points) for points, _ in sides]
-    every = -(-int(np.prod(counts)) // most)
-    thinned = _lattice(counts, every)
-    if (
-        every > 1
-        and min(int(np.bincount(part, minlength=n).min()) for part, n in zip(thinned, counts, strict=True))
-        < LEAST_IN_PLANE
-    ):
+    every = -(-math.prod(counts) // most)
+    if every > 1 and most < LEAST_IN_PLANE * max(counts):
         inner = _three_grids(machine, sides, most, emphasis)
     else:
+        thinned = _lattice(counts, every)
         position_mm = np.stack([side[0][part] for side, part in zip(sides, thinned, strict=True)], axis=1)
         weight = np.prod([side[1][part] for side, part in zip(sides, thinned, strict=True)], axis=0)
         inner = VolumeSample(position_mm, weight)
