@@ -20,8 +20,9 @@ from compgen.errors import InputError
 LEVERS = ("1", "x", "y", "z", "tx", "ty", "tz")
 #: Limits of ``volcomp.h``.
 MOST_CURVES, MOST_TERMS, MOST_NODES, MOST_VERTICES, LONGEST_NAME = 64, 512, 10_000, 100_000, 31
-#: The iteration of the inverse ends when no axis moves by more than this, or fails after so many rounds.
-LAST_STEP_MM, MOST_ROUNDS = 1e-13, 50
+#: The iteration of the inverse ends when no axis moves by more than this and this part of its coordinate (far from
+#: machine zero neighbouring numbers differ by more than the first), or fails after so many rounds.
+LAST_STEP_MM, LAST_PART, MOST_ROUNDS = 1e-13, 1e-15, 50
 
 
 @dataclass(frozen=True)
@@ -104,9 +105,9 @@ class VolTable:
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(MOST_ROUNDS):
                 following = wanted_mm - self.error(axes, tool_mm)
-                moved = np.max(np.abs(following - axes), initial=0.0)
+                ended = np.abs(following - axes) <= LAST_STEP_MM + LAST_PART * np.abs(following)
                 axes = following
-                if moved <= LAST_STEP_MM:
+                if np.all(ended):
                     return axes
         raise InputError(
             "the errors of the table change too fast with position: no position puts the tool where it belongs"

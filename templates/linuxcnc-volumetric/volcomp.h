@@ -30,8 +30,10 @@
 #define VOLCOMP_VERTICES 100000
 #define VOLCOMP_BYTES (64L << 20)
 #define VOLCOMP_NAME 32
-// The iteration ends when no axis moves by more than this, mm; a table that needs more rounds is refused.
+// The iteration ends when no axis moves by more than this, mm, and this part of its coordinate (far from machine zero
+// neighbouring numbers differ by more than the first); a table that needs more rounds is refused.
 #define VOLCOMP_STEP 0.0000000000001
+#define VOLCOMP_PART 0.000000000000001
 #define VOLCOMP_ROUNDS 50
 
 typedef struct {
@@ -383,15 +385,16 @@ static int volcomp_inverse(const volcomp_table *table, const double p[3], const 
     for (k = 0; k < 3; k++)
         q[k] = p[k];
     for (round = 0; round < VOLCOMP_ROUNDS; round++) {
-        double e[3], moved = 0;
+        double e[3];
+        int moved = 0;
         volcomp_error(table, q, t, e);
         for (k = 0; k < 3; k++) {
             double next = p[k] - e[k];
             double step = fabs(next - q[k]);
-            moved = step > moved ? step : moved;
+            moved |= step > VOLCOMP_STEP + VOLCOMP_PART * fabs(next);
             q[k] = next;
         }
-        if (!(moved > VOLCOMP_STEP))
+        if (!moved)
             return 0;
     }
     return -1;
