@@ -82,6 +82,7 @@ class Level:
         if self.key in ("volumetric", "directional"):  # the control evaluates E = C P with the tool in use
             return [dict.fromkeys(errors.names, 0.0) for _ in tools_mm]
         position_mm = _points(machine, errors) if self.solver is None else self.solver.position_mm
+        weight = None if self.solver is None else self.solver.weight
         found: list[dict[str, float]] = [{} for _ in tools_mm]
         for name in errors.names:
             part = errors.only(name)
@@ -91,7 +92,7 @@ class Level:
                 added = self.solver.field(_best(self.solver, self.pitch, wanted))
             for tool, left in zip(tools_mm, found, strict=True):
                 rest = volumetric_error(machine, part, position_mm, tool) + added
-                rest = rest - rest.mean(axis=0) if anchored else rest
+                rest = rest - np.average(rest, axis=0, weights=weight) if anchored else rest
                 left[name] = float(np.sqrt(np.max(np.einsum("ij,ij->i", rest, rest)))) / MM_PER_UM
         return found
 

@@ -287,7 +287,7 @@ def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dic
     for name, field_mm, values in zip(names, wanted, solver.project_all(wanted), strict=True):
         rest = field_mm - solver.field(values)
         if solver.offsets:
-            rest = rest - rest.mean(axis=0)
+            rest = rest - np.average(rest, axis=0, weights=solver.weight)
         largest = float(np.max(np.linalg.norm(rest, axis=1)))
         if largest > NAMED_FROM_MM:
             found[name] = round(largest / MM_PER_UM, 3)
