@@ -26,6 +26,7 @@ ALLOWED_SPREAD = 0.20
 #: A sample repeats a short function until it lasts about this long.
 SHORTEST_SAMPLE_S = 0.02
 _DGEMM_SIZE = 384
+Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
@@ -98,22 +99,28 @@ def dgemm() -> None:
     np.matmul(left, right, out=product)
 
 
-def _seconds(function: Callable[[], object], calls: int) -> float:
-    start = time.perf_counter()
+def seconds(function: Callable[[], object], calls: int = 1, clock: Clock = time.perf_counter) -> float:
+    """Time of one of ``calls`` calls in a row, s."""
+    start = clock()
     for _ in range(calls):
         function()
-    return (time.perf_counter() - start) / calls
+    return (clock() - start) / calls
 
 
 def _calls_for(function: Callable[[], object]) -> int:
     """Calls that make up one sample; the first call of all (compilation, page faults) is not counted."""
     function()
-    once = _seconds(function, 1)
+    once = seconds(function)
     return max(1, round(SHORTEST_SAMPLE_S / max(once, 1e-9)))
 
 
-def alternate(functions: Mapping[str, Callable[[], object]], runs: int = 7) -> Comparison:
-    """Time functions without arguments in turn, ``runs`` rounds (at least 5), on one thread."""
+def alternate(
+    functions: Mapping[str, Callable[[], object]], runs: int = 7, clock: Clock = time.perf_counter
+) -> Comparison:
+    """Time functions without arguments in turn, ``runs`` rounds (at least 5), on one thread.
+
+    With ``time.process_time`` as ``clock``, time that other programs take does not count.
+    """
     if runs < 5:
         raise ValueError(f"{runs} runs give no median with a spread; at least 5 are needed")
     every = {**functions, "dgemm": dgemm}
@@ -122,7 +129,7 @@ def alternate(functions: Mapping[str, Callable[[], object]], runs: int = 7) -> C
         calls = {name: _calls_for(function) for name, function in every.items()}
         for _ in range(runs):
             for name, function in every.items():
-                samples[name].append(_seconds(function, calls[name]))
+                samples[name].append(seconds(function, calls[name], clock))
     timings = {name: Timing(name, tuple(times)) for name, times in samples.items()}
     reference = timings.pop("dgemm")
     return Comparison(tuple(timings.values()), reference)
