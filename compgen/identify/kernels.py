@@ -1,7 +1,8 @@
 """Access to the compiled inner loops of :mod:`compgen.identify.compiled`, which need numba.
 
-Loading them takes a third of a second, and about 13 s for the first time on a computer, when they are compiled. They are loaded for large data, and for a process that identifies repeatedly; a single small identification from the command
-line is faster without.
+Loading them takes a third of a second, and about 13 s for the first time on a computer, when they are compiled. They are
+loaded for large data, and for a process that identifies repeatedly; a single small identification from the command line
+is faster without.
 """
 
 from __future__ import annotations
