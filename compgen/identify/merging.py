@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import t as student_t
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
@@ -28,6 +28,8 @@ from compgen.model.volumetric import c_matrix, tool_of
 
 #: Probability with which two true measurements are said to disagree somewhere.
 FALSE_ALARM = 0.05
+#: Degrees of freedom where the scatter is stated, not estimated.
+MANY = 1e6
 #: Levels of the other axes at which the motion of the tool is compared.
 LEVELS = 3
 
@@ -39,7 +41,7 @@ class Agreement:
     Parameters
     ----------
     en : largest |difference| / (k u(difference)) over the positions of each error; above 1 they disagree.
-    coverage_factor : k, chosen so that ``FALSE_ALARM`` holds for all values together.
+    coverage_factor : k of Student's distribution, chosen so that ``FALSE_ALARM`` holds for all values together.
     not_expressed_mm : largest motion of the tool of the second one that the errors of the first cannot express.
     """
 
@@ -68,7 +70,8 @@ def merge(machine: Machine, first: Identification, second: Identification) -> Id
     own = joint_covariance(first)
     names, positions, turned, factor, left = projected(machine, first.layout, second)
     values = _values_at(first.errors, names, positions)
-    agreement, u1, u2 = _compare(names, values, turned, own.errors_factor, factor, left)
+    freedom = float(second.details.get("repeatability_freedom") or MANY)
+    agreement, u1, u2 = _compare(names, (values, own.errors_factor), (turned, factor), left, freedom)
     merged, roots = _average(names, agreement, (values, own.errors_factor, u1), (turned, factor, u2))
     errors = _table(first.errors, names, positions, merged, roots)
     texts = _texts(agreement)
@@ -105,14 +108,12 @@ def _check(machine: Machine, first: Identification, second: Identification) -> N
         raise InputError("one of the measurements has no uncertainties, so that they cannot be compared or averaged")
 
 
-def _points(machine: Machine, errors: ErrorTable) -> FloatArray:
-    """Positions (m, 3): every axis at its nodes and measured positions, the others at a few levels."""
+def _points(machine: Machine) -> FloatArray:
+    """Positions (m, 3): every axis at its nodes, the others at a few levels."""
     levels = [np.linspace(*axis.range_mm, LEVELS) for axis in machine.axes]
     parts = []
     for k, axis in enumerate(machine.axes):
-        measured = errors.curves[f"E{AXES[k]}{AXES[k]}"].position_mm
-        along = np.unique(np.concatenate([axis.nodes_mm, measured]))
-        lists = [along if j == k else levels[j] for j in range(3)]
+        lists = [axis.nodes_mm if j == k else levels[j] for j in range(3)]
         parts.append(np.stack(np.meshgrid(*lists, indexing="ij"), axis=-1).reshape(-1, 3))
     return np.vstack(parts)
 
@@ -126,7 +127,7 @@ def projected(machine: Machine, layout: ErrorParameters, second: Identification)
     Returns name and position of each value (k,), the values (k,), their factor (k, r), and the largest motion of the
     tool that the layout cannot express, mm.
     """
-    position = _points(machine, second.errors)
+    position = _points(machine)
     tip = position + tool_of(machine, None)
     bases = [layout.basis(axis, position[:, axis]) for axis in range(3)]
     rigid = [np.broadcast_to(unit, tip.shape) for unit in np.eye(3)] + [np.cross(unit, tip) for unit in np.eye(3)]
@@ -159,12 +160,17 @@ def _values_at(errors: ErrorTable, names: Sequence[str], position_mm: FloatArray
 
 
 def _compare(
-    names: Sequence[str], one: FloatArray, other: FloatArray, root1: FloatArray, root2: FloatArray, left_mm: float
+    names: Sequence[str],
+    first: tuple[FloatArray, FloatArray],
+    second: tuple[FloatArray, FloatArray],
+    left_mm: float,
+    freedom: float,
 ) -> tuple[Agreement, FloatArray, FloatArray]:
+    (one, root1), (other, root2) = first, second
     u1, u2 = (np.sqrt(np.einsum("ij,ij->i", root, root)) for root in (root1, root2))
     u = np.hypot(u1, u2)
     known = u > 1e-15
-    k = float(norm.isf(FALSE_ALARM / 2.0 / max(int(known.sum()), 1)))
+    k = float(student_t.isf(FALSE_ALARM / 2.0 / max(int(known.sum()), 1), freedom))
     ratio = np.zeros(len(u))
     ratio[known] = np.abs(one - other)[known] / (k * u[known])
     label = np.array(names)

@@ -45,11 +45,22 @@ def details_of(
         "slopes_arcsec": {name: value / RAD_PER_ARCSEC for name, value in evaluation.slopes.items()},
         "squareness": _squareness(instrument, evaluation),
         "contradictions": list(dict.fromkeys(run.contradiction for run in runs if run.contradiction)),
+        "repeatability_freedom": _freedom(reduced),
         "repeatability_half_range": in_table_units(repeated),
         "reversal_angles_urad": _reversal_angles(evaluation),
         "budget": {name: _in_units(name, part) for name, part in contributions.items()},
         "table": format_table(columns).splitlines() if columns else [],
     }
+
+
+def _freedom(runs: Sequence[RelativeRun]) -> int | None:
+    """Degrees of freedom of the scatter of repeated runs, the fewest of all axes; None without repeats."""
+    found = []
+    for axis in {run.axis for run in runs}:
+        own = [run for run in runs if run.axis == axis]
+        if len(own) > 1:
+            found.append((len(own) - 1) * max(len(np.unique(own[0].position_mm)) - 2, 1))
+    return min(found, default=None)
 
 
 def _in_units(name: str, part: Mapping[str, float]) -> dict[str, Any]:

@@ -27,6 +27,8 @@ LARGEST_OFFSET_MM = 300.0
 LEAST = 8
 #: Curvature of Y_QD2 - Y_QD1 below which nothing is said, mm.
 STRAIGHT_MM = 0.2 * MM_PER_UM
+#: Spots that move by less than this say nothing about their channel, mm; share below which a difference is small.
+SPREAD_MM, SWAPPED = 3.0 * MM_PER_UM, 0.3
 #: Share of one PSD2 step that counts as "the same zero".
 ZERO_MM = 1e-9
 
@@ -126,12 +128,18 @@ def _contradiction(machine: Machine, instrument: Instrument, runs: Sequence[Rela
 
 def _swapped(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
     """Angles and drift monitor are small; the spots of a long run are not: channels that stand in each other's place."""
-    rows = np.concatenate([run.rows for run in runs])
     spots = readings.signals_mm
-    same = float(np.std(spots["z_qd1_mm"][rows] - spots["z_qd2_mm"][rows]))
-    other = float(np.std(spots["y_qd1_mm"][rows] - spots["z_qd2_mm"][rows]))
-    spread = float(np.std(spots["z_qd1_mm"][rows]))
-    if spread > 5 * MM_PER_UM and other < 0.2 * same and other < 0.2 * spread:
+
+    def size(first: str, second: str | None = None) -> float:
+        """Root mean square of a signal, or of the difference of two, about its line in L."""
+        parts = []
+        for run in runs:
+            value = spots[first][run.rows] - (0.0 if second is None else spots[second][run.rows])
+            parts.append(value - np.polyval(np.polyfit(run.distance_mm, value, 1), run.distance_mm))
+        return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+
+    same, other, spread = size("z_qd1_mm", "z_qd2_mm"), size("y_qd1_mm", "z_qd2_mm"), size("z_qd2_mm")
+    if spread > SPREAD_MM and other < SWAPPED * min(same, spread):
         text = "Y_QD1, not Z_QD1, follows Z_QD2: the channels of the first detector stand in each other's place"
         yield Suspicion("detector_swap", _letter(runs), text, {"z_z_um": same * 1e3, "y_z_um": other * 1e3})
 

@@ -129,7 +129,13 @@ def _repeats(
         left = values - line @ np.linalg.lstsq(line, values, rcond=None)[0]
         total += left.T @ left
         weight += len(left) - 2
-    return total / (weight * (len(runs) - 1) / len(runs))
+    freedom = weight * (len(runs) - 1) / len(runs)
+    return total / freedom * student(freedom)
+
+
+def student(freedom: float) -> float:
+    """Variance of Student's t for so many degrees of freedom: what a variance from few readings has to be multiplied by."""
+    return freedom / max(freedom - 2.0, 0.5)
 
 
 def _neighbours(motion: Sequence[FloatArray]) -> FloatArray:
