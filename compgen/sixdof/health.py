@@ -23,6 +23,8 @@ SIGNIFICANT, EXPLAINED = 6.0, 0.5
 ALIKE = 0.25
 #: An offset of L beyond this is not a slip but another set-up, mm.
 LARGEST_OFFSET_MM = 300.0
+#: A reduced depth that is off by more belongs to no such target, mm.
+LARGEST_DEPTH_MM = 60.0
 #: Readings of a run below which no regression is made.
 LEAST = 8
 #: Curvature of Y_QD2 - Y_QD1 below which nothing is said, mm.
@@ -138,10 +140,14 @@ def _swapped(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Suspicio
             parts.append(value - np.polyval(np.polyfit(run.distance_mm, value, 1), run.distance_mm))
         return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
-    same, other, spread = size("z_qd1_mm", "z_qd2_mm"), size("y_qd1_mm", "z_qd2_mm"), size("z_qd2_mm")
+    second = spots.get("y_qd2_mm")
+    seen = second is not None and not np.isnan(second).any()
+    own, wrong, by = ("y_qd1_mm", "z_qd1_mm", "y_qd2_mm") if seen else ("z_qd1_mm", "y_qd1_mm", "z_qd2_mm")
+    same, other, spread = size(own, by), size(wrong, by), size(by)
     if spread > SPREAD_MM and other < SWAPPED * min(same, spread):
-        text = "Y_QD1, not Z_QD1, follows Z_QD2: the channels of the first detector stand in each other's place"
-        yield Suspicion("detector_swap", _letter(runs), text, {"z_z_um": same * 1e3, "y_z_um": other * 1e3})
+        names = [name.removesuffix("_mm").upper() for name in (wrong, own, by)]
+        text = f"{names[0]}, not {names[1]}, follows {names[2]}: the channels of the first detector stand in each other's place"
+        yield Suspicion("detector_swap", _letter(runs), text, {"own_um": same * 1e3, "other_um": other * 1e3})
 
 
 def _drift(readings: SixDof, instrument: Instrument, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
@@ -184,7 +190,7 @@ def _crosstalk(machine: Machine, instrument: Instrument, runs: Sequence[Relative
     position = errors[0].position_mm
     kappa = HANDEDNESS[axis]
     at_tool = runs[0].away < 0  # only then does L enter the straightness
-    largest = LARGEST_OFFSET_MM if at_tool else 3.0 * optics.reduced_depth_mm
+    largest = LARGEST_OFFSET_MM if at_tool else LARGEST_DEPTH_MM
     arm = float(np.abs(cross_talk_arm_mm(optics, set_up, runs[0].distance_mm)).mean())
     for channel, (name, sign) in enumerate((("yaw", kappa), ("pitch", -kappa))):
         straight, angle = delta[:, DIRECTIONS[axis][1 + channel]], eps[:, ROTATIONS[axis][channel]]
