@@ -10,12 +10,15 @@ import pytest
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
-from compgen.core.error_table import read_errors
+from compgen.core.error_table import Curve, ErrorTable, read_errors
 from compgen.core.machine import load_machine
 from compgen.core.reversal import read_reversal
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import identify_measurement, joint_covariance, read_measurement
+from compgen.identify.merging import projected
+from compgen.identify.parameters import error_parameters
 from compgen.identify.sixdof import SixDofMeasurement, identify_sixdof
+from compgen.model import modelled_errors, volumetric_error
 from compgen.simulate import SimulatedSixDof, read_scenario, simulate_sixdof, write_simulation
 from compgen.sixdof.instrument import read_instrument
 from compgen.sixdof.readings import format_sixdof, read_sixdof
@@ -317,7 +320,77 @@ def test_two_axes_alone_give_their_errors_and_one_squareness(tmp_path):
     assert any(text.startswith("EZZ") for text in found.unobservable)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('kind = "sixdof-laser"', 'kind = "tracer"', "sixdof-laser"),
+        ("glass_index = 1.5151", "glass_index = 15.151", "between 1 and 4"),
+        ("focal_length_mm = 100.0\n", "", "focal_length_mm: is missing"),
+        ("[axes.X]\nmode = 2", "[axes.X]\nmode = 3", "from 1 to 2"),
+        ("[axes.X]\nmode = 2\nbeam_direction = 1", "[axes.X]\nmode = 2\nbeam_direction = 0", "or -1 is expected"),
+        ("eps_PEy_arcsec = 4.0", "eps_PEy_deg = 4.0", "is not a systematic parameter"),
+        ("eps_PEy_arcsec = 4.0", "eps_PEy_arcsec = 4.0\neps_PEy_urad = 4.0", "twice, in two units"),
+        ("eps_PEy_arcsec = 0.05", "eps_PEy_arcsec = -0.05", "not negative"),
+        ("[axes.Y.systematics]", "[axes.X.systematics]", "is not a systematic parameter"),
+        ("qd_um = 0.05", "qd_mm = 0.05", "did you mean 'qd_um'"),
+        ('line = "ls"', 'line = "endpoints"', "'ls', 'minzone'"),
+        ('line = "ls"', 'line = "ls"\nsquareness_sign = 2', "-1"),
+    ],
+)
+def test_a_wrong_instrument_file_names_key_and_choices(tmp_path, old, new, message):
+    text = FILE.read_text()
+    assert old in text
+    (tmp_path / "wrong.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as caught:
+        read_instrument(tmp_path / "wrong.toml")
+    assert caught.value.file is not None
+    assert caught.value.field
+
+
+def test_a_distance_that_becomes_negative_is_refused(tmp_path):
+    """Command and chain let the target come nearer by 800 mm from 100 mm on."""
+    text = FILE.read_text().replace("[axes.Z]\nmode = 1\nbeam_direction = 1", "[axes.Z]\nmode = 1\nbeam_direction = -1")
+    (tmp_path / "near.toml").write_text(text)
+    readings = read_sixdof(DATA)
+    flipped = np.where(readings.axis == 2, -1.0, 1.0) * readings.signals_mm["displacement_mm"]
+    signals = {**readings.signals_mm, "displacement_mm": flipped}
+    with pytest.raises(InputError, match="optical distance would become"):
+        identify_sixdof(
+            MACHINE,
+            SixDofMeasurement(
+                dataclasses.replace(readings, signals_mm=signals), read_instrument(tmp_path / "near.toml")
+            ),
+        )
+
+
 # --- merging -------------------------------------------------------------------------------------------------------
+
+
+def test_the_projection_keeps_how_the_tool_moves_up_to_a_rigid_motion():
+    """All 21 errors folded into the 17 that a tracer sees: E at random nodes, beyond the solver's sample.
+
+    Between nodes an angle times its own travel is no straight line, which a straightness curve is.
+    """
+    found = identify_sixdof(MACHINE, SixDofMeasurement(read_sixdof(DATA), read_instrument(FILE)))
+    layout = error_parameters(MACHINE, modelled_errors(MACHINE))
+    names, positions, values, factor, left = projected(MACHINE, layout, found)
+    assert left <= 1e-9
+    label, curves, squareness = np.array(names), {}, {}
+    for name in dict.fromkeys(names):
+        rows = label == name
+        if name in ("EC0Y", "EB0Z", "EA0Z"):
+            squareness[name] = (float(values[rows][0]), 0.0)
+        else:
+            curves[name] = Curve(positions[rows], values[rows], np.zeros(rows.sum()))
+    table = ErrorTable(curves, squareness)
+    assert len(table.names) == 17
+    at = 50.0 * np.random.default_rng(4).integers(0, 17, (300, 3))
+    difference = volumetric_error(MACHINE, table, at) - volumetric_error(MACHINE, found.errors, at)
+    design = np.hstack([np.tile(np.eye(3), (len(at), 1)), np.vstack([_turn(p) for p in at])])
+    rest = difference.ravel() - design @ np.linalg.lstsq(design, difference.ravel(), rcond=None)[0]
+    assert np.abs(difference).max() > 1 * UM
+    assert np.abs(rest).max() <= 1e-8
+    assert factor.shape[0] == len(values)
 
 
 def lengths_of(truth_file, tmp_path, seed=3):

@@ -131,6 +131,20 @@ def test_an_uncertainty_without_repeats_and_without_stated_noise_comes_from_neig
     assert 0.5 <= u / (np.sqrt(2.0) * 5 * SCATTER[0, 5]) <= 2.0  # zero at the first position: the root of two
 
 
+def test_runs_whose_slopes_differ_make_squareness_as_uncertain_as_they_differ():
+    """Straightness of X of three runs leans by -12, 0 and 12 urad more: their mean has 12 urad / sqrt(3)."""
+    readings = measured(np.random.default_rng(8))
+    lean = 12e-6 * (readings.run - 2.0) * (readings.axis == 0) * readings.position_mm
+    signals = {**readings.signals_mm}
+    for name in ("y_qd1_mm", "y_qd2_mm"):
+        signals[name] = signals[name] + 2.0 * lean
+    leaning = dataclasses.replace(readings, signals_mm=signals)
+    plain, found = (uncertainty_budget(MACHINE, r, INSTRUMENT).contributions() for r in (readings, leaning))
+    assert plain["EC0Y"].get("run to run", 0.0) == 0.0
+    assert found["EC0Y"]["run to run"] == pytest.approx(12e-6 / np.sqrt(3.0), rel=0.3)
+    assert found["EA0Z"]["run to run"] == 0.0
+
+
 def test_the_half_range_of_three_runs_is_the_papers_metric():
     """T10: half of max minus min at each position, the worst one counts."""
     runs = axis_runs(MACHINE, measured(np.random.default_rng(4)), INSTRUMENT)

@@ -8,6 +8,7 @@ from compgen.identify.measurement import describe, identify_measurement, read_me
 from compgen.identify.monte_carlo import SelfCheck, sample_errors, self_check
 from compgen.identify.noise import IdentifyOptions
 from compgen.identify.result import Identification, StationResult
+from compgen.identify.sixdof import SixDofMeasurement, identify_sixdof
 from compgen.identify.systematic import SystematicInputs
 
 __all__ = [
@@ -16,12 +17,14 @@ __all__ = [
     "IdentifyOptions",
     "KnownStations",
     "SelfCheck",
+    "SixDofMeasurement",
     "StationResult",
     "SystematicInputs",
     "describe",
     "identify",
     "identify_deviations",
     "identify_measurement",
+    "identify_sixdof",
     "joint_covariance",
     "locate_stations",
     "predict_uncertainty",

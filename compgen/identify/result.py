@@ -147,7 +147,7 @@ class Identification:
             "residual_rms_um": self.rms_um,
             "residual_max_um": float(np.max(np.abs(self.residual_mm[self.accepted]))) / MM_PER_UM,
             "degrees_of_freedom": self.degrees_of_freedom,
-            "reduced_chi_square": self.reduced_chi_square,
+            "reduced_chi_square": None if np.isnan(self.reduced_chi_square) else self.reduced_chi_square,
             **self._u_of_the_readings(),
             "readings": len(self.accepted),
             "readings_used": int(np.count_nonzero(self.accepted)),

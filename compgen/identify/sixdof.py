@@ -103,7 +103,7 @@ def _result(
         accepted=np.ones(size, dtype=bool),
         rms_um=rms_um,
         degrees_of_freedom=freedom,
-        reduced_chi_square=1.0,
+        reduced_chi_square=float("nan"),  # nothing is adjusted
         u_source="propagated" if known else "unknown",
         u_length_um=rms_um,
         u_length_um_per_m=0.0,

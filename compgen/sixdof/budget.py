@@ -7,14 +7,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.errors import CompgenWarning
-from compgen.sixdof.chain import evaluate_readings, values_of
-from compgen.sixdof.evaluation import AxisErrors, axis_errors, evaluate_axes
+from compgen.sixdof.chain import axis_runs, evaluate_readings, values_of
+from compgen.sixdof.comparison import each_run
+from compgen.sixdof.evaluation import AxisErrors, Evaluation, axis_errors, evaluate, evaluate_axes
 from compgen.sixdof.frames import errors_of_run, expected_away
 from compgen.sixdof.instrument import Instrument, known_systematics
 from compgen.sixdof.readings import SixDof
@@ -23,6 +25,8 @@ from compgen.sixdof.scatter import Scatter, moved_run, scatter_of, unit_moves
 
 #: Steps of a body's motion for its derivative: mm and rad; everything behind it is linear but the minimum zone.
 STEPS = (1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6)
+#: Probability with which runs that differ by the scatter of their readings alone are taken to differ by more.
+UNLIKELY = 0.02
 #: Parameters of the beams, one for all axes; the others belong to the prism or the target of one axis.
 SHARED = ("eps_PEy", "eps_PEz")
 #: Constants of :class:`Optics` that a budget can hold.
@@ -86,8 +90,14 @@ def uncertainty_budget(machine: Machine, readings: SixDof, instrument: Instrumen
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CompgenWarning)
-        errors = evaluate_readings(machine, readings, instrument).errors
-        columns = [*_random_columns(machine, readings, instrument), *_constant_columns(machine, readings, instrument)]
+        runs = axis_runs(machine, readings, instrument)
+        errors = evaluate(machine, instrument, runs).errors
+        random = _random_columns(machine, readings, instrument)
+        columns = [
+            *random,
+            *_run_to_run(errors, random, each_run(machine, instrument, runs)),
+            *_constant_columns(machine, readings, instrument),
+        ]
     sources = tuple(source for source, _ in columns)
     size = len(values_of(errors))
     factor = np.column_stack([column for _, column in columns]) if columns else np.zeros((size, 0))
@@ -123,6 +133,37 @@ def _random_columns(machine: Machine, readings: SixDof, instrument: Instrument) 
                 root = _root(covariance[group] / scatter.count[group])
                 columns += [(source, column) for column in (response @ root).T if np.any(column)]
     return columns
+
+
+def _run_to_run(errors: ErrorTable, random: Sequence[Column], evaluations: Sequence[Evaluation]) -> list[Column]:
+    """What whole runs differ by beyond the scatter of their readings: drift from run to run, slopes above all.
+
+    The variance of the mean of R runs by their differences is compared with that by the scatter; where it is larger
+    than chance has it (``UNLIKELY``), the differences themselves are a source, divided by the root of R (R - 1).
+    """
+    count = len(evaluations)
+    if count < 2:
+        return []
+    tables = [_resampled(item.errors, errors) for item in evaluations]
+    part = (np.array(tables) - np.mean(tables, axis=0)) / np.sqrt(count * (count - 1))
+    limit = float(chi2.isf(UNLIKELY, count - 1)) / (count - 1)
+    known = sum((column**2 for _, column in random), np.zeros(part.shape[1]))
+    kept = np.zeros(part.shape[1], dtype=bool)
+    for _, rows in _rows_of(errors):
+        kept[rows] = np.mean(np.sum(part[:, rows] ** 2, axis=0)) > limit * np.mean(known[rows])
+    return [("run to run", np.where(kept, column, 0.0)) for column in part] if np.any(kept) else []
+
+
+def _resampled(errors: ErrorTable, like: ErrorTable) -> FloatArray:
+    """Values of a table at the positions of another one, in the order of its file."""
+    return np.concatenate(
+        [
+            np.array([errors.squareness[name][0]])
+            if name in like.squareness
+            else errors.curves[name].at(like.curves[name].position_mm)
+            for name in like.names
+        ]
+    )
 
 
 def _means(machine: Machine, instrument: Instrument, runs: Sequence[RelativeRun]) -> AxisErrors:

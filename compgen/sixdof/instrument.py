@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -97,7 +97,7 @@ def read_instrument(path: str | Path) -> Instrument:
         exit_to_prism_mm=root.take("exit_to_prism_mm", tomlio.not_negative, 0.0),
     )
     common = read_systematics(root.section("systematics", required=False))
-    u_common = read_systematics(root.section("u_systematics", required=False))
+    u_common = read_systematics(root.section("u_systematics", required=False), check=tomlio.not_negative)
     instrument = Instrument(
         optics=optics,
         axes=_read_axes(root.section("axes"), common),
@@ -203,7 +203,9 @@ def _read_axis(entry: tomlio.Section, axis: int, common: Mapping[str, float]) ->
     return result
 
 
-def read_systematics(section: tomlio.Section, axis: int | None = None) -> dict[str, float]:
+def read_systematics(
+    section: tomlio.Section, axis: int | None = None, check: Callable[[Any], float] = tomlio.number
+) -> dict[str, float]:
     """Read parameters with their unit at the end of the key (``eps_zir_arcsec``, ``delta_xic_um``) to mm and rad."""
     names, found = known_systematics(axis), {}
     for key in section.data:
@@ -214,6 +216,6 @@ def read_systematics(section: tomlio.Section, axis: int | None = None) -> dict[s
             raise section.fail(key, f"is not a systematic parameter; {nearest(key, allowed)}")
         if name in found:
             raise section.fail(key, "stands there twice, in two units")
-        found[name] = section.take(key, tomlio.number) * units[unit]
+        found[name] = section.take(key, check) * units[unit]
     section.finish()
     return found
