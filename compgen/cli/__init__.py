@@ -7,6 +7,7 @@ import sys
 import click
 
 from compgen.cli import (
+    diagnose_commands,
     export_commands,
     identify_commands,
     listing_commands,
@@ -42,6 +43,7 @@ MODULES = (
     run_commands,
     simulate_commands,
     identify_commands,
+    diagnose_commands,
     plan_commands,
     export_commands,
     options_commands,

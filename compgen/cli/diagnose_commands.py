@@ -1,0 +1,68 @@
+"""``compgen diagnose``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.core.files import OutputFolder
+from compgen.core.machine import Machine
+from compgen.diagnose import DiagnoseOptions, diagnose
+from compgen.diagnose.files import diagnosis_files, summary
+from compgen.diagnose.measurement import read_diagnosed
+
+
+@click.command("diagnose")
+@machine_argument
+@click.argument("measurements", nargs=-1, required=True, type=click.Path(path_type=Path))
+@out_option
+@click.option(
+    "--max-effects", type=click.IntRange(0, 6), default=4, show_default=True, help="Most named effects at once."
+)
+@click.option("--effects", metavar="NAME,...", help="Look for these effects only; default: the whole catalogue.")
+@click.option("--add", "added", multiple=True, metavar="NAME", help="Add this effect whether it was found or not.")
+@click.option("--u-um", type=float, help="Standard uncertainty of a reading, um; used where no line was repeated.")
+@json_option
+def diagnose_command(
+    machine: Machine,
+    measurements: tuple[Path, ...],
+    out: Path,
+    max_effects: int,
+    effects: str | None,
+    added: tuple[str, ...],
+    u_um: float | None,
+    as_json: bool,
+) -> int:
+    """Find where model and measurement disagree, name the missing effect, add it, and see the gap shrink.
+
+    MEASUREMENTS are *.lengths.csv (mm) or *.deviations.csv files. Writes diagnosis.json, diagnosis.md, pages with
+    pictures (index.html), and extended.toml: the machine with the effects that were found.
+
+    Exit code 1: it cannot be decided, or the gap does not shrink on lines that were left out.
+
+    \b
+    Example:
+      compgen diagnose zha-gantry lengths.csv --out diagnosis/
+    """
+    OutputFolder(out)
+    names = tuple(name.strip() for name in effects.split(",") if name.strip()) if effects else ()
+    options = DiagnoseOptions(max_effects, names, added, u_um)
+    with progress(quiet=as_json) as show:
+        show("reading the measurement")
+        measurement = read_diagnosed(measurements)
+        found = diagnose(machine, measurement, options, show=show)
+        show("drawing")
+        files = OutputFolder(out)
+        for name, content in diagnosis_files(found).items():
+            files.add(name, content)
+        files.commit()
+    if as_json:
+        print_json(found.to_dict())
+    else:
+        stdout.print(summary(found))
+    return 0 if found.acceptable else 1
+
+
+COMMANDS = (diagnose_command,)

@@ -1,0 +1,135 @@
+"""The base model of a diagnosis: smooth curves for the errors of the machine file, rich enough for the data.
+
+Legendre polynomials, because the positions of lines and diagonals form no grid; where the data ask for more (BIC),
+the curves of the machine file between its nodes are added. What cannot be told apart is left to the rank.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.machine import Machine
+from compgen.core.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
+from compgen.model.basis import hat_matrix, spline_matrix
+from compgen.model.observability import modelled_errors
+
+#: Degree of the curves, if there are enough levels.
+DEGREE = 7
+#: Nodes beyond this are not tried as a richer basis.
+MOST_NODES = 40
+
+
+def legendre(s: FloatArray, degree: int) -> FloatArray:
+    """Legendre polynomials P0 ... P_degree at ``s`` (m,), shape (m, degree + 1)."""
+    return np.asarray(np.polynomial.legendre.legvander(s, degree))
+
+
+@dataclass(frozen=True)
+class CurveBasis:
+    """Basis of the curves of the three axes: ``degree`` of the polynomials, ``nodal`` where nodes are added."""
+
+    machine: Machine
+    errors: tuple[str, ...]
+    degree: tuple[int, int, int]
+    nodal: tuple[bool, bool, bool] = (False, False, False)
+
+    def of_axis(self, axis: int, position_mm: FloatArray) -> FloatArray:
+        """Basis of an axis at positions (m,): polynomials P1, P2 ..., then nodal curves, (m, k)."""
+        item = self.machine.axes[axis]
+        s = (2.0 * position_mm - sum(item.range_mm)) / item.length_mm
+        columns = legendre(s, self.degree[axis])[:, 1:]
+        if not self.nodal[axis]:
+            return columns
+        build = spline_matrix if self.machine.curves == "cubic" else hat_matrix
+        return np.hstack([columns, build(item.nodes_mm, position_mm)])
+
+    def _zeroed(self, axis: int, position_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Bases of an axis zero at the reference point, and zero at both ends of the travel, each (m, k)."""
+        item = self.machine.axes[axis]
+        fixed = np.array([self.machine.reference_point_mm[axis], *item.range_mm])
+        whole = self.of_axis(axis, np.concatenate([fixed, position_mm]))
+        reference, low, high, columns = whole[0], whole[1], whole[2], whole[3:]
+        share = ((position_mm - item.range_mm[0]) / item.length_mm)[:, None]
+        return columns - reference, (columns - (1.0 - share) * low - share * high)[:, 1:]
+
+    def parts(self, position_mm: FloatArray) -> list[Part]:
+        """Name, place in the vector of unknowns and basis (m, k) of every error at positions (m, 3)."""
+        bases = [self._zeroed(axis, position_mm[:, axis]) for axis in range(3)]
+        parts: list[Part] = []
+        start = 0
+        for name in self.errors:
+            if name in SQUARENESS_NAMES:
+                part = np.ones((len(position_mm), 1))
+            else:
+                error = error_named(name)
+                part = bases[error.axis][1 if error.is_straightness else 0]
+            parts.append(Part(name, slice(start, start + part.shape[1]), part))
+            start += part.shape[1]
+        return parts
+
+
+@dataclass(frozen=True)
+class Part:
+    """One error: its name, its place in the vector of unknowns, its basis at the poses (m, k)."""
+
+    name: str
+    place: slice
+    basis: FloatArray
+
+
+def size_of(parts: Sequence[Part]) -> int:
+    """Number of unknowns of all errors."""
+    return parts[-1].place.stop if parts else 0
+
+
+def names_of(parts: Sequence[Part]) -> list[str]:
+    """Error of every unknown."""
+    return [part.name for part in parts for _ in range(part.basis.shape[1])]
+
+
+def values_of(parts: Sequence[Part], unknowns: FloatArray) -> FloatArray:
+    """All 21 errors (m, 21) for the unknowns, mm and rad."""
+    values = np.zeros((len(parts[0].basis), len(ERROR_INDEX)))
+    for part in parts:
+        values[:, ERROR_INDEX[part.name]] = part.basis @ unknowns[part.place]
+    return values
+
+
+def tip_columns(parts: Sequence[Part], columns: FloatArray) -> FloatArray:
+    """Derivative of the tip by the unknowns, (3, m, k); ``columns`` (m, 3, 21) is that by the errors."""
+    design = np.empty((3, len(columns), size_of(parts)))
+    for part in parts:
+        own = columns[:, :, ERROR_INDEX[part.name]]
+        for k in range(3):
+            np.multiply(own[:, k, None], part.basis, out=design[k, :, part.place])
+    return design
+
+
+def base_errors(machine: Machine) -> tuple[str, ...]:
+    """Errors of the base model: those of the machine file with its own tool; what other tools show is an effect."""
+    return modelled_errors(machine)
+
+
+def first_basis(machine: Machine, position_mm: FloatArray, readings: int, poses: int) -> CurveBasis:
+    """Return the smooth basis that ``readings`` at ``poses`` distinct positions can carry."""
+    errors = base_errors(machine)
+    curves = sum(name not in SQUARENESS_NAMES for name in errors)
+    most = max(2, int(min(readings, 3 * poses) / 4 / max(curves, 1)))
+    degree = []
+    for axis in range(3):
+        levels = len(np.unique(np.round(position_mm[:, axis], 3)))
+        degree.append(max(1, min(DEGREE, levels - 1, most)))
+    return CurveBasis(machine, errors, (degree[0], degree[1], degree[2]))
+
+
+def richer(basis: CurveBasis, axis: int) -> CurveBasis | None:
+    """Return the basis with the nodes of the machine file on one axis, or None if that adds nothing."""
+    nodes = len(basis.machine.axes[axis].nodes_mm)
+    if basis.nodal[axis] or not basis.degree[axis] + 1 < nodes <= MOST_NODES:
+        return None
+    nodal = [flag or k == axis for k, flag in enumerate(basis.nodal)]
+    return CurveBasis(basis.machine, basis.errors, basis.degree, (nodal[0], nodal[1], nodal[2]))

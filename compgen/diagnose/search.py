@@ -1,0 +1,254 @@
+"""The search for the set of groups that explains the residual best: forward beam, drops and swaps, then a prune.
+
+Criterion: -chi2 plus a penalty for each member. Named effects pay as in the extended BIC (Chen and Chen 2008); generic
+groups pay the evidence of a random effect with optimised prior variance, k + k log(chi2/k), and a handicap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.diagnose.scene import Scene
+
+#: Handicap of a generic group, and of one that depends on time or temperature.
+HANDICAP, SLOW_HANDICAP = 21.0, 27.0
+MOST_MEMBERS = 6
+BEAM, ADDITIONS = 2, 3
+#: Largest p-value of a member, corrected for the number of groups and scan positions.
+LARGEST_P = 1e-3
+#: Directions of which less than this (squared) is left beside the other members say nothing.
+LEAST_SQUARE = 1e-6
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What the search may do: ``named`` is the number of named effects, ``most_named`` how many may be chosen."""
+
+    named: int
+    most_named: int = 4
+    most_members: int = MOST_MEMBERS
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A set of groups: members in the order named, then generic; criterion; chi-square of all; and of each in turn."""
+
+    members: tuple[int, ...]
+    criterion: float
+    chi2: float
+    gains: tuple[float, ...]
+
+
+def rules_of(scene: Scene, most_named: int) -> Rules:
+    """Return the rules for the groups of a scene."""
+    names = {group.name for group in scene.groups if group.tier == "named"}
+    return Rules(max(len(names), 1), most_named)
+
+
+def penalty(scene: Scene, rules: Rules, group: int, chi2: float) -> float:
+    """Penalty of a member that gains ``chi2``."""
+    item, k = scene.groups[group], scene.size(group)
+    if item.tier == "base":
+        return k * float(np.log(scene.count))
+    if item.tier == "named":
+        return k * float(np.log(scene.count)) + 2 * float(np.log(rules.named)) + 2 * float(np.log(item.scans))
+    handicap = SLOW_HANDICAP if item.slow else HANDICAP
+    return k + k * float(np.log(max(chi2 / max(k, 1), 1.0))) + handicap
+
+
+def _ordered(scene: Scene, members: Sequence[int]) -> list[int]:
+    rank = {"base": 0, "named": 1, "generic": 2}
+    return sorted(members, key=lambda g: rank[scene.groups[g].tier])
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What is left of all groups beside a set: ``cross`` (r, K) and ``score`` (K,)."""
+
+    cross: FloatArray
+    score: FloatArray
+    chi2: float
+
+
+def beside(scene: Scene, members: Sequence[int]) -> Beside:
+    """Take a set of groups out of all others."""
+    index = scene.coordinates(members)
+    if not len(index):
+        return Beside(np.zeros((0, len(scene.score))), scene.score, 0.0)
+    square, vectors = np.linalg.eigh(scene.gram[np.ix_(index, index)])
+    kept = square > LEAST_SQUARE
+    turn = vectors[:, kept] / np.sqrt(square[kept])
+    cross = turn.T @ scene.gram[index]
+    own = turn.T @ scene.score[index]
+    return Beside(cross, scene.score - own @ cross, float(own @ own))
+
+
+def gains(scene: Scene, left: Beside, wanted: Sequence[int]) -> FloatArray:
+    """chi-square that each of the groups ``wanted`` would gain beside the set."""
+    result = np.zeros(len(wanted))
+    sizes = np.diff(scene.start)[list(wanted)]
+    single = np.flatnonzero(sizes == 1)
+    at = scene.start[:-1][np.asarray(wanted, dtype=np.int64)[single]]
+    square = 1.0 - np.einsum("rk,rk->k", left.cross[:, at], left.cross[:, at])
+    result[single] = np.where(square > LEAST_SQUARE, left.score[at] ** 2 / np.maximum(square, LEAST_SQUARE), 0.0)
+    for k in np.flatnonzero(sizes > 1).tolist():
+        place = scene.place(wanted[k])
+        cross = left.cross[:, place]
+        values, vectors = np.linalg.eigh(np.eye(cross.shape[1]) - cross.T @ cross)
+        kept = values > LEAST_SQUARE
+        result[k] = float(np.sum((vectors[:, kept].T @ left.score[place]) ** 2 / values[kept]))
+    return result
+
+
+def evaluate(scene: Scene, rules: Rules, members: Sequence[int]) -> Chosen:
+    """Criterion of a set; named members enter first."""
+    order = _ordered(scene, members)
+    found, total = [], 0.0
+    criterion = 0.0
+    fixed = [g for g in order if scene.groups[g].tier != "generic"]
+    known = beside(scene, fixed).chi2
+    criterion += sum(penalty(scene, rules, g, 0.0) for g in fixed) - known
+    found += [gain_of(scene, [f for f in fixed if f != g], g) for g in fixed]
+    total = known
+    for k, group in enumerate(order[len(fixed) :]):
+        chi2 = beside(scene, order[: len(fixed) + k + 1]).chi2
+        found.append(chi2 - total)
+        criterion += penalty(scene, rules, group, chi2 - total) - (chi2 - total)
+        total = chi2
+    return Chosen(tuple(order), criterion, total, tuple(found))
+
+
+def gain_of(scene: Scene, others: Sequence[int], group: int) -> float:
+    """chi-square that a group gains beside others."""
+    return float(gains(scene, beside(scene, others), [group])[0])
+
+
+def _allowed(scene: Scene, rules: Rules, members: Sequence[int]) -> list[int]:
+    """Groups that may be added: of another name, visible, and within the numbers allowed."""
+    names = {scene.groups[g].name for g in members}
+    reported = [g for g in members if scene.groups[g].tier != "base"]
+    named = sum(scene.groups[g].tier == "named" for g in members)
+    found = []
+    for g, group in enumerate(scene.groups):
+        if group.name in names or not scene.size(g):
+            continue
+        if group.tier == "named" and named >= rules.most_named:
+            continue
+        if group.tier != "base" and len(reported) >= rules.most_members:
+            continue
+        found.append(g)
+    return found
+
+
+def _best_additions(scene: Scene, rules: Rules, members: Sequence[int], most: int) -> list[Chosen]:
+    """The sets with one more group that lower the criterion most."""
+    allowed = _allowed(scene, rules, members)
+    if not allowed:
+        return []
+    gained = gains(scene, beside(scene, members), allowed)
+    merit = np.array([g - penalty(scene, rules, a, g) for g, a in zip(gained, allowed, strict=True)])
+    best: dict[str, Chosen] = {}
+    for k in np.argsort(-merit)[: 4 * most]:
+        name = scene.groups[allowed[k]].name
+        if merit[k] <= -10.0 or len(best) >= most:
+            break
+        if name not in best:
+            best[name] = evaluate(scene, rules, [*members, allowed[k]])
+    return list(best.values())
+
+
+def search(scene: Scene, rules: Rules, start: Sequence[int] = ()) -> Chosen:
+    """Find the set with the smallest criterion; then drop members that are not significant."""
+    best = evaluate(scene, rules, start)
+    beam = [best]
+    while True:
+        found: dict[frozenset[int], Chosen] = {}
+        for item in beam:
+            for chosen in _best_additions(scene, rules, item.members, ADDITIONS):
+                found[frozenset(chosen.members)] = chosen
+        if not found:
+            break
+        beam = sorted(found.values(), key=lambda item: item.criterion)[:BEAM]
+        beam = [_improved(scene, rules, item) for item in beam]
+        if beam[0].criterion >= best.criterion - 1e-6:
+            break
+        best = min(beam, key=lambda item: item.criterion)
+    return prune(scene, rules, _improved(scene, rules, best))
+
+
+def _improved(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:
+    """Drop and swap members as long as that lowers the criterion."""
+    for _ in range(6):
+        better = chosen
+        for member in chosen.members:
+            rest = [g for g in chosen.members if g != member]
+            for trial in [evaluate(scene, rules, rest), *_best_additions(scene, rules, rest, 2)]:
+                if trial.criterion < better.criterion - 1e-6:
+                    better = trial
+        if better is chosen:
+            return chosen
+        chosen = better
+    return chosen
+
+
+def prune(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:
+    """Drop the least significant member as long as its corrected p-value is too large."""
+    from scipy.stats import f as f_distribution  # imported here: slow to load
+
+    trials = len({group.name for group in scene.groups})
+    members = list(chosen.members)
+    while members:
+        left = scene.total - beside(scene, members).chi2
+        freedom = scene.freedom - len(scene.coordinates(members))
+        worst, largest = -1, 0.0
+        for member in members:
+            if scene.groups[member].tier == "base":
+                continue
+            k = max(scene.size(member), 1)
+            gain = gain_of(scene, [g for g in members if g != member], member)
+            ratio = gain / k / max(left / max(freedom, 1), 1e-300)
+            p = float(f_distribution.sf(ratio, k, scene.count / 2)) * trials * scene.groups[member].scans
+            if p > largest:
+                worst, largest = member, p
+        if largest <= LARGEST_P:
+            break
+        members.remove(worst)
+    return chosen if len(members) == len(chosen.members) else evaluate(scene, rules, members)
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A name that explains the readings almost as well in place of a member, with its weight and correlation."""
+
+    name: str
+    weight: float
+    group: int
+
+
+#: Difference of the criterion within which a name belongs to the set of 99 %.
+WITHIN = 9.2
+
+
+def alternatives(scene: Scene, rules: Rules, chosen: Chosen, member: int) -> list[Alternative]:
+    """Names that could stand in place of a named member, itself first, with weights that add up to 1."""
+    rest = [g for g in chosen.members if g != member]
+    allowed = [g for g in _allowed(scene, rules, rest) if scene.groups[g].tier == "named"]
+    gained = gains(scene, beside(scene, rest), allowed)
+    rough = {g: penalty(scene, rules, g, 0.0) - gain for g, gain in zip(allowed, gained, strict=True)}
+    reference = rough.get(member, 0.0)
+    best: dict[str, int] = {}
+    for g in sorted(rough, key=lambda g: rough[g]):
+        if scene.groups[g].name not in best and rough[g] - reference < 3 * WITHIN:
+            best[scene.groups[g].name] = g
+    best[scene.groups[member].name] = member
+    values = {name: evaluate(scene, rules, [*rest, g]).criterion for name, g in best.items()}
+    least = min(values.values())
+    kept = {name: value for name, value in values.items() if value - least <= WITHIN}
+    weights = {name: float(np.exp(-0.5 * (value - least))) for name, value in kept.items()}
+    total = sum(weights.values())
+    found = [Alternative(name, weight / total, best[name]) for name, weight in weights.items()]
+    return sorted(found, key=lambda item: -item.weight)
