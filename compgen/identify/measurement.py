@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 
 from compgen.core.deviations import Deviations, holds_deviations, read_deviations
 from compgen.core.lengths import Lengths, read_lengths
@@ -32,6 +33,10 @@ class MixedMeasurement:
 Measurement = Lengths | Deviations | SixDofMeasurement | MixedMeasurement
 
 
+@overload
+def read_measurement(paths: Sequence[str | Path], instrument: None = None) -> Lengths | Deviations: ...
+@overload
+def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None) -> Measurement: ...
 def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement:
     """Read measurement files by their columns: ``*.lengths.csv``, ``*.deviations.csv``, ``*.sixdof.csv``.
 
