@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.core.names import AXES, MM_PER_UM
-from compgen.effects.base import Card, DisplacementEffect, Effect, Family, Parameter
+from compgen.effects.base import Card, DisplacementEffect, Parameter, along
 from compgen.effects.readings import Readings
 
 
@@ -22,7 +20,7 @@ class Backlash(DisplacementEffect):
             name=f"backlash_{letter}",
             title=f"Backlash of {letter}",
             equation=f"d_{letter} = c dir_{letter}",
-            source="ISO 230-2:2014, 3.14 (reversal value B = 2 c)",
+            source="ISO 230-2 (reversal value B = 2 c)",
             covariates=(f"approach_{letter.lower()}",),
             parameters=(Parameter("c_um", MM_PER_UM, "half the reversal value", 100.0),),
             aliases=(f"servo_lag_{letter}", f"lost_motion_{letter}"),
@@ -33,16 +31,4 @@ class Backlash(DisplacementEffect):
         """Unit displacement along the axis, signed by the last direction of travel."""
         if readings.approach is None or not np.any(readings.approach[:, self.axis]):
             return None
-        moved = np.zeros((len(readings), 3, 1))
-        moved[:, self.axis, 0] = readings.approach[:, self.axis]
-        return moved
-
-
-class BacklashFamily(Family):
-    """Backlash of X, Y and Z."""
-
-    name = "backlash"
-
-    def members(self, stations: Sequence[str]) -> Sequence[Effect]:
-        """One for each axis."""
-        return [Backlash(axis) for axis in range(3)]
+        return along(self.axis, readings.approach[:, self.axis])

@@ -1,19 +1,25 @@
 """What an effect of the catalogue is: an equation, what it depends on, its parameters, and what it may be confused with.
 
-An effect is linear in its parameters once its scan position (a time, a pitch) is chosen. It knows one thing: how much
-each reading changes per unit of each parameter.
+An effect is linear in its parameters once its settings (the time of a step, a pitch) are chosen. It knows one thing:
+how much each reading changes per unit of each parameter.
 """
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Self
 
 import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.effects.readings import Readings
+
+#: What stands for the name of a station where the catalogue is listed without a measurement.
+ANY_STATION = "<station>"
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,14 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Setting:
+    """A number that an effect is not linear in: the time of a step, a pitch, the temperature that counts as zero."""
+
+    name: str
+    meaning: str
+
+
+@dataclass(frozen=True)
 class Card:
     """What the catalogue says about an effect.
 
@@ -43,7 +57,10 @@ class Card:
     parameters : its free parameters.
     aliases : effects that data may confuse with it.
     breaker : the smallest further measurement that separates them.
-    kinds : the kinds of readings in which it can show.
+    kinds : the kinds of readings in which it can show; ``noise`` for what is found in the residuals alone.
+    settings : numbers that it is not linear in; a machine file may give them.
+    scan : the setting that the data are searched for, empty if there is none.
+    slow : whether it changes with time or temperature only slowly, so that drifting noise resembles it.
     """
 
     name: str
@@ -55,12 +72,16 @@ class Card:
     aliases: tuple[str, ...] = ()
     breaker: str = ""
     kinds: tuple[str, ...] = ("lengths", "deviations", "axis")
+    settings: tuple[Setting, ...] = ()
+    scan: str = ""
+    slow: bool = False
 
 
 class Effect(ABC):
-    """One effect of the catalogue."""
+    """One effect of the catalogue; ``settings`` holds those that are chosen."""
 
     card: Card
+    settings: Mapping[str, float] = MappingProxyType({})
 
     @abstractmethod
     def columns(self, readings: Readings) -> FloatArray | None:
@@ -70,9 +91,21 @@ class Effect(ABC):
         """Scan positions (e.g. times of a step) that the data leave open; empty if there is nothing to scan."""
         return ()
 
-    def at(self, position: float) -> Effect:
+    def at(self, position: float) -> Self:
         """Return the effect with its scan position fixed; only for effects with ``positions``."""
-        raise TypeError(f"{self.card.name} has no scan position")
+        if not self.card.scan:
+            raise TypeError(f"{self.card.name} has no scan position")
+        return self.with_settings({self.card.scan: position})
+
+    def with_settings(self, settings: Mapping[str, float]) -> Self:
+        """Return the effect with some of its settings chosen."""
+        chosen = copy.copy(self)
+        chosen.settings = MappingProxyType({**self.settings, **settings})
+        return chosen
+
+    def used(self, readings: Readings) -> dict[str, float]:
+        """Settings that hold for these readings, chosen or following from them: what a machine file has to keep."""
+        return dict(self.settings)
 
 
 class DisplacementEffect(Effect):
@@ -88,6 +121,14 @@ class DisplacementEffect(Effect):
         return None if moved is None else np.asarray(np.einsum("nd,ndk->nk", readings.direction, moved))
 
 
+def along(axis: int, columns: FloatArray) -> FloatArray:
+    """Displacement (n, 3, k) along one axis of ``columns`` (n,) or (n, k)."""
+    columns = columns.reshape(len(columns), -1)
+    moved = np.zeros((len(columns), 3, columns.shape[1]))
+    moved[:, axis] = columns
+    return moved
+
+
 class Family(ABC):
     """Effects of one equation: one for each axis, station or channel."""
 
@@ -96,3 +137,58 @@ class Family(ABC):
     @abstractmethod
     def members(self, stations: Sequence[str]) -> Sequence[Effect]:
         """Return the effects of this family; ``stations`` are the names of the stations of the measurement."""
+
+
+class Single(Family):
+    """A family of one; ``make`` returns it."""
+
+    def __init__(self, name: str, make: Callable[[], Effect]) -> None:
+        self.name, self._make = name, make
+
+    def members(self, stations: Sequence[str]) -> Sequence[Effect]:
+        """The one effect."""
+        return [self._make()]
+
+
+class PerAxis(Family):
+    """One effect for each axis; ``make`` takes its number 0, 1, 2."""
+
+    def __init__(self, name: str, make: Callable[[int], Effect]) -> None:
+        self.name, self._make = name, make
+
+    def members(self, stations: Sequence[str]) -> Sequence[Effect]:
+        """Those of X, Y and Z."""
+        return [self._make(axis) for axis in range(3)]
+
+
+class PerName(Family):
+    """One effect for each of some fixed names (of errors, of classes); ``make`` takes the name."""
+
+    def __init__(self, name: str, names: Sequence[str], make: Callable[[str], Effect]) -> None:
+        self.name, self._names, self._make = name, tuple(names), make
+
+    def members(self, stations: Sequence[str]) -> Sequence[Effect]:
+        """Those of the names, in their order."""
+        return [self._make(name) for name in self._names]
+
+
+class PerStation(Family):
+    """One effect for each station; ``make`` takes its name."""
+
+    def __init__(self, name: str, make: Callable[[str], Effect]) -> None:
+        self.name, self._make = name, make
+
+    def members(self, stations: Sequence[str]) -> Sequence[Effect]:
+        """Those of the stations."""
+        return [self._make(station) for station in stations]
+
+
+class AllStations(Family):
+    """One effect with a parameter for each station; ``make`` takes their names."""
+
+    def __init__(self, name: str, make: Callable[[tuple[str, ...]], Effect]) -> None:
+        self.name, self._make = name, make
+
+    def members(self, stations: Sequence[str]) -> Sequence[Effect]:
+        """The one effect; none without stations."""
+        return [self._make(tuple(stations))] if stations else []

@@ -59,12 +59,26 @@ class Readings:
         """Return the number of readings."""
         return len(self.direction)
 
-    def temperature_k(self, name: str) -> FloatArray | None:
-        """Temperature of channel ``temp_<name>_c`` less its mean, (n,); None if it was not logged or never changed."""
-        logged = self.covariates.get(f"temp_{name}_c")
-        if logged is None or np.ptp(logged) == 0.0:
+    def covariate(self, name: str) -> FloatArray | None:
+        """Return a covariate (n,); None if it was not logged for every reading."""
+        logged = self.covariates.get(name)
+        return None if logged is None or not np.isfinite(logged).all() else logged
+
+    def temperature_k(self, name: str, reference_c: float | None = None) -> FloatArray | None:
+        """Temperature of channel ``temp_<name>_c`` less ``reference_c``, (n,); default: less its mean.
+
+        None if it was not logged for every reading, or if it never changed and no reference is given.
+        """
+        logged = self.covariate(f"temp_{name}_c")
+        if logged is None or (reference_c is None and np.ptp(logged) == 0.0):
             return None
-        return np.asarray(logged - logged.mean())
+        return np.asarray(logged - (logged.mean() if reference_c is None else reference_c))
+
+    def is_from(self, name: str) -> NDArray[np.bool_]:
+        """Whether each reading was taken from station ``name``, (n,)."""
+        if name not in self.stations:
+            return np.zeros(len(self), dtype=np.bool_)
+        return np.asarray(self.station == self.stations.index(name))
 
     def normalised(self, axis: int) -> FloatArray:
         """Position of an axis over its travel, -1 ... +1, (n,)."""
