@@ -25,6 +25,8 @@ ALIKE = 0.25
 LARGEST_OFFSET_MM = 300.0
 #: A reduced depth that is off by more belongs to no such target, mm.
 LARGEST_DEPTH_MM = 60.0
+#: Share of its variance that may be noise for a drift monitor to be compared with.
+NOISY = 0.2
 #: Readings of a run below which no regression is made.
 LEAST = 8
 #: Curvature of Y_QD2 - Y_QD1 below which nothing is said, mm.
@@ -160,6 +162,9 @@ def _drift(readings: SixDof, instrument: Instrument, runs: Sequence[RelativeRun]
         return
     path = path_mm(instrument.optics, fixed, runs[0].distance_mm)
     for channel, name in ((0, "yaw"), (1, "pitch")):
+        noise = float(np.mean(np.diff(drift[:, :, channel], n=2, axis=1) ** 2)) / 6.0
+        if noise > NOISY * float(np.mean(_free(drift[:, :, channel]) ** 2)):
+            continue  # what the correction took over from a noisy monitor would be seen, not drift
         turn = np.array([run.turn_rad[:, ROTATIONS[axis][channel]] for run in runs])
         found = _regression(_free(drift[:, :, channel]), _free(turn))
         if found and abs(found["slope"]) > 0.1:
