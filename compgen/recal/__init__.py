@@ -1,0 +1,1 @@
+"""Scheduled recalibration: job file, store, approval, rollback (``docs/recal.md``)."""

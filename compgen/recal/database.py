@@ -1,0 +1,128 @@
+"""Connections to the store: SQLite by default, PostgreSQL by URL; old stores are upgraded as they are opened."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+from sqlalchemy import event
+
+from compgen.errors import CompgenError, InputError
+from compgen.recal.schema import HEAD
+
+Result = TypeVar("Result")
+
+#: Waits between attempts to reach the store, s.
+WAITS_S = (0.2, 0.5, 1.0, 2.0)
+#: How long a writer waits for another one on SQLite, s.
+BUSY_S = 60.0
+#: Key of the lock under which PostgreSQL stores are upgraded.
+UPGRADE_LOCK = 7305211
+
+
+class StoreError(CompgenError):
+    """The store cannot be reached, or is not one; nothing was changed."""
+
+
+def engine_of(url: str) -> sa.Engine:
+    """Return an engine for a URL or the path of an SQLite file; InputError for a kind that is not served."""
+    try:
+        parsed = sa.make_url(url if "://" in url else f"sqlite:///{url}")
+    except sa.exc.ArgumentError as error:
+        raise InputError(f"{url!r} is not the URL of a store; give sqlite:///FILE or postgresql://HOST/NAME") from error
+    kind = parsed.get_backend_name()
+    if kind == "postgresql":
+        return sa.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True, pool_size=2)
+    if kind != "sqlite" or not parsed.database or parsed.database == ":memory:":
+        raise InputError(f"{shown(url)} is not a store; give sqlite:///FILE or postgresql://HOST/NAME")
+    Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+    engine = sa.create_engine(parsed, connect_args={"timeout": BUSY_S}, poolclass=sa.pool.NullPool)
+    event.listen(engine, "connect", _configure_sqlite)
+    event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def shown(url: str) -> str:
+    """Return the URL without its password."""
+    try:
+        return sa.make_url(url).render_as_string(hide_password=True) if "://" in url else url
+    except sa.exc.ArgumentError:
+        return "the given URL"
+
+
+def _configure_sqlite(connection: Any, _record: object) -> None:
+    """Write-ahead log, full synchronisation, foreign keys; transactions are begun by :func:`_begin_sqlite`."""
+    connection.isolation_level = None
+    cursor = connection.cursor()
+    cursor.execute("PRAGMA journal_mode = WAL")
+    cursor.execute("PRAGMA synchronous = FULL")
+    cursor.execute("PRAGMA foreign_keys = ON")
+    cursor.close()
+
+
+def _begin_sqlite(connection: sa.Connection) -> None:
+    """Writers take the lock at once, so that none has to give up half way."""
+    reading = connection.get_execution_options().get("reading", False)
+    connection.exec_driver_sql("BEGIN" if reading else "BEGIN IMMEDIATE")
+
+
+def retried(action: Callable[[], Result], url: str, wait: Callable[[float], None] = time.sleep) -> Result:
+    """Do ``action`` again while the store cannot be reached, then raise StoreError."""
+    for pause in (*WAITS_S, None):
+        try:
+            return action()
+        except sa.exc.OperationalError as error:
+            if pause is None or not _may_pass(error):
+                raise StoreError(f"the store {shown(url)} cannot be used: {_first_line(error)}") from error
+            wait(pause)
+        except sa.exc.DatabaseError as error:
+            if isinstance(error, sa.exc.IntegrityError):
+                raise
+            raise StoreError(f"the store {shown(url)} cannot be used: {_first_line(error)}") from error
+    raise AssertionError("unreachable")
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(getattr(error, "orig", error)).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+def _may_pass(error: sa.exc.OperationalError) -> bool:
+    """Whether waiting may help: not for a wrong name, password or a full disk."""
+    text = str(error).lower()
+    lasting = ("authentication", "does not exist", "no such table", "no such column", "disk is full", "readonly")
+    return not any(word in text for word in lasting)
+
+
+def upgrade(engine: sa.Engine) -> None:
+    """Bring the schema to :data:`HEAD`; InputError for a store that a newer program made."""
+    with engine.connect().execution_options(reading=True) as connection:
+        if _revision(connection) == HEAD:
+            return
+    with engine.begin() as connection:
+        if connection.dialect.name == "postgresql":
+            connection.execute(sa.select(sa.func.pg_advisory_xact_lock(UPGRADE_LOCK)))
+        if _revision(connection) != HEAD:
+            _migrate(connection)
+
+
+def _revision(connection: sa.Connection) -> str | None:
+    if not sa.inspect(connection).has_table("alembic_version"):
+        return None
+    found = connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar()
+    if found is not None and str(found) > HEAD:
+        raise InputError(f"the store was written by a newer compgen (schema {found}, this one knows {HEAD}); update")
+    return None if found is None else str(found)
+
+
+def _migrate(connection: sa.Connection) -> None:
+    from alembic import command  # late: only a store that is new or old needs it
+    from alembic.config import Config
+
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).with_name("migrations")))
+    config.attributes["connection"] = connection
+    command.upgrade(config, "head")

@@ -1,0 +1,178 @@
+"""Approve, reject, roll back: each adds one decision with who, when and why; nothing else makes tables active.
+
+The files follow the store (:func:`compgen.recal.publish.publish`), so a decision counts once it stands in the store.
+"""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+
+from compgen.errors import InputError
+from compgen.recal import schema
+from compgen.recal.records import DecisionKind, DecisionRecord, MachineRecord, TableRecord
+from compgen.recal.states import OPEN, WAS_ACTIVE, active_id, before_active, state_of
+from compgen.recal.store import Store
+
+
+class DecisionError(InputError):
+    """The tables are in no state in which this can be decided."""
+
+
+def pending(store: Store, machine: MachineRecord | None = None) -> list[TableRecord]:
+    """Return the sets of tables that wait for a person: proposed ones, and those that the policy holds back."""
+    return [table for table in store.tables(machine) if table.state in OPEN]
+
+
+def active_table(store: Store, machine: MachineRecord) -> TableRecord | None:
+    """Return the set of tables that is active, None if none is."""
+    return next((table for table in store.tables(machine) if table.state == "active"), None)
+
+
+def approve(
+    store: Store, machine: MachineRecord, version: int, actor: str, reason: str = "", *, override: bool = False
+) -> DecisionRecord:
+    """Make a proposed version active.
+
+    Parameters
+    ----------
+    version : version of the machine's tables.
+    actor, reason : who, and why; both are kept.
+    override : also for tables that the policy holds back; then a reason is due. Files that the round trip did not
+        accept can never be approved.
+
+    Raises
+    ------
+    DecisionError
+        for an unknown version, one that is not open, one that is held back without ``override``.
+    """
+
+    def action(connection: sa.Connection) -> DecisionRecord:
+        decisions, table_id, accepted = _open(connection, machine, version)
+        state = state_of(table_id, decisions)
+        if not accepted:
+            raise DecisionError(
+                _place(machine, version) + " was not accepted by the round trip; it can not be approved"
+            )
+        if state == "held" and not override:
+            raise DecisionError(
+                _place(machine, version) + " is held back by the policy; override it with a reason, or reject it"
+            )
+        if state == "held" and not reason.strip():
+            raise DecisionError(
+                _place(machine, version) + " is held back by the policy; say the reason why it is right"
+            )
+        return add_decision(store, connection, machine, "approve", table_id, actor, reason)
+
+    return store.write(action)
+
+
+def reject(store: Store, machine: MachineRecord, version: int, actor: str, reason: str) -> DecisionRecord:
+    """Refuse a proposed version or one that is held back; DecisionError where it is not open or no reason is given."""
+
+    def action(connection: sa.Connection) -> DecisionRecord:
+        _, table_id, _ = _open(connection, machine, version)
+        if not reason.strip():
+            raise DecisionError("to reject tables a reason is due")
+        return add_decision(store, connection, machine, "reject", table_id, actor, reason)
+
+    return store.write(action)
+
+
+def rollback(store: Store, machine: MachineRecord, actor: str, reason: str, *, to: int | None = None) -> DecisionRecord:
+    """Make an earlier version active again.
+
+    Parameters
+    ----------
+    to : version that was active before; 0 for no tables at all; None for the one that was active before this one.
+
+    Raises
+    ------
+    DecisionError
+        where nothing is active, the version was never active, or no reason is given.
+    """
+
+    def action(connection: sa.Connection) -> DecisionRecord:
+        decisions = locked_decisions(connection, machine)
+        if not reason.strip():
+            raise DecisionError("to roll back a reason is due")
+        if active_id(decisions) is None and not to:
+            raise DecisionError(f"{machine.name}: no tables are active, so there is nothing to undo")
+        table_id = before_active(decisions) if to is None else _earlier(connection, machine, decisions, to)
+        return add_decision(store, connection, machine, "rollback", table_id, actor, reason)
+
+    return store.write(action)
+
+
+def _earlier(
+    connection: sa.Connection, machine: MachineRecord, decisions: list[DecisionRecord], version: int
+) -> int | None:
+    if version == 0:
+        return None
+    table_id, _ = _table_of(connection, machine, version)
+    state = state_of(table_id, decisions)
+    if state not in WAS_ACTIVE:
+        raise DecisionError(f"{_place(machine, version)} is {state}; only a version that was active can come back")
+    return table_id
+
+
+def locked_decisions(connection: sa.Connection, machine: MachineRecord) -> list[DecisionRecord]:
+    """Return the decisions of a machine and keep others from deciding until this transaction ends."""
+    connection.execute(sa.select(schema.machines.c.id).where(schema.machines.c.id == machine.id).with_for_update())
+    table = schema.decisions
+    query = sa.select(table).where(table.c.machine_id == machine.id).order_by(table.c.sequence)
+    return [DecisionRecord(*row) for row in connection.execute(query)]
+
+
+def add_decision(
+    store: Store,
+    connection: sa.Connection,
+    machine: MachineRecord,
+    kind: DecisionKind,
+    table_id: int | None,
+    actor: str,
+    reason: str,
+) -> DecisionRecord:
+    """Add one decision; its time is never before that of the one before it, whatever the clock says."""
+    if not actor.strip():
+        raise DecisionError("a decision needs the name of who makes it")
+    table = schema.decisions
+    own = table.c.machine_id == machine.id
+    last = connection.execute(sa.select(table).where(own).order_by(table.c.sequence.desc()).limit(1)).first()
+    now = store.now(connection)
+    row = {
+        "machine_id": machine.id,
+        "sequence": 1 if last is None else last.sequence + 1,
+        "table_id": table_id,
+        "kind": kind,
+        "actor": actor,
+        "reason": reason,
+        "at": now if last is None else max(now, last.at),
+    }
+    connection.execute(sa.insert(table).values(**row))
+    stored = sa.select(table).where(own, table.c.sequence == row["sequence"])
+    return DecisionRecord(*connection.execute(stored).one())
+
+
+def _open(connection: sa.Connection, machine: MachineRecord, version: int) -> tuple[list[DecisionRecord], int, bool]:
+    """Return decisions, id and acceptance of a version that is open, under the machine's lock."""
+    decisions = locked_decisions(connection, machine)
+    table_id, accepted = _table_of(connection, machine, version)
+    state = state_of(table_id, decisions)
+    if state not in (*OPEN, "refused"):
+        raise DecisionError(f"{_place(machine, version)} is {state}; only pending or held tables can be decided on")
+    return decisions, table_id, accepted
+
+
+def _table_of(connection: sa.Connection, machine: MachineRecord, version: int) -> tuple[int, bool]:
+    table = schema.tables
+    own = table.c.machine_id == machine.id
+    row = connection.execute(sa.select(table.c.id, table.c.accepted).where(own, table.c.version == version)).first()
+    if row is None:
+        known = connection.execute(sa.select(sa.func.max(table.c.version)).where(own)).scalar()
+        having = f"it has 1 to {known}" if known else "it has none"
+        raise DecisionError(f"{machine.name} has no tables of version {version}; {having}")
+    return int(row.id), bool(row.accepted)
+
+
+def _place(machine: MachineRecord, version: int) -> str:
+    return f"{machine.name}: version {version}"

@@ -1,0 +1,1 @@
+"""Alembic's scripts that bring an older store to the present schema."""

@@ -1,0 +1,171 @@
+"""What the store hands out: frozen records, times in UTC."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Literal
+
+#: State of a set of tables, from the last decision about it.
+TableState = Literal["pending", "held", "refused", "superseded", "rejected", "active", "retired"]
+DecisionKind = Literal["propose", "hold", "refuse", "supersede", "approve", "reject", "rollback"]
+
+
+@dataclass(frozen=True)
+class MachineRecord:
+    """A machine by the name that the job file gives it."""
+
+    id: int
+    name: str
+    at: datetime
+
+
+@dataclass(frozen=True)
+class MeasurementRecord:
+    """One measurement, known by the SHA-256 of its files.
+
+    ``measured_at`` comes from the file's comment ``measured_at`` (``measured_at_source`` = "file") or from the time of
+    the file itself ("file time"); ``active_table`` is the comment ``active_table``: a version or "none"; None if the
+    file says nothing. ``temperatures_c`` holds lowest, mean and highest value of each channel. ``files`` are name and
+    SHA-256.
+    """
+
+    id: int
+    machine_id: int
+    sha256: str
+    name: str
+    measured_at: datetime
+    measured_at_source: str
+    received_at: datetime
+    active_table: str | None
+    temperatures_c: Mapping[str, Mapping[str, float]]
+    files: Sequence[tuple[str, str]] = ()
+
+
+@dataclass(frozen=True)
+class AttemptRecord:
+    """One attempt to process a measurement: ``outcome`` "done" or "failed"; ``message`` says why."""
+
+    id: int
+    machine_id: int
+    measurement_id: int
+    outcome: str
+    message: str
+    settings_sha256: str
+    owner: str
+    seconds: float
+    at: datetime
+
+
+@dataclass(frozen=True)
+class IdentificationRecord:
+    """Errors of the bare machine from one measurement; contents through ``Store.errors_of`` and ``covariance_of``.
+
+    ``active_table_id`` is the set of tables that was active while the machine was measured and was taken out.
+    """
+
+    id: int
+    machine_id: int
+    measurement_id: int
+    machine_version_id: int
+    active_table_id: int | None
+    errors_sha256: str
+    covariance_sha256: str | None
+    fitted_sha256: str | None
+    summary: Mapping[str, Any]
+    program: str
+    at: datetime
+    measured_at: datetime
+
+
+@dataclass(frozen=True)
+class TableRecord:
+    """A set of tables of one machine; ``version`` counts from 1.
+
+    ``accepted`` says whether the round trip accepted the files, ``reasons`` why the policy holds them back,
+    ``summary`` holds the figures of the judgement, ``state`` what the last decision made of it.
+    """
+
+    id: int
+    machine_id: int
+    version: int
+    identification_id: int
+    accepted: bool
+    controllers: Sequence[str]
+    reasons: Sequence[str]
+    summary: Mapping[str, Any]
+    at: datetime
+    state: TableState
+
+
+@dataclass(frozen=True)
+class DecisionRecord:
+    """Who decided what, when and why; ``table_id`` is None where a rollback leaves no table active."""
+
+    id: int
+    machine_id: int
+    sequence: int
+    table_id: int | None
+    kind: DecisionKind
+    actor: str
+    reason: str
+    at: datetime
+
+
+@dataclass(frozen=True)
+class EventRecord:
+    """Something that happened beside decisions: an unreadable file, a clock that went backwards."""
+
+    id: int
+    machine_id: int | None
+    kind: str
+    subject: str
+    message: str
+    at: datetime
+
+
+@dataclass(frozen=True)
+class TableFile:
+    """One file of a set of tables: the control that it belongs to, its name and contents."""
+
+    controller: str
+    name: str
+    content: bytes
+
+
+@dataclass(frozen=True)
+class NewMeasurement:
+    """A measurement to be kept: contents by file name, and what is known about it, see :class:`MeasurementRecord`."""
+
+    sha256: str
+    name: str
+    measured_at: datetime
+    measured_at_source: str
+    contents: Mapping[str, bytes]
+    active_table: str | None = None
+    temperatures_c: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class NewResult:
+    """What processing a measurement gave, kept in one transaction.
+
+    ``hold`` lists why the policy holds the tables back; with ``approve`` they become active at once unless held or not
+    accepted.
+    """
+
+    machine_text: bytes
+    errors_text: bytes
+    covariance: bytes | None
+    fitted_text: bytes | None
+    summary: Mapping[str, Any]
+    program: str
+    active_table_id: int | None
+    files: Sequence[TableFile]
+    accepted: bool
+    hold: Sequence[str]
+    judgement: Mapping[str, Any]
+    approve: bool
+    settings_sha256: str
+    seconds: float

@@ -1,0 +1,332 @@
+"""The store: machines, measurements, identified errors, tables, decisions; nothing in it is ever changed.
+
+Open it with :func:`open_store`. Approval and rollback are in :mod:`compgen.recal.decisions`, leases in
+:mod:`compgen.recal.claims`, what processing adds in :mod:`compgen.recal.results`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+
+from compgen.core.error_table import ErrorTable, read_errors
+from compgen.core.files import sha256_of
+from compgen.core.machine import Machine, read_machine
+from compgen.errors import InputError
+from compgen.identify.covariance import Covariance, read_covariance
+from compgen.recal import schema
+from compgen.recal.database import StoreError, engine_of, retried, shown, upgrade
+from compgen.recal.records import (
+    AttemptRecord,
+    DecisionRecord,
+    EventRecord,
+    IdentificationRecord,
+    MachineRecord,
+    MeasurementRecord,
+    NewMeasurement,
+    TableFile,
+    TableRecord,
+)
+from compgen.recal.states import state_of
+
+Result = TypeVar("Result")
+Clock = Callable[[], datetime]
+
+
+class Store:
+    """A store that is open; every method is one transaction. ``clock`` is for tests."""
+
+    def __init__(self, engine: sa.Engine, url: str, clock: Clock | None = None) -> None:
+        self.engine, self.url, self._clock = engine, url, clock
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self.engine.dispose()
+
+    def now(self, connection: sa.Connection) -> datetime:
+        """Return the time by which leases count: that of the PostgreSQL server, or of this machine."""
+        if self._clock is not None:
+            return self._clock()
+        if connection.dialect.name == "postgresql":
+            found: datetime = connection.execute(sa.select(sa.func.clock_timestamp())).scalar_one()
+            return found.astimezone(UTC)
+        return datetime.now(UTC)
+
+    def read(self, action: Callable[[sa.Connection], Result]) -> Result:
+        """Do ``action`` in a transaction that only reads; again while the store cannot be reached."""
+
+        def once() -> Result:
+            with self.engine.connect().execution_options(reading=True) as connection:
+                return action(connection)
+
+        return retried(once, self.url)
+
+    def write(self, action: Callable[[sa.Connection], Result]) -> Result:
+        """Do ``action`` in a transaction, all of it or nothing; again while the store cannot be reached."""
+
+        def once() -> Result:
+            with self.engine.begin() as connection:
+                return action(connection)
+
+        return retried(once, self.url)
+
+    # --- machines ---------------------------------------------------------------------------------------------------
+
+    def add_machine(self, name: str) -> MachineRecord:
+        """Return the machine ``name``, which is added if it is not known."""
+        found = self.read(lambda connection: _machine_named(connection, name))
+        if found is not None:
+            return found
+        with suppress(sa.exc.IntegrityError):  # somebody else was faster
+            self.write(lambda c: c.execute(sa.insert(schema.machines).values(name=name, at=self.now(c))))
+        return self.machine(name)
+
+    def machine(self, name: str) -> MachineRecord:
+        """Return the machine ``name``; InputError if the store does not know it."""
+        found = self.read(lambda connection: _machine_named(connection, name))
+        if found is None:
+            raise InputError(f"the store knows no machine {name!r}; it is added by its first `compgen recal run`")
+        return found
+
+    def machines(self) -> list[MachineRecord]:
+        """Return all machines by name."""
+        query = sa.select(schema.machines).order_by(schema.machines.c.name)
+        return [MachineRecord(*row) for row in self._rows(query)]
+
+    def machine_of(self, identification: IdentificationRecord) -> Machine:
+        """Return the machine as its file described it when the errors were identified."""
+        table = schema.machine_versions
+        query = sa.select(table.c.sha256).where(table.c.id == identification.machine_version_id)
+        with tempfile.TemporaryDirectory(prefix="compgen-") as folder:
+            path = Path(folder) / "machine.toml"
+            path.write_bytes(self.blob(self.read(lambda c: c.execute(query).scalar_one())))
+            return replace(read_machine(path), source=None)
+
+    # --- measurements -----------------------------------------------------------------------------------------------
+
+    def add_measurement(self, machine: MachineRecord, new: NewMeasurement) -> MeasurementRecord:
+        """Keep a measurement with its contents and return it; the same contents are kept once."""
+        known = self.find_measurement(machine, new.sha256)
+        if known is not None:
+            return known
+        with suppress(sa.exc.IntegrityError):  # somebody else was faster
+            self.write(lambda c: _insert_measurement(c, machine.id, new, self.now(c)))
+        found = self.find_measurement(machine, new.sha256)
+        if found is None:
+            raise StoreError(f"measurement {new.name} cannot be kept in {shown(self.url)}")
+        return found
+
+    def find_measurement(self, machine: MachineRecord, sha256: str) -> MeasurementRecord | None:
+        """Return the machine's measurement with this hash, or None."""
+        return next(iter(self.measurements(machine, sha256=sha256)), None)
+
+    def measurements(
+        self, machine: MachineRecord | None = None, *, sha256: str | None = None
+    ) -> list[MeasurementRecord]:
+        """Return the measurements of a machine (or of all) in the order in which they were made."""
+        table = schema.measurements
+        query = sa.select(table).order_by(table.c.measured_at, table.c.id)
+        query = _where(query, table, machine)
+        if sha256 is not None:
+            query = query.where(table.c.sha256 == sha256)
+        files: dict[int, list[tuple[str, str]]] = {}
+        listed = schema.measurement_files
+        inner = sa.select(listed.c.measurement_id, listed.c.name, listed.c.sha256).order_by(listed.c.id)
+        if machine is not None:
+            inner = inner.join(table, table.c.id == listed.c.measurement_id).where(table.c.machine_id == machine.id)
+        for measurement_id, name, digest in self._rows(inner):
+            files.setdefault(measurement_id, []).append((name, digest))
+        return [MeasurementRecord(**row._mapping, files=tuple(files.get(row.id, ()))) for row in self._rows(query)]
+
+    def contents_of(self, measurement: MeasurementRecord) -> dict[str, bytes]:
+        """Return the contents of a measurement's files by name."""
+        return {name: self.blob(digest) for name, digest in measurement.files}
+
+    def attempts(self, machine: MachineRecord | None = None) -> list[AttemptRecord]:
+        """Return all attempts to process measurements, oldest first."""
+        query = sa.select(schema.attempts).order_by(schema.attempts.c.id)
+        return [AttemptRecord(*row) for row in self._rows(_where(query, schema.attempts, machine))]
+
+    # --- identified errors and tables -------------------------------------------------------------------------------
+
+    def identifications(self, machine: MachineRecord | None = None) -> list[IdentificationRecord]:
+        """Return the identified errors of a machine (or of all) in the order in which they were measured."""
+        table, measured = schema.identifications, schema.measurements
+        query = sa.select(table, measured.c.measured_at).join(measured, measured.c.id == table.c.measurement_id)
+        query = _where(query, table, machine).order_by(measured.c.measured_at, table.c.id)
+        return [_identification(row) for row in self._rows(query)]
+
+    def identification(self, identification_id: int) -> IdentificationRecord:
+        """Return the identified errors with this id."""
+        table, measured = schema.identifications, schema.measurements
+        query = sa.select(table, measured.c.measured_at).join(measured, measured.c.id == table.c.measurement_id)
+        rows = self._rows(query.where(table.c.id == identification_id))
+        if not rows:
+            raise InputError(f"the store holds no identification {identification_id}")
+        return _identification(rows[0])
+
+    def errors_of(self, identification: IdentificationRecord, *, fitted: bool = False) -> ErrorTable:
+        """Return the identified errors of the bare machine (or the fitted ones), mm and rad."""
+        digest = identification.fitted_sha256 if fitted else identification.errors_sha256
+        if digest is None:
+            raise InputError("this identification keeps no fitted errors")
+        with tempfile.TemporaryDirectory(prefix="compgen-") as folder:
+            path = Path(folder) / "identified.errors.csv"
+            path.write_bytes(self.blob(digest))
+            return read_errors(path)
+
+    def covariance_of(self, identification: IdentificationRecord) -> Covariance | None:
+        """Return the joint covariance of the identified errors, None if there is none."""
+        if identification.covariance_sha256 is None:
+            return None
+        with tempfile.TemporaryDirectory(prefix="compgen-") as folder:
+            path = Path(folder) / "identified.covariance.npz"
+            path.write_bytes(self.blob(identification.covariance_sha256))
+            return read_covariance(path)
+
+    def tables(self, machine: MachineRecord | None = None) -> list[TableRecord]:
+        """Return the sets of tables of a machine (or of all) by version, with their states."""
+        decided: dict[int, list[DecisionRecord]] = {}
+        for decision in self.decisions(machine):
+            decided.setdefault(decision.machine_id, []).append(decision)
+        table = schema.tables
+        query = _where(sa.select(table), table, machine).order_by(table.c.machine_id, table.c.version)
+        found = []
+        for row in self._rows(query):
+            state = state_of(row.id, decided.get(row.machine_id, []))
+            parts = (row.controllers, row.reasons, row.summary, row.at, state)
+            found.append(TableRecord(row.id, row.machine_id, row.version, row.identification_id, row.accepted, *parts))
+        return found
+
+    def table_files(self, table: TableRecord) -> list[TableFile]:
+        """Return the files of a set of tables, byte for byte."""
+        files = schema.table_files
+        query = sa.select(files.c.controller, files.c.name, files.c.sha256).where(files.c.table_id == table.id)
+        return [TableFile(row[0], row[1], self.blob(row[2])) for row in self._rows(query.order_by(files.c.id))]
+
+    def decisions(self, machine: MachineRecord | None = None) -> list[DecisionRecord]:
+        """Return all decisions in their order: who, what, when, why."""
+        table = schema.decisions
+        query = _where(sa.select(table), table, machine).order_by(table.c.machine_id, table.c.sequence)
+        return [DecisionRecord(*row) for row in self._rows(query)]
+
+    # --- events and contents ----------------------------------------------------------------------------------------
+
+    def add_event(self, kind: str, subject: str, message: str, machine: MachineRecord | None = None) -> bool:
+        """Keep an event unless the last one of this machine, kind and subject says the same; return whether it is new."""
+        table, machine_id = schema.events, None if machine is None else machine.id
+        same = sa.and_(
+            table.c.machine_id.is_not_distinct_from(machine_id), table.c.kind == kind, table.c.subject == subject
+        )
+        query = sa.select(table.c.message).where(same).order_by(table.c.id.desc()).limit(1)
+
+        def insert(connection: sa.Connection) -> bool:
+            if connection.execute(query).scalar() == message:
+                return False
+            row = {"machine_id": machine_id, "kind": kind, "subject": subject, "message": message}
+            connection.execute(sa.insert(table).values(**row, at=self.now(connection)))
+            return True
+
+        return False if self.read(lambda c: c.execute(query).scalar()) == message else self.write(insert)
+
+    def events(self, machine: MachineRecord | None = None) -> list[EventRecord]:
+        """Return the events of a machine (or all), oldest first."""
+        query = sa.select(schema.events).order_by(schema.events.c.id)
+        return [EventRecord(*row) for row in self._rows(_where(query, schema.events, machine))]
+
+    def blob(self, sha256: str) -> bytes:
+        """Return contents by their SHA-256; StoreError if they are damaged."""
+        query = sa.select(schema.blobs.c.deflated).where(schema.blobs.c.sha256 == sha256)
+        packed = self.read(lambda connection: connection.execute(query).scalar())
+        try:
+            content = zlib.decompress(packed or b"")
+        except zlib.error:
+            content = b""
+        if sha256_of(content) != sha256:
+            raise StoreError(f"the contents {sha256[:12]}... are missing or damaged in the store; restore a backup")
+        return content
+
+    def _rows(self, query: sa.Select[Any]) -> list[Any]:
+        return self.read(lambda connection: list(connection.execute(query).all()))
+
+
+def open_store(url: str, *, clock: Clock | None = None) -> Store:
+    """Open a store, make it if it does not exist, upgrade it if it is old.
+
+    Parameters
+    ----------
+    url : ``sqlite:///FILE``, a bare path, or ``postgresql://USER:PASSWORD@HOST/NAME``.
+    clock : for tests: the time, with its zone.
+
+    Raises
+    ------
+    InputError
+        for a URL that is none, or a store of a newer program.
+    StoreError
+        if it cannot be reached after some attempts.
+    """
+    engine = engine_of(url)
+    retried(lambda: upgrade(engine), url)
+    return Store(engine, url, clock)
+
+
+def put_blobs(connection: sa.Connection, contents: Iterable[bytes]) -> list[str]:
+    """Keep contents that are not there yet and return their SHA-256."""
+    digests = []
+    for content in contents:
+        digest = sha256_of(content)
+        known = connection.execute(sa.select(schema.blobs.c.size).where(schema.blobs.c.sha256 == digest)).first()
+        if known is None:
+            insert = _insert_once(connection)
+            row = {"sha256": digest, "size": len(content), "deflated": zlib.compress(content, 6)}
+            connection.execute(insert.values(**row).on_conflict_do_nothing())
+        digests.append(digest)
+    return digests
+
+
+def _insert_once(connection: sa.Connection) -> Any:
+    from sqlalchemy.dialects import postgresql, sqlite
+
+    kind = postgresql if connection.dialect.name == "postgresql" else sqlite
+    return kind.insert(schema.blobs)
+
+
+def _where(query: sa.Select[Any], table: sa.Table, machine: MachineRecord | None) -> sa.Select[Any]:
+    return query if machine is None else query.where(table.c.machine_id == machine.id)
+
+
+def _machine_named(connection: sa.Connection, name: str) -> MachineRecord | None:
+    row = connection.execute(sa.select(schema.machines).where(schema.machines.c.name == name)).first()
+    return None if row is None else MachineRecord(*row)
+
+
+def _identification(row: Any) -> IdentificationRecord:
+    return IdentificationRecord(**row._mapping)
+
+
+def _insert_measurement(connection: sa.Connection, machine_id: int, new: NewMeasurement, now: datetime) -> None:
+    values: Mapping[str, Any] = {
+        "machine_id": machine_id,
+        "sha256": new.sha256,
+        "name": new.name,
+        "measured_at": new.measured_at,
+        "measured_at_source": new.measured_at_source,
+        "received_at": now,
+        "active_table": new.active_table,
+        "temperatures_c": {name: dict(figures) for name, figures in new.temperatures_c.items()},
+    }
+    key = connection.execute(sa.insert(schema.measurements).values(**values)).inserted_primary_key
+    digests = put_blobs(connection, new.contents.values())
+    rows = [
+        {"measurement_id": key[0] if key else None, "name": name, "sha256": digest}
+        for name, digest in zip(new.contents, digests, strict=True)
+    ]
+    connection.execute(sa.insert(schema.measurement_files), rows)
