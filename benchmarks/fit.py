@@ -28,6 +28,7 @@ from compgen.fit.bounds import Bounds
 from compgen.fit.smooth import second_difference
 from compgen.fit.solve import solve_curves
 from compgen.fit.stacked import CurveProblem, Stack
+from compgen.model.evaluate import load_kernels
 
 OURS, OSQP, CVXPY = "compgen", "OSQP cold", "cvxpy+Clarabel"
 CURVES = 18
@@ -165,6 +166,7 @@ def main() -> None:
     parser.add_argument("--slow", action="store_true", help="also the peers that need many seconds for a case")
     arguments = parser.parse_args()
     print(timing.machine_line(("numpy", "scipy", "osqp", "clarabel", "cvxpy")))
+    print("  compiled loops loaded beforehand, as after an identification:", load_kernels())
     for active in (False, True):
         for n in arguments.nodes:
             compare(n, arguments.runs, active=active, slow=arguments.slow or n <= 101)

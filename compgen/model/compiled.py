@@ -53,7 +53,7 @@ def _settings() -> Iterator[None]:
         numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR = before
 
 
-def _compiled(function: Function, signature: object) -> Function:
+def compile_for(function: Function, signature: object) -> Function:
     """Compile for one signature; without the cache where no folder can be written."""
     options = {"error_model": "numpy", "fastmath": {"contract"}}
     with _settings():
@@ -171,7 +171,7 @@ def field_kernel(
             total = at_point(axes, position, tool, end)
             out[end, 0], out[end, 1], out[end, 2] = total[0], total[1], total[2]
 
-    return _compiled(kernel, types.void(_AXES, _POINTS, _POINTS, _RESULT))
+    return compile_for(kernel, types.void(_AXES, _POINTS, _POINTS, _RESULT))
 
 
 @_inline
@@ -243,7 +243,7 @@ def grid_kernel(tilted: bool) -> Callable[..., None]:
 
     levels = types.Array(types.float64, 1, "C", readonly=True)
     values = types.Array(types.float64, 3, "C", readonly=True)
-    return _compiled(kernel, types.void(levels, levels, levels, values, values, values, types.float64[:, :, :, ::1]))
+    return compile_for(kernel, types.void(levels, levels, levels, values, values, values, types.float64[:, :, :, ::1]))
 
 
 @_inline
@@ -300,4 +300,4 @@ def _exact(axes: Any, even: Any, order: Any, tool_side: Any, tilt: Any, position
 def exact_kernel() -> Callable[..., None]:
     """Kernel ``(axes, even, order, tool_side, tilt, position, tool, out)`` of the exact model."""
     arguments = (_AXES, types.boolean[::1], types.int64[::1], types.boolean[::1], _RESULT, _POINTS, _POINTS, _RESULT)
-    return _compiled(_exact, types.void(*arguments))
+    return compile_for(_exact, types.void(*arguments))
