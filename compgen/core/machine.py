@@ -76,7 +76,8 @@ class Machine:
 
     ``errors`` is ``"observable"``, 17, 21 or a tuple of names (resolved by :func:`compgen.model.modelled_errors`).
     ``controllers`` keeps the raw settings of each control; the control itself checks them. ``emphasis`` says where
-    tables have to be best that cannot be good everywhere.
+    tables have to be best that cannot be good everywhere. ``effects`` keeps the raw ``[effects.NAME]`` sections, which
+    :func:`compgen.effects.active_effects` reads.
     """
 
     name: str
@@ -90,6 +91,7 @@ class Machine:
     controllers: Mapping[str, tomlio.Section] = field(default_factory=dict)
     source: Path | None = None
     emphasis: Emphasis = Emphasis()
+    effects: Mapping[str, tomlio.Section] = field(default_factory=dict)
 
     @property
     def lower_mm(self) -> FloatArray:
@@ -130,6 +132,8 @@ def read_machine(path: str | Path) -> Machine:
     axes_section.finish()
     controllers_section = root.section("controllers", required=False)
     controllers = {key: controllers_section.section(key) for key in controllers_section.data}
+    effects_section = root.section("effects", required=False)
+    effects = {key: effects_section.section(key) for key in effects_section.data}
     for axis_name, axis, reference_mm in zip(AXES, axes, reference_point_mm, strict=True):
         low, high = axis.range_mm
         if not low <= reference_mm <= high:
@@ -152,6 +156,7 @@ def read_machine(path: str | Path) -> Machine:
         controllers=controllers,
         source=Path(path),
         emphasis=emphasis,
+        effects=effects,
     )
 
 

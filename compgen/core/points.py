@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,9 @@ import numpy as np
 from compgen.core.csvio import FloatArray, format_csv, read_csv
 from compgen.core.lengths import APPROACH_COLUMNS, POSITION_COLUMNS, TOOL_COLUMNS
 from compgen.errors import InputError
+
+#: Columns that effects of a machine may depend on, beside ``temp_<name>_c``.
+COVARIATES = ("time_s", "feed_mm_min", "load_kg", "setup")
 
 
 @dataclass(frozen=True)
@@ -22,11 +25,13 @@ class Points:
     position_mm : shape (n, 3).
     tool_mm : tool offset at each point, shape (n, 3), or None for the machine's own.
     approach : last direction of travel of each axis (+1, -1, 0 unknown), shape (n, 3), or None.
+    covariates : further numbers by column name (time_s, feed_mm_min, load_kg, setup, temp_<name>_c), each (n,).
     """
 
     position_mm: FloatArray
     tool_mm: FloatArray | None = None
     approach: FloatArray | None = None
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -35,7 +40,12 @@ class Points:
 
 def read_points(path: str | Path) -> Points:
     """Read a ``*.points.csv`` file; tool and approach columns are optional, but each complete."""
-    table = read_csv(path, required=POSITION_COLUMNS, optional=(*TOOL_COLUMNS, *APPROACH_COLUMNS))
+    table = read_csv(
+        path,
+        required=POSITION_COLUMNS,
+        optional=(*TOOL_COLUMNS, *APPROACH_COLUMNS, *COVARIATES),
+        prefixes=("temp_*_c",),
+    )
     groups: list[FloatArray | None] = []
     for names in (TOOL_COLUMNS, APPROACH_COLUMNS):
         present = [name for name in names if name in table.columns]
@@ -44,7 +54,8 @@ def read_points(path: str | Path) -> Points:
         read = table.signs if names is APPROACH_COLUMNS else table.numbers
         groups.append(np.column_stack([read(name) for name in names]) if present else None)
     position_mm = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
-    return Points(position_mm, tool_mm=groups[0], approach=groups[1])
+    further = [name for name in table.columns if name in COVARIATES or name.startswith("temp_")]
+    return Points(position_mm, groups[0], groups[1], {name: table.numbers(name) for name in further})
 
 
 def format_points(
@@ -56,4 +67,4 @@ def format_points(
         columns |= dict(zip(TOOL_COLUMNS, points.tool_mm.T, strict=True))
     if points.approach is not None:
         columns |= dict(zip(APPROACH_COLUMNS, points.approach.T, strict=True))
-    return format_csv({**columns, **results}, metadata)
+    return format_csv({**columns, **points.covariates, **results}, metadata)

@@ -16,11 +16,14 @@ from compgen.effects.base import (
     along,
 )
 from compgen.effects.catalogue import FAMILIES, catalogue, listed
-from compgen.effects.readings import Readings, readings_of_deviations, readings_of_lengths
+from compgen.effects.of_machine import ActiveEffect, active_effects, displacement_of, section_text
+from compgen.effects.readings import Readings, readings_of_deviations, readings_of_lengths, readings_of_points
+from compgen.effects.reversal import advice_of_effects, effects_reversal, with_effects_reversal
 
 __all__ = [
     "ANY_STATION",
     "FAMILIES",
+    "ActiveEffect",
     "AllStations",
     "Card",
     "DisplacementEffect",
@@ -33,9 +36,16 @@ __all__ = [
     "Readings",
     "Setting",
     "Single",
+    "active_effects",
+    "advice_of_effects",
     "along",
     "catalogue",
+    "displacement_of",
+    "effects_reversal",
     "listed",
     "readings_of_deviations",
     "readings_of_lengths",
+    "readings_of_points",
+    "section_text",
+    "with_effects_reversal",
 ]

@@ -37,10 +37,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Setting:
-    """A number that an effect is not linear in: the time of a step, a pitch, the temperature that counts as zero."""
+    """A number that an effect is not linear in: the time of a step, a pitch, the temperature that counts as zero.
+
+    ``needed`` says that nothing takes its place where it is not given.
+    """
 
     name: str
     meaning: str
+    needed: bool = False
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ class LengthStep(Effect):
             aliases=("slowly varying noise", "machine_jump"),
             breaker="repeat the first point of every line at its end",
             kinds=("lengths",),
-            settings=(Setting("time_s", "time of the step"),),
+            settings=(Setting("time_s", "time of the step", needed=True),),
             scan="time_s",
             slow=True,
         )

@@ -26,7 +26,7 @@ class MachineJump(DisplacementEffect):
             parameters=tuple(Parameter(f"c{a.lower()}_um", MM_PER_UM, f"jump along {a}", 1000.0) for a in AXES),
             aliases=("tool_offset_error", "length_step"),
             breaker="return to the first set-up, and to one reference point from time to time",
-            settings=(Setting("time_s", "time of the jump"),),
+            settings=(Setting("time_s", "time of the jump", needed=True),),
             scan="time_s",
             slow=True,
         )

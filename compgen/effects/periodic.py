@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from compgen.core.csvio import FloatArray
+from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.effects.base import Card, DisplacementEffect, Parameter, Setting, along
 from compgen.effects.readings import Readings
@@ -36,23 +37,24 @@ class Periodic(DisplacementEffect):
             scan="pitch_mm",
         )
 
-    def _pitch_mm(self, readings: Readings) -> float | None:
-        return self.settings.get("pitch_mm", readings.machine.axes[self.axis].screw_pitch_mm)
+    def pitch_mm(self, machine: Machine) -> float | None:
+        """Pitch in mm: the setting, else that of the machine file; None if neither is known."""
+        return self.settings.get("pitch_mm", machine.axes[self.axis].screw_pitch_mm)
 
     def positions(self, readings: Readings) -> Sequence[float]:
         """Usual leads, where neither a setting nor the machine file gives the pitch."""
-        if self._pitch_mm(readings) is not None:
+        if self.pitch_mm(readings.machine) is not None:
             return ()
         return [lead for lead in LEADS_MM if lead < readings.machine.axes[self.axis].length_mm / 6.0]
 
     def used(self, readings: Readings) -> dict[str, float]:
         """The pitch."""
-        pitch_mm = self._pitch_mm(readings)
+        pitch_mm = self.pitch_mm(readings.machine)
         return {} if pitch_mm is None else {"pitch_mm": pitch_mm}
 
     def displacement(self, readings: Readings) -> FloatArray | None:
         """Sine and cosine of the angle of the screw and of twice that angle."""
-        pitch_mm = self._pitch_mm(readings)
+        pitch_mm = self.pitch_mm(readings.machine)
         if pitch_mm is None:
             return None
         angle = 2.0 * np.pi * readings.position_mm[:, self.axis] / pitch_mm

@@ -18,6 +18,7 @@ from compgen.core.deviations import Deviations
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
+from compgen.core.points import Points
 from compgen.model.volumetric import tool_of
 
 Kind = Literal["lengths", "deviations", "axis"]
@@ -123,4 +124,23 @@ def readings_of_deviations(machine: Machine, deviations: Deviations) -> Readings
         approach=None if deviations.approach is None else deviations.approach[row],
         covariates={name: values[row] for name, values in deviations.covariates.items()},
         labels={name: values[row] for name, values in deviations.labels.items()},
+    )
+
+
+def readings_of_points(machine: Machine, points: Points) -> Readings:
+    """Return commanded points as readings, one each, for effects that move the tip; their direction is Z."""
+    count = len(points)
+    setup = points.covariates.get("setup")
+    return Readings(
+        machine=machine,
+        kind="deviations",
+        position_mm=points.position_mm,
+        direction=np.broadcast_to([0.0, 0.0, 1.0], (count, 3)),
+        tool_mm=np.broadcast_to(tool_of(machine, points.tool_mm), (count, 3)),
+        stations=(),
+        station=np.zeros(count, dtype=np.int64),
+        range_mm=np.zeros(count),
+        approach=points.approach,
+        covariates={name: values for name, values in points.covariates.items() if name != "setup"},
+        labels={} if setup is None else {"setup": setup.astype(np.int64)},
     )

@@ -38,7 +38,7 @@ class ToolOffsetError(DisplacementEffect):
             aliases=("machine_jump", "laser_scale", "lever_ECX", "lever_EAZ", "lever_EBZ", "lever_ECZ"),
             breaker="measure with a third tool offset, and return to the first",
             kinds=("lengths", "deviations"),
-            settings=(Setting("setup", "label of the set-up"),),
+            settings=(Setting("setup", "label of the set-up", needed=True),),
             scan="setup",
         )
 

@@ -30,7 +30,7 @@ class WarmupDrift(Effect):
             breaker="a stationary test: the same target again and again with the axis at rest, and then with the sensor warm",
             kinds=("axis",),
             settings=(
-                Setting("tau", "time constant in s; in readings where no time was logged"),
+                Setting("tau", "time constant in s; in readings where no time was logged", needed=True),
                 Setting("start", "time (or number of the reading) at which the drift begins; default: the first"),
             ),
             scan="tau",
