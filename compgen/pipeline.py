@@ -32,12 +32,14 @@ from compgen.identify import (
     identify_measurement,
     read_measurement,
 )
+from compgen.identify.evidence import evidence_files
 from compgen.identify.measurement import Measurement
 from compgen.identify.monte_carlo import SelfCheck
 from compgen.identify.reversal import SIGNIFICANT
 from compgen.verify import Verification, read_tables, verify
 from compgen.verify.active import ActiveTables, without_active
 from compgen.verify.check_program import check_files
+from compgen.verify.evidence import verification_files
 from compgen.verify.safety import SafetyLimits
 
 Progress = Callable[[str], None]
@@ -232,7 +234,7 @@ def _write_result(
 ) -> ControllerResult:
     prefix = "" if verification.accepted else REJECTED_PREFIX
     verification = replace(verification, files=tuple((prefix + name, digest) for name, digest in verification.files))
-    result = {**beside, "result.json": json.dumps(verification.summary(), indent=2) + "\n"}
+    result = {**beside, **verification_files(verification)}
     paths = exported.write(folder, accepted=verification.accepted, beside=result)
     return ControllerResult(exported, verification, tuple(paths))
 
@@ -314,6 +316,7 @@ def run(
         verification = replace(verification, reasons=reasons)
         beside = check_files(machine, exported, identification.errors, templates, reversal)
         checked[name] = exported, verification, beside
-    write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted)})
+    evidence = evidence_files(machine, measurement, identification)
+    write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted), **evidence})
     results = [_write_result(*checked[name], target) for name, target in targets.items()]
     return RunResult(identification, fitted, tuple(results))

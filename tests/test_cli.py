@@ -115,12 +115,15 @@ def test_run_writes_everything_and_exits_with_0(call, small_machine_file, small_
         "identified.covariance.npz",
         "identified.errors.csv",
         "identify.json",
+        "machine.toml",
         "manifest.json",
         "preflight.md",
+        "residuals.csv",
         "result.json",
         "stations.csv",
         "volcomp0.csv",
         "volcomp0.lis",
+        "volume.csv",
     ]
     result = strict_json((out / "result.json").read_text())
     assert result["accepted"] is True

@@ -71,6 +71,8 @@ def test_identify_writes_errors_covariance_and_report(tmp_path, capsys):
         "identified.covariance.npz",
         "identified.errors.csv",
         "identify.json",
+        "machine.toml",
+        "residuals.csv",
     ]
     errors = read_errors(tmp_path / "identified.errors.csv")
     assert len(errors.names) == 21

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
@@ -34,6 +33,7 @@ from compgen.report.text import verification_table
 from compgen.verify import read_tables, residuals, verify
 from compgen.verify.active import ActiveTables, bare_errors
 from compgen.verify.check_program import check_files
+from compgen.verify.evidence import verification_files
 from compgen.verify.explain import explain as explained
 from compgen.verify.safety import SafetyLimits
 
@@ -181,7 +181,7 @@ def verify_command(
 ) -> int:
     """Verify controller files against the errors of the machine: the exact model before, and after the tables act.
 
-    Writes result.json to DIR. Exit code 1 if the tables are not acceptable, with the reasons.
+    Writes result.json and volume.csv to DIR. Exit code 1 if the tables are not acceptable, with the reasons.
 
     \b
     Example:
@@ -192,7 +192,7 @@ def verify_command(
     both = read_reversal(reversal) if reversal else None
     parsed, table = read_tables(machine, tables, controller), read_error_file(errors)
     result = verify(machine, parsed, table, where, reversal=both, limits=limits)
-    write_all(out, {"result.json": json.dumps(result.summary(), indent=2) + "\n"})
+    write_all(out, verification_files(result))
     if as_json:
         print_json(result.summary())
     else:

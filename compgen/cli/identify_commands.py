@@ -25,6 +25,7 @@ from compgen.identify import (
     read_measurement,
     read_stations,
 )
+from compgen.identify.evidence import evidence_files
 from compgen.identify.monte_carlo import self_check
 from compgen.identify.noise import METHODS
 from compgen.pipeline import failure_reported, fit_files, identification_files, identify_bare, provenance_of, write_all
@@ -188,7 +189,8 @@ def identify_command(
                 replicates,
                 progress=lambda k: show(f"self-check: {k} of {replicates} replicates"),
             )
-    write_all(out, identification_files(result, provenance_of(machine.source, *measurements, instrument), checked))
+    files = identification_files(result, provenance_of(machine.source, *measurements, instrument), checked)
+    write_all(out, {**files, **evidence_files(machine, measurement, result)})
     if as_json:
         print_json({**result.summary(), **({"monte_carlo": checked.summary()} if checked else {})})
     else:
