@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from compgen.core.error_table import ErrorTable
+from compgen.core.lines import fitted_line
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM, error_named
 from compgen.errors import InputError
 from compgen.sixdof.evaluation import Evaluation, evaluate
 from compgen.sixdof.frames import AxisRun
 from compgen.sixdof.instrument import RAD_PER_ARCSEC, Instrument
-from compgen.sixdof.lines import fitted_line
 from compgen.sixdof.optics import ERRORS_OF_AXIS
 
 #: Rows of the tables: title, unit, and how much of it 1 mm or 1 rad is; in the order of ROLES.

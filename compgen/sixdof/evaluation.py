@@ -9,11 +9,11 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.lines import fitted_line
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.sixdof.frames import AxisRun, along, turned_by, zeroed
 from compgen.sixdof.instrument import Instrument
-from compgen.sixdof.lines import fitted_line
 
 #: (S_xy, S_xz, S_yz): for each the two straightnesses, as (component, moving axis), whose slopes add up to it.
 SLOPES = (((1, 0), (0, 1)), ((2, 0), (0, 2)), ((2, 1), (1, 2)))
