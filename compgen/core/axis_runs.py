@@ -51,7 +51,7 @@ class AxisRuns:
     @property
     def axes(self) -> tuple[int, ...]:
         """Axes that were measured, ascending."""
-        return tuple(np.unique(self.axis).tolist())
+        return tuple(int(axis) for axis in np.unique(self.axis))
 
 
 def holds_axis_runs(path: str | Path) -> bool:

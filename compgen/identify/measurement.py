@@ -1,4 +1,4 @@
-"""One door for all kinds of measurement: tracer lengths, measured positions and six-DOF readings, told by their columns."""
+"""One door for all kinds of measurement, told by their columns: lengths, positions, axis runs, six-DOF readings."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
 
+from compgen.core.axis_runs import AxisRuns, holds_axis_runs, read_axis_runs
 from compgen.core.deviations import Deviations, holds_deviations, read_deviations
 from compgen.core.lengths import Lengths, read_lengths
 from compgen.core.machine import Machine
+from compgen.core.names import AXES
 from compgen.errors import InputError
+from compgen.identify.axis_runs import identify_axis_runs
 from compgen.identify.deviations import identify_deviations
 from compgen.identify.identify import identify
 from compgen.identify.merging import merge
@@ -30,19 +33,19 @@ class MixedMeasurement:
     sixdof: SixDofMeasurement
 
 
-Measurement = Lengths | Deviations | SixDofMeasurement | MixedMeasurement
+Measurement = Lengths | Deviations | AxisRuns | SixDofMeasurement | MixedMeasurement
 
 
 @overload
-def read_measurement(paths: Sequence[str | Path], instrument: None = None) -> Lengths | Deviations: ...
+def read_measurement(paths: Sequence[str | Path], instrument: None = None) -> Lengths | Deviations | AxisRuns: ...
 @overload
 def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None) -> Measurement: ...
 def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement:
-    """Read measurement files by their columns: ``*.lengths.csv``, ``*.deviations.csv``, ``*.sixdof.csv``.
+    """Read measurement files by their columns: ``*.lengths.csv``, ``*.deviations.csv``, ``*.axis.csv``, ``*.sixdof.csv``.
 
     Parameters
     ----------
-    paths : files; six-DOF readings may stand beside one of the other kinds.
+    paths : files; six-DOF readings may stand beside lengths or deviations.
     instrument : the instrument TOML of the six-DOF readings.
 
     Raises
@@ -63,10 +66,22 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
     if not posed:
         return _read_others(others)
     sixdof = SixDofMeasurement(read_sixdof(posed), read_instrument(str(instrument)))
-    return MixedMeasurement(_read_others(others), sixdof) if others else sixdof
+    return MixedMeasurement(_beside(_read_others(others), others[0]), sixdof) if others else sixdof
 
 
-def _read_others(paths: Sequence[str | Path]) -> Lengths | Deviations:
+def _beside(other: Lengths | Deviations | AxisRuns, path: str | Path) -> Lengths | Deviations:
+    if isinstance(other, AxisRuns):
+        raise InputError("holds axis runs, and another file six-DOF readings; take one of them", file=path)
+    return other
+
+
+def _read_others(paths: Sequence[str | Path]) -> Lengths | Deviations | AxisRuns:
+    along = [holds_axis_runs(path) for path in paths]
+    if any(along) and not all(along):
+        message = "holds no axis runs, and another file does; identify them one after the other"
+        raise InputError(message, file=paths[along.index(False)])
+    if any(along):
+        return read_axis_runs(paths)
     kinds = [holds_deviations(path) for path in paths]
     if any(kinds) and not all(kinds):
         message = "holds tracer lengths, and another file deviations; identify them one after the other"
@@ -82,6 +97,8 @@ def describe(measurement: Measurement) -> str:
         return f"{len(measurement)} six-DOF readings in {len(measurement.readings.runs())} runs"
     if isinstance(measurement, Deviations):
         return f"{len(measurement)} measured positions"
+    if isinstance(measurement, AxisRuns):
+        return f"{len(measurement)} readings along {', '.join(AXES[axis] for axis in measurement.axes)}"
     return f"{len(measurement)} lengths of {len(measurement.stations)} stations"
 
 
@@ -107,6 +124,13 @@ def identify_measurement(
                 "whose uncertainties stand in the instrument file ([noise], [u_constants], [u_systematics])"
             )
         return identify_sixdof(machine, measurement)
+    if isinstance(measurement, AxisRuns):
+        if other or chosen.u_deviation_um is not None:
+            raise InputError(
+                "--method, --stations, --u-... belong to other kinds of measurement; the files hold axis runs, whose "
+                "uncertainty is that of their scatter"
+            )
+        return identify_axis_runs(machine, measurement)
     if other:
         raise InputError(
             "--method, --stations, --u-length-... and the systematic inputs belong to tracer lengths; the files hold "

@@ -60,14 +60,15 @@ class Identification:
     segments : beam breaks: runs of readings with a dead length of their own, or rejected together.
     reversal : mean difference between the directions of approach; None if no stop was approached from both sides.
     residual_tests : makes the tests behind ``whiteness``.
-    corrections : what was taken out of the readings (temperature of the scales, wavelength).
+    corrections : what was taken out of the readings (temperature of the scales, wavelength, effects of the machine file).
     rank, unknowns, condition, iterations : of the least-squares problem.
     worst_u : largest standard uncertainty by unit ("um", "urad") with its error.
     layout : the unknown errors and their bases.
     adjustment : the optimum with its factor, for the joint covariance and for systematic inputs; None if there is none.
     systematic : what systematic inputs contribute, and is part of the standard uncertainties then; None if none is.
     method : "joint", "two-step", "sixdof" for readings of the six-DOF instrument (the residuals are translations about
-        the mean of their position), "merged" for those and others, or "deviations" where measured positions were given
+        the mean of their position), "merged" for those and others, "axis-runs" for
+        runs along single axes, or "deviations" where measured positions were given
         in place of lengths; then the residuals are those of the components dx, dy, dz, and ``u_length_um`` is their
         standard uncertainty.
     steps : figures of the single steps of the two-step method.
@@ -161,7 +162,8 @@ class Identification:
             "segments": [item.summary() for item in self.segments],
             "reversal": None if self.reversal is None else self.reversal.summary(),
             "whiteness": None if self.whiteness is None else self.whiteness.summary(),
-            "corrections": dict(self.corrections),
+            "corrections": {key: value for key, value in self.corrections.items() if key != "effects"},
+            "effects": dict(self.corrections.get("effects", {})),
             "worst_standard_uncertainty": {
                 unit: {"value": value, "error": name} for unit, (value, name) in self.worst_u.items()
             },
@@ -177,7 +179,7 @@ class Identification:
 
     def _u_of_the_readings(self) -> dict[str, Any]:
         known = {"source": self.u_source, "constant_um": self.u_length_um}
-        if self.method in ("deviations", "sixdof"):
+        if self.method in ("deviations", "sixdof", "axis-runs"):
             return {"u_deviation": {**known, "scaled_by": self.u_scale}}
         proportional = {"proportional_um_per_m": self.u_length_um_per_m, "scaled_by": self.u_scale}
         return {"u_length": {**known, **proportional}}

@@ -24,6 +24,8 @@ def identification_table(result: Identification) -> Group:
     """Return the summary of an identification."""
     if result.method == "sixdof":
         return Group(*_sixdof_lines(result), _errors_table(result))
+    if result.method == "axis-runs":
+        return Group(Text("\n".join(_axis_lines(result))), _errors_table(result))
     lengths = result.method != "deviations"
     used = f"{int(result.accepted.sum())} of {len(result.accepted)} "
     used += (
@@ -48,6 +50,15 @@ def identification_table(result: Identification) -> Group:
         worst = max(result.details["en"].items(), key=lambda item: item[1])
         lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")
     return Group(Text("\n".join(lines)), _errors_table(result))
+
+
+def _axis_lines(result: Identification) -> list[str]:
+    """What was measured along each axis, and how it repeats."""
+    lines = [
+        f"{name}: {item['targets']} targets from {item['from_mm']:g} to {item['to_mm']:g} mm, {item['runs']} runs"
+        for name, item in result.details["axes"].items()
+    ]
+    return [*lines, f"scatter within targets and directions {result.rms_um:.3f} um rms, method {result.method}"]
 
 
 def _sixdof_lines(result: Identification) -> list[Text]:
