@@ -21,6 +21,7 @@ from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.core.reversal import WORTH_MM, ReversalCurves, format_reversal
+from compgen.effects import with_effects_reversal
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.export import REJECTED_PREFIX, Export, Provenance, export, usable_format
 from compgen.fit import FitOptions, FitResult, fit
@@ -124,6 +125,14 @@ def identification_files(
 
 def identified_reversal(result: Identification) -> ReversalCurves | None:
     """Return the reversals that are far beyond their uncertainty and worth a table; None if there is none.
+
+    Backlash of the machine file that was taken out of the readings is part of them.
+    """
+    return with_effects_reversal(result.layout.machine, _found_reversal(result), result.corrections.get("effects", {}))
+
+
+def _found_reversal(result: Identification) -> ReversalCurves | None:
+    """Return the reversals that the readings show.
 
     They belong to curves that are the means of both directions, so none is returned where the readings were not
     brought to that mean.

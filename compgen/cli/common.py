@@ -21,6 +21,7 @@ from compgen.controllers import CONTROLLERS
 from compgen.core.machine import Machine, load_machine
 from compgen.core.plugins import restored, why_missing
 from compgen.core.text import nearest
+from compgen.effects import active_effects
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.plugins import KINDS
 
@@ -55,7 +56,7 @@ stderr = Console(stderr=True, highlight=False, emoji=False, markup=False)
 
 
 def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:
-    """Load a machine and check the settings of every control that its file names."""
+    """Load a machine and check the settings of every control and the effects that its file names."""
     machine = load_machine(name, tuple(machines))
     for controller in machine.controllers:
         if controller in CONTROLLERS:
@@ -64,6 +65,7 @@ def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:
             message = f"is not a controller; {nearest(controller, {*CONTROLLERS, *CONTRACT_CONTROLLERS})}"
             message += why_missing("control", controller) or "; if it comes from a plug-in, add --plugin PATH"
             raise InputError(message, file=machine.source, field=f"[controllers.{controller}]")
+    active_effects(machine)
     return machine
 
 

@@ -26,6 +26,7 @@ from compgen.core.files import OutputFolder, write_file
 from compgen.core.machine import Machine
 from compgen.core.points import format_points, read_points
 from compgen.core.reversal import read_reversal
+from compgen.effects import effects_reversal
 from compgen.export import export
 from compgen.pipeline import provenance_of, write_all
 from compgen.report.explain_text import explanation_markdown
@@ -38,7 +39,8 @@ from compgen.verify.explain import explain as explained
 from compgen.verify.safety import SafetyLimits
 
 REVERSAL_HELP = (
-    "*.reversal.csv (um): what each axis does differently in its two directions; becomes tables of one direction."
+    "*.reversal.csv (um): what each axis does differently in its two directions; becomes tables of one direction "
+    "(default: backlash and lost motion of the machine file)."
 )
 
 
@@ -86,7 +88,7 @@ def export_command(
     """
     OutputFolder(out)
     table, beside = read_error_file(errors), {}
-    both = read_reversal(reversal) if reversal else None
+    both = read_reversal(reversal) if reversal else effects_reversal(machine)
     if active is not None:
         table, lost_um = bare_errors(machine, table, active)
         beside["bare.errors.csv"] = format_errors(table, {"active_tables_removed": active.names, "lost_um": lost_um})
@@ -189,7 +191,7 @@ def verify_command(
     """
     OutputFolder(out)
     where = read_points(points) if points else None
-    both = read_reversal(reversal) if reversal else None
+    both = read_reversal(reversal) if reversal else effects_reversal(machine)
     parsed, table = read_tables(machine, tables, controller), read_error_file(errors)
     result = verify(machine, parsed, table, where, reversal=both, limits=limits)
     write_all(out, verification_files(result))

@@ -13,6 +13,7 @@ from compgen.core.emphasis import zone_of
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.core.reversal import read_reversal
+from compgen.effects import effects_reversal
 from compgen.errors import InputError
 from compgen.pipeline import RunResult, identified_reversal, write_all
 from compgen.report.explain_text import explanation_markdown
@@ -96,7 +97,7 @@ def options_command(
             read_error_file(errors),
             tools_mm=[_tool(text) for text in tools],
             zone_mm=zone_of(zone, [axis.range_mm for axis in machine.axes]) if zone else None,
-            reversal=read_reversal(reversal) if reversal else None,
+            reversal=read_reversal(reversal) if reversal else effects_reversal(machine),
             templates=templates,
         )
     if out is not None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import click
 
 from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.controllers.error_files import read_error_file
+from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.files import write_file
 from compgen.core.machine import Machine
-from compgen.core.points import format_points, read_points
-from compgen.errors import InputError
+from compgen.core.points import Points, format_points, read_points
+from compgen.effects import active_effects, displacement_of, readings_of_points
+from compgen.errors import CompgenWarning, InputError
 from compgen.identify import Covariance, predict_uncertainty, read_covariance
 from compgen.model import predict
 from compgen.simulate import (
@@ -79,7 +82,9 @@ def predict_command(
 ) -> int:
     """Predict the error of the tool tip at given points: E = C P, or the exact model.
 
-    ERRORS is an *.errors.csv file (um, urad). FILE gets the points plus ex_um, ey_um, ez_um, and with --uncertainty
+    ERRORS is an *.errors.csv file (um, urad). With --exact the effects of the machine file that move the tip are added
+    where the points hold their columns (approach_x ..., temp_..., time_s, feed_mm_min, load_kg). FILE gets the points plus
+    ex_um, ey_um, ez_um, and with --uncertainty
     u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that compgen identify wrote.
 
     \b
@@ -90,6 +95,8 @@ def predict_command(
     table = read_error_file(errors)
     covariance = None if uncertainty is None else _covariance(errors, table, uncertainty)
     error_mm = predict(machine, table, where, exact=exact)
+    if exact:
+        error_mm = error_mm + _effects_mm(machine, where)
     columns = {f"e{axis}_um": error_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
     extra: dict[str, float] = {}
     if covariance is not None:
@@ -107,6 +114,15 @@ def predict_command(
         if extra:
             stdout.print(f"largest standard uncertainty: x, y, z {', '.join(f'{u:.3f}' for u in extra.values())} um")
     return 0
+
+
+def _effects_mm(machine: Machine, points: Points) -> FloatArray:
+    """How the effects of the machine file move the tip at the points, (n, 3), mm; warns of columns that are missing."""
+    moved_mm, missing = displacement_of(active_effects(machine), readings_of_points(machine, points))
+    if missing:
+        message = f"the points lack the columns of {', '.join(missing)}: left out (compgen effects NAME lists them)"
+        warnings.warn(message, CompgenWarning, stacklevel=2)
+    return moved_mm
 
 
 def _covariance(errors: Path, table: ErrorTable, file: str) -> Covariance:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 import numpy as np
 
 from compgen.core.csvio import FloatArray
@@ -27,14 +29,15 @@ ADVICE = {
 }
 
 
-def effects_reversal(machine: Machine) -> ReversalCurves | None:
+def effects_reversal(machine: Machine, only: Container[str] | None = None) -> ReversalCurves | None:
     """Return the reversal of the backlash and lost motion of a machine file; None if it has neither.
 
-    The effects move the tip by c dir, the reversal value of ISO 230-2 is the difference of both directions, 2 c.
+    ``only`` takes effects of some names. The effects move the tip by c dir; the reversal value of ISO 230-2 is the
+    difference of both directions, 2 c.
     """
     curves: dict[tuple[int, int], Curve] = {}
     for active in active_effects(machine):
-        if isinstance(active.effect, Backlash | LostMotion):
+        if isinstance(active.effect, Backlash | LostMotion) and (only is None or active.name in only):
             axis = active.effect.axis
             key = (axis, axis)
             curves[key] = added(curves.get(key), _curve(machine, active))
@@ -68,9 +71,11 @@ def _u_at(curve: Curve, position_mm: FloatArray) -> FloatArray:
     return np.interp(position_mm, curve.position_mm, curve.u)
 
 
-def with_effects_reversal(machine: Machine, found: ReversalCurves | None) -> ReversalCurves | None:
-    """Return a reversal found in readings, from which the machine file's effects were taken out, with these again."""
-    own = effects_reversal(machine)
+def with_effects_reversal(
+    machine: Machine, found: ReversalCurves | None, taken_out: Container[str]
+) -> ReversalCurves | None:
+    """Return a reversal found in readings together with those effects of the machine file that were ``taken_out``."""
+    own = effects_reversal(machine, taken_out)
     if own is None or found is None:
         return found or own
     curves = dict(own.curves)

@@ -15,6 +15,7 @@ from compgen.core.files import OutputFolder, sha256_of
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.reversal import WORTH_MM, ReversalCurves, format_reversal, reversal_name
+from compgen.effects import advice_of_effects
 from compgen.errors import InputError
 from compgen.export.companions import companion_files, errors_context
 from compgen.export.render import Format, load_format, render, render_files
@@ -140,6 +141,7 @@ def export(
         tables = control.with_reversal(machine, settings, tables, held) if held.curves else tables
     own = _with_backlash(control, machine, settings, control.context(machine, settings, tables), rest)
     own = {**own, "warnings": [*own["warnings"], *control.left_out(machine, settings, errors), *machine.emphasis.notes]}
+    own["warnings"] = [*own["warnings"], *advice_of_effects(machine)]
     common = export_context(machine, errors, controller, provenance or Provenance(), reversal)
     files = render_files(card, {**common, **own}, templates)
     with_errors = {**common, **own, "errors21": errors_context(machine, errors)}

@@ -3,7 +3,9 @@
 * **Scales.** At the temperature T of an axis its scale has grown about the reference point: at the command q the
   carriage stands at q + alpha (T - 20 degC)(q - q_ref), along the (leaning) axis. What this does to a length, with the
   exact model, is taken out of the reading. The identified errors then are those of the machine with all scales at
-  20 degC. Nothing else is corrected: neither bending, nor a growth of bed, spindle or workpiece.
+  20 degC. Unless the machine file names effects, nothing else is corrected: neither bending, nor a growth of bed,
+  spindle or workpiece.
+* **Effects** of the machine file (``[effects.NAME]``): what they add to a length is taken out.
 * **Wavelength**, only if the file says ``# wavelength_compensated = false``: the refractive index of the air by the
   modified Edlen equation (Birch & Downs, Metrologia 30 (1993) 155 and 31 (1994) 315). A reading N is the true change of
   n times the distance D since the tracer was set to zero, over the index that the instrument assumed:
@@ -33,7 +35,9 @@ from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
+from compgen.effects import ActiveEffect, readings_of_lengths
 from compgen.errors import CompgenWarning, InputError
+from compgen.identify.effects import effects_of_lengths, moved_by, notes_of
 from compgen.identify.parameters import ErrorParameters
 from compgen.identify.state import IntArray, State
 from compgen.model.exact import tip_position
@@ -49,19 +53,23 @@ class Conditions:
 
     Parameters
     ----------
+    machine : the machine.
     growth_mm : what the scales add to the command of each axis, (n, 3).
     dead_share : share of the dead length by which a reading is too short, (n,).
     notes : what was corrected, for ``identify.json``.
+    effects : effects of the machine file that the readings show.
     """
 
+    machine: Machine
     growth_mm: FloatArray
     dead_share: FloatArray
     notes: Mapping[str, Any]
+    effects: tuple[ActiveEffect, ...] = ()
 
     @property
     def needs_geometry(self) -> bool:
         """Whether the correction depends on stations and dead lengths."""
-        return bool(np.any(self.growth_mm) or np.any(self.dead_share))
+        return bool(np.any(self.growth_mm) or np.any(self.dead_share) or self.effects)
 
     def correction_mm(
         self, lengths: Lengths, layout: ErrorParameters, state: State, group: IntArray, further_mm: FloatArray
@@ -76,10 +84,17 @@ class Conditions:
         bases = [layout.basis(axis, poses[:, axis]) for axis in range(3)]
         values = layout.values(state.errors, bases)[pose.ravel()]
         station = state.stations_mm[lengths.station]
-        grown = tip_position(machine, values, lengths.position_mm + self.growth_mm, tool) + further_mm - station
-        plain = tip_position(machine, values, lengths.position_mm, tool) - station
-        change = np.linalg.norm(plain, axis=1) - np.linalg.norm(grown, axis=1)
-        return np.asarray(change + self.dead_share * state.dead_length_mm[group])
+        tip = tip_position(machine, values, lengths.position_mm, tool)
+        moved, lengthened = self._effects_mm(lengths, station, tip)
+        grown = tip_position(machine, values, lengths.position_mm + self.growth_mm, tool) + further_mm + moved - station
+        change = np.linalg.norm(tip - station, axis=1) - np.linalg.norm(grown, axis=1)
+        return np.asarray(change - lengthened + self.dead_share * state.dead_length_mm[group])
+
+    def _effects_mm(self, lengths: Lengths, station: FloatArray, tip: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Displacement of the tips (n, 3) and change of the lengths (n,) by the effects."""
+        if not self.effects:
+            return np.zeros_like(tip), np.zeros(len(tip))
+        return moved_by(self.effects, readings_of_lengths(self.machine, lengths, station, tip))
 
 
 def reading_conditions(machine: Machine, lengths: Lengths, *, temperature: bool = True) -> tuple[Lengths, Conditions]:
@@ -97,7 +112,10 @@ def reading_conditions(machine: Machine, lengths: Lengths, *, temperature: bool 
         lengths = replace(lengths, length_mm=lengths.length_mm * assumed / index)
         share = float(index.mean()) / index - 1.0
         notes["wavelength"] = {"index_assumed": assumed, "index_mean": float(index.mean())}
-    return lengths, Conditions(growth, share, notes)
+    effects = effects_of_lengths(machine, lengths)
+    if effects:
+        notes["effects"] = notes_of(effects)
+    return lengths, Conditions(machine, growth, share, notes, effects)
 
 
 def _growth(machine: Machine, lengths: Lengths) -> tuple[FloatArray, dict[str, Any]]:

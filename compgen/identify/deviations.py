@@ -6,7 +6,7 @@ will do as long as its axes are those of the machine to a few degrees.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjustment import Adjustment
+from compgen.identify.effects import without_effects
 from compgen.identify.noise import IdentifyOptions
 from compgen.identify.outliers import Rejected, accepted_readings
 from compgen.identify.parameters import ErrorParameters, common_tool, parameters_for_tools
@@ -60,7 +61,9 @@ def identify_deviations(
     """
     chosen = options or IdentifyOptions()
     with one_thread():
-        return _identify(machine, deviations, chosen)
+        deviations, effects = without_effects(machine, deviations)
+        found = _identify(machine, deviations, chosen)
+        return replace(found, corrections={**found.corrections, "effects": effects}) if effects else found
 
 
 @dataclass(frozen=True)
