@@ -1,0 +1,1 @@
+"""Accuracy figures of the standards, with uncertainty, and before against after."""
