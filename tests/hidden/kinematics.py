@@ -52,8 +52,19 @@ class Truth:
     squareness: Mapping[str, float] = field(default_factory=dict)
 
 
-def random_truth(rng: np.random.Generator, degree: int, length_um: float = 8.0, angle_urad: float = 12.0) -> Truth:
-    """Smooth random errors whose coefficients fall with their order."""
+def without_lever(machine: HiddenMachine) -> list[str]:
+    """Angular errors that do nothing of their own while the tool offset is zero: no lever, or only their own travel."""
+    found = []
+    for axis in range(3):
+        arms = {j for j in range(3) if lever(machine, axis, np.eye(3)[[j]], np.zeros((1, 3)))[0, j]}
+        found += [f"E{'ABC'[k]}{AXES[axis]}" for k in range(3) if arms - {k} <= {axis}]
+    return found
+
+
+def random_truth(
+    machine: HiddenMachine, rng: np.random.Generator, degree: int, length_um: float = 8.0, angle_urad: float = 12.0
+) -> Truth:
+    """Smooth random errors whose coefficients fall with their order; none that has no lever."""
     curves = {}
     for direction in "XYZ":
         for axis in "XYZ":
@@ -61,6 +72,8 @@ def random_truth(rng: np.random.Generator, degree: int, length_um: float = 8.0, 
                 name = f"E{'ABC'['XYZ'.index(direction)] if kind else direction}{axis}"
                 drawn = rng.normal(size=degree + 1) * size / (1.0 + 0.5 * np.arange(degree + 1))
                 curves[name] = np.where(np.arange(degree + 1) == 0, 0.0, drawn)
+    for name in without_lever(machine):
+        del curves[name]
     return Truth(curves, {name: float(rng.normal() * 3e-5) for name in ("EC0Y", "EB0Z", "EA0Z")})
 
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from hidden.change import Change, Hidden, along, first_stop_at, of_station, p2, share_of_time
+from hidden.kinematics import without_lever
 from hidden.session import Session
 
 AXES = "XYZ"
@@ -190,8 +191,8 @@ def named(session: Session) -> Mapping[str, Hidden]:
     }
     for family, make in families.items():
         found |= {f"{family}_{AXES[axis]}": make(axis) for axis in range(3)}
+    found |= {f"lever_{error}": lever_arm(error) for error in without_lever(session.machine)}
     if session.machine.chain == "WFYXZT":
-        found |= {f"lever_{error}": lever_arm(error) for error in ("ECX", "EAZ", "EBZ", "ECZ")}
         found["sign_EBY"] = sign_eby
     for k, name in enumerate(session.station_names):
         found[f"station_drift_{name}"] = station_drift(k)

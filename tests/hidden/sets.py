@@ -222,7 +222,7 @@ def assemble(
 ) -> Case:
     """Put truth, effects and noise together and write both files as text."""
     degree = int(rng.integers(6, 8))
-    truth = random_truth(rng, degree)
+    truth = random_truth(session.machine, rng, degree)
     tip_um = np.zeros((len(session.t), 3))
     reading_um = noise.copy()
     for change in changes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hidden.kinematics import AXES, error_directions
+from hidden.kinematics import AXES, error_directions, without_lever
 from hidden.session import Session
 from numpy.polynomial import legendre
 
@@ -16,7 +16,7 @@ def base_columns(session: Session, degree: int = DEGREE) -> np.ndarray:
     stop, station = session.reading_stop, session.reading_station
     blocks = []
     for name, moved in error_directions(session.machine, session.q, session.tool).items():
-        if name in ("ECX", "EAZ", "EBZ", "ECZ") and session.machine.chain == "WFYXZT":
+        if name in without_lever(session.machine):
             continue
         seen = np.sum(u * moved[stop], axis=1)
         powers = legendre.legvander(session.s[:, AXES.index(name[2])], degree)
