@@ -1,0 +1,42 @@
+"""Structured logs on stderr: one JSON object per line, or words on a terminal."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, Literal
+
+import structlog
+
+Format = Literal["auto", "json", "text"]
+
+
+def configure(kind: Format = "auto") -> None:
+    """Choose the form of the logs; "auto" gives words on a terminal and JSON elsewhere."""
+    words = kind == "text" or (kind == "auto" and sys.stderr.isatty())
+    last: Any = (
+        structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()) if words else structlog.processors.JSONRenderer()
+    )
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            last,
+        ],
+        logger_factory=structlog.WriteLoggerFactory(file=sys.stderr),
+        cache_logger_on_first_use=False,
+    )
+
+
+def info(event: str, **fields: Any) -> None:
+    """Log what was done."""
+    structlog.get_logger().info(event, **fields)
+
+
+def warning(event: str, **fields: Any) -> None:
+    """Log what somebody should look at."""
+    structlog.get_logger().warning(event, **fields)
+
+
+def error(event: str, **fields: Any) -> None:
+    """Log what went wrong."""
+    structlog.get_logger().error(event, **fields)

@@ -1,0 +1,227 @@
+"""One measurement through the whole chain, in a temporary folder, judged against what is active now."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from compgen.core.files import read_bytes
+from compgen.core.machine import Machine, load_machine
+from compgen.errors import CompgenWarning, InputError
+from compgen.export import program_version
+from compgen.identify import IdentifyOptions
+from compgen.identify.covariance import FILE_NAME as COVARIANCE
+from compgen.pipeline import Checks, RunResult, run
+from compgen.recal.job import MachineJob
+from compgen.recal.judge import ActiveState, Judgement, apply_limits, judge_change, judge_measurement, judge_tables
+from compgen.recal.records import MachineRecord, MeasurementRecord, NewResult, TableFile, TableRecord
+from compgen.recal.states import active_id
+from compgen.recal.store import Store
+from compgen.verify import ReadTables, read_tables
+from compgen.verify.active import ActiveTables
+from compgen.verify.safety import SafetyLimits
+
+
+#: Files of a run that belong to the identification; with one control they stand beside its own.
+NOT_OF_A_CONTROL = (
+    "identified.errors.csv",
+    COVARIANCE,
+    "identified.reversal.csv",
+    "measured.deviations.csv",
+    "stations.csv",
+    "identify.json",
+    "fitted.errors.csv",
+    "fit.json",
+)
+
+
+@dataclass(frozen=True)
+class Processed:
+    """What is to be kept, and the id of the tables that it was judged against."""
+
+    result: NewResult
+    judged_against: int | None
+
+
+def process(store: Store, job: MachineJob, record: MachineRecord, measurement: MeasurementRecord) -> Processed:
+    """Run the chain for one measurement and judge the outcome; nothing outside a temporary folder is written.
+
+    Raises
+    ------
+    CompgenError
+        for a measurement that cannot be used, or does not determine the errors.
+    """
+    started = time.monotonic()
+    settings = job.settings_sha256()
+    machine = load_machine(job.machine)
+    tables = store.tables(record)
+    now = store.read(store.now)
+    with tempfile.TemporaryDirectory(prefix="compgen-recal-") as folder, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", CompgenWarning)
+        paths = write_files(Path(folder) / "measurement", store.contents_of(measurement))
+        measured = _active_then(store, job, record, measurement, tables)
+        checks: Checks = {"instrument": job.instrument, "limits": SafetyLimits(job.policy.max_step_um)}
+        if measured is not None:
+            checks["active"] = _parsed(store, machine, measured, job.controllers[0], Path(folder) / "then")
+        outcome = run(
+            machine,
+            paths,
+            job.controllers,
+            Path(folder) / "out",
+            identify_options=IdentifyOptions(**job.identify),
+            templates=job.templates,
+            allow_unverified=job.allow_unverified,
+            **checks,
+        )
+        active = _active_now(store, machine, tables, Path(folder) / "now")
+        judgement = _judged(store, job, machine, measurement, (outcome, active, now))
+        judgement.figures["warnings"] = [str(item.message) for item in caught if _ours(item)]
+        files = _tables_of(outcome, Path(folder) / "out")
+        result = _result(Path(folder) / "out", machine, outcome, files, judgement)
+    kept = NewResult(
+        **result,
+        active_table_id=None if measured is None else measured.id,
+        approve=job.approval == "auto",
+        settings_sha256=settings,
+        seconds=time.monotonic() - started,
+    )
+    return Processed(kept, next((table.id for table in tables if table.state == "active"), None))
+
+
+def _ours(item: warnings.WarningMessage) -> bool:
+    return issubclass(item.category, CompgenWarning)
+
+
+def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
+    """Write files into a temporary folder and return their paths."""
+    paths = []
+    for name, content in contents.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        paths.append(path)
+    return paths
+
+
+# --- active tables -------------------------------------------------------------------------------------------------
+
+
+def _active_then(
+    store: Store, job: MachineJob, record: MachineRecord, measurement: MeasurementRecord, tables: Sequence[TableRecord]
+) -> TableRecord | None:
+    """Return the tables that were active while the machine was measured: what the file says, else what the job says."""
+    said = measurement.active_table
+    if said is not None and said.lower() in ("none", "bare"):
+        return None
+    if said is not None:
+        version = said.lower().removeprefix("v")
+        found = next((table for table in tables if version.isdigit() and table.version == int(version)), None)
+        if found is None or not found.accepted:
+            raise InputError(
+                f"says active_table = {said}, but {job.name} has no such tables; a version or none is expected",
+                file=measurement.name,
+            )
+        return found
+    if job.measured_with == "bare":
+        return None
+    before = [decision for decision in store.decisions(record) if decision.at <= measurement.measured_at]
+    wanted = active_id(before)
+    return next((table for table in tables if table.id == wanted), None)
+
+
+def _parsed(store: Store, machine: Machine, table: TableRecord, control: str, folder: Path) -> ActiveTables:
+    paths = _written(store, table, control, folder)
+    if not paths:
+        raise InputError(f"version {table.version} was active, but holds no tables of {control}; is the control right?")
+    return ActiveTables(read_tables(machine, paths, control), tuple(paths))
+
+
+def _written(store: Store, table: TableRecord, control: str, folder: Path) -> list[Path]:
+    """Write the table files proper of one control (no manifest, no notes) and return their paths."""
+    names = table.summary.get("tables", {}).get(control, [])
+    files = {file.name: file.content for file in store.table_files(table) if file.controller == control}
+    return write_files(folder / control, {name: files[name] for name in names})
+
+
+def _active_now(store: Store, machine: Machine, tables: Sequence[TableRecord], folder: Path) -> ActiveState | None:
+    table = next((item for item in tables if item.state == "active"), None)
+    if table is None:
+        return None
+    read = {}
+    for control in table.controllers:
+        paths = _written(store, table, control, folder)
+        if paths:
+            read[control] = read_tables(machine, paths, control)
+    return ActiveState(table.version, read, store.identification(table.identification_id))
+
+
+# --- judgement -----------------------------------------------------------------------------------------------------
+
+
+def _judged(
+    store: Store,
+    job: MachineJob,
+    machine: Machine,
+    measurement: MeasurementRecord,
+    state: tuple[RunResult, ActiveState | None, datetime],
+) -> Judgement:
+    result, active, now = state
+    judgement = Judgement()
+    latest = None if active is None else active.identification.measured_at
+    judge_measurement(judgement, job.policy, measurement, now, latest)
+    new: dict[str, ReadTables] = {}
+    for item in result.results:
+        if item.verification.accepted:
+            control = item.verification.controller
+            names = {path.name: path for path in item.paths}
+            new[control] = read_tables(machine, [names[Path(name).name] for name in item.export.files], control)
+    if active is not None and result.accepted:
+        judge_change(judgement, store, machine, result, active, job.policy)
+        judge_tables(judgement, machine, result, new, active)
+    if result.accepted:
+        apply_limits(judgement, machine, new, {} if active is None else active.tables, job.policy)
+    judgement.figures["active_version"] = None if active is None else active.version
+    judgement.figures["result"] = {item.verification.controller: item.verification.summary() for item in result.results}
+    if not result.accepted:
+        reasons = [reason for item in result.results for reason in item.verification.reasons]
+        judgement.hold[:0] = list(dict.fromkeys(reasons))
+    return judgement
+
+
+def _tables_of(result: RunResult, folder: Path) -> list[TableFile]:
+    """Return the files of every control by their names below the control's own folder."""
+    files = []
+    for item in result.results:
+        control = item.verification.controller
+        root = folder / control if len(result.results) > 1 else folder
+        names = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
+        files += [TableFile(control, name, read_bytes(root / name)) for name in names if name not in NOT_OF_A_CONTROL]
+    return files
+
+
+def _result(
+    folder: Path, machine: Machine, outcome: RunResult, files: Sequence[TableFile], judgement: Judgement
+) -> dict[str, Any]:
+    """Return the fields of a :class:`NewResult` that come from the chain."""
+    judgement.figures["tables"] = {item.verification.controller: list(item.export.files) for item in outcome.results}
+    covariance = folder / COVARIANCE
+    assert machine.source is not None
+    return {
+        "machine_text": read_bytes(machine.source),
+        "errors_text": read_bytes(folder / "identified.errors.csv"),
+        "covariance": read_bytes(covariance) if covariance.is_file() else None,
+        "fitted_text": read_bytes(folder / "fitted.errors.csv"),
+        "summary": outcome.identification.summary(),
+        "program": program_version(),
+        "files": tuple(files),
+        "accepted": outcome.accepted,
+        "hold": tuple(judgement.hold),
+        "judgement": judgement.figures,
+    }
