@@ -27,7 +27,6 @@ from compgen.verify import ReadTables, read_tables
 from compgen.verify.active import ActiveTables
 from compgen.verify.safety import SafetyLimits
 
-
 #: Files of a run that belong to the identification; with one control they stand beside its own.
 NOT_OF_A_CONTROL = (
     "identified.errors.csv",
