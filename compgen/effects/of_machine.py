@@ -27,8 +27,8 @@ from compgen.effects.readings import Readings
 from compgen.errors import InputError
 
 #: The names of stations in the names of effects and of their parameters.
-_STATION = re.compile(r"(?:station_drift|length_step|tracer_runout)_(.+)")
-_STATION_KEY = re.compile(r"c_(.+)_um_per_k")
+STATION_NAME = re.compile(r"(?:station_drift|length_step|tracer_runout)_(.+)")
+DEAD_PATH_KEY = re.compile(r"c_(.+)_um_per_k")
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,10 @@ def active_effects(machine: Machine) -> tuple[ActiveEffect, ...]:
 
 def _stations_of(machine: Machine) -> tuple[str, ...]:
     """Names of the stations in the names of effects and parameters."""
-    found = [match.group(1) for name in machine.effects if (match := _STATION.fullmatch(name))]
+    found = [match.group(1) for name in machine.effects if (match := STATION_NAME.fullmatch(name))]
     dead_path = machine.effects.get("dead_path")
     keys = [] if dead_path is None else dead_path.data
-    found += [match.group(1) for key in keys if (match := _STATION_KEY.fullmatch(key))]
+    found += [match.group(1) for key in keys if (match := DEAD_PATH_KEY.fullmatch(key))]
     return tuple(dict.fromkeys(found))
 
 
@@ -101,10 +101,17 @@ def _read(machine: Machine, known: dict[str, Effect], name: str, raw: tomlio.Sec
     if not effect.card.parameters:
         message = f"{name} has no parameters, so it cannot be switched on; it is found in residuals"
         raise InputError(message, file=raw.path, line=_line(raw), field=f"[{raw.name}]")
-    effect = _with_settings(machine, effect, section)
-    values = _parameters(effect.card, section)
+    effect, values = read_values(effect, section)
+    if isinstance(effect, Periodic) and effect.pitch_mm(machine) is None:
+        raise section.fail("pitch_mm", "is missing, and the machine file has no screw_pitch_mm for this axis")
     section.finish()
     return ActiveEffect(effect, values)
+
+
+def read_values(effect: Effect, section: tomlio.Section) -> tuple[Effect, FloatArray]:
+    """Take settings and parameters of an effect from a section; return it with its settings, and the values in SI."""
+    effect = _with_settings(effect, section)
+    return effect, _parameters(effect.card, section)
 
 
 def _line(section: tomlio.Section) -> int | None:
@@ -112,14 +119,14 @@ def _line(section: tomlio.Section) -> int | None:
     return section.fail("", "").line
 
 
-def _with_settings(machine: Machine, effect: Effect, section: tomlio.Section) -> Effect:
+def _with_settings(effect: Effect, section: tomlio.Section) -> Effect:
     settings: dict[str, float] = {}
     for setting in effect.card.settings:
         check = _degree if setting.name == "degree" else tomlio.number
         value = section.take(setting.name, check, None)
         if value is not None:
             settings[setting.name] = float(value)
-        elif setting.needed or (isinstance(effect, Periodic) and effect.pitch_mm(machine) is None):
+        elif setting.needed:
             raise section.fail(setting.name, f"is missing: {setting.meaning}")
     return effect.with_settings(settings)
 

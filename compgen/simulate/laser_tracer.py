@@ -54,7 +54,7 @@ class LaserTracer:
 
     def observe(self, stops: Stops, tip_mm: FloatArray, rng: np.random.Generator) -> Lengths:
         """Return the readings at stops whose true tips are ``tip_mm`` (n, 3): distance - dead length + noise."""
-        stop, station = self._rows(len(stops))
+        stop, station = self.rows(len(stops))
         centre_mm = np.array([item.position_mm for item in self.stations])
         dead_mm = np.array([item.dead_length_mm for item in self.stations])
         distance_mm = np.linalg.norm(tip_mm[stop] - centre_mm[station], axis=1)
@@ -67,8 +67,11 @@ class LaserTracer:
             length_mm=distance_mm - dead_mm[station] + noise_mm,
             tool_mm=None if stops.tool_mm is None else stops.tool_mm[stop],
             approach=stops.approach[stop],
-            labels={"run": stops.run[stop]},
-            covariates={"time_s": stops.time_s[stop]},
+            labels={"run": stops.run[stop], **{name: label[stop] for name, label in stops.labels.items()}},
+            covariates={
+                "time_s": stops.time_s[stop],
+                **{name: values[stop] for name, values in stops.covariates.items()},
+            },
             metadata={
                 "instrument": "laser-tracer",
                 "u_length_um": f"{self.noise_um:g}",
@@ -76,7 +79,7 @@ class LaserTracer:
             },
         )
 
-    def _rows(self, stops: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def rows(self, stops: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Stop and station of each reading, in order of time."""
         count = len(self.stations)
         if self.in_turn:

@@ -15,16 +15,17 @@ from compgen.core.lengths import Lengths, format_lengths
 from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.model.exact import tip_position
-from compgen.simulate.effects import Effect
-from compgen.simulate.laser_tracer import Station
+from compgen.simulate.effects import Effect, LengthEffect, Sights
+from compgen.simulate.laser_tracer import LaserTracer, Station
 from compgen.simulate.scenario import Scenario
+from compgen.simulate.session import plan_session, with_temperatures
 from compgen.simulate.sixdof_measurement import SimulatedSixDof
 from compgen.simulate.trajectory import Stops, plan_stops
 from compgen.simulate.truth import child_seeds, draw_truth, random_stream
 from compgen.sixdof.readings import SixDof, format_sixdof
 
-#: Children of the seed: one for the errors, one for the noise.
-ERROR_STREAM, NOISE_STREAM = 0, 1
+#: Children of the seed: one for the errors, one for the noise, one for the order of a session.
+ERROR_STREAM, NOISE_STREAM, ORDER_STREAM = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -100,14 +101,18 @@ def simulate(
     if isinstance(instrument, SimulatedSixDof):
         raise InputError("is a six-DOF instrument, which has no lengths; call simulate_sixdof", file=scenario.source)
     try:
-        stops = plan_stops(scenario.trajectory, machine, instrument.passes)
+        stops = with_temperatures(_stops(machine, scenario, seeds, instrument.passes), scenario.temperatures)
     except InputError as error:
         raise InputError(error.message, file=scenario.source, field=error.field) from None
     tools_mm = np.array(scenario.trajectory.tools_mm) if scenario.trajectory.tools_mm else None
     truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), tools_mm)
     truth.warn_outside(stops.position_mm)
-    tip_mm = actual_tips(machine, truth, stops, (*scenario.effects, *effects))
+    of_tips = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect)]
+    tip_mm = actual_tips(machine, truth, stops, (*of_tips, *effects))
     lengths = instrument.observe(stops, tip_mm, random_stream(seeds, NOISE_STREAM))
+    of_lengths = [effect for effect in scenario.effects if isinstance(effect, LengthEffect)]
+    if of_lengths:
+        lengths = _changed(lengths, instrument, stops, tip_mm, of_lengths)
     common = _common(machine, used_seed)
     return Simulation(
         name=scenario.name,
@@ -115,6 +120,29 @@ def simulate(
         truth=_described(machine, truth, used_seed),
         stations=getattr(instrument, "stations", ()),
     )
+
+
+def _stops(machine: Machine, scenario: Scenario, seeds: np.random.SeedSequence, passes: int) -> Stops:
+    if scenario.session is None:
+        return plan_stops(scenario.trajectory, machine, passes)
+    order = random_stream(seeds, ORDER_STREAM)
+    return plan_session(scenario.session, scenario.trajectory, machine, passes, order)
+
+
+def _changed(
+    lengths: Lengths, instrument: object, stops: Stops, tip_mm: FloatArray, effects: Sequence[LengthEffect]
+) -> Lengths:
+    """Add what effects of tracers and air do to the lengths."""
+    if not isinstance(instrument, LaserTracer):
+        raise InputError(
+            f"{effects[0].name} acts on the lengths of a laser-tracer; this instrument has none of its kind"
+        )
+    stop, station = instrument.rows(len(stops))
+    places = np.array([item.position_mm for item in instrument.stations])
+    names = tuple(item.name for item in instrument.stations)
+    sights = Sights(stops, stop, names, station, places[station], tip_mm[stop])
+    change = np.sum([effect.change(sights) for effect in effects], axis=0)
+    return replace(lengths, length_mm=lengths.length_mm + change)
 
 
 def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = None) -> SixDofSimulation:

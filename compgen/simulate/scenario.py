@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,9 +13,10 @@ import numpy as np
 from compgen.core import tomlio
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
-from compgen.simulate.effects import Effect, read_effects
+from compgen.simulate.effects import SimulatedEffect, read_effects
 from compgen.simulate.laser_tracer import read_laser_tracer
 from compgen.simulate.registration import instrument_problems
+from compgen.simulate.session import Session, Temperature, read_session, read_temperatures
 from compgen.simulate.sixdof_measurement import SimulatedSixDof, read_sixdof_measurement
 from compgen.simulate.trajectory import Stops, Trajectory, read_trajectory
 from compgen.simulate.truth import RandomErrors, TruthPlan, read_truth_plan
@@ -49,7 +50,9 @@ class Scenario:
     errors: TruthPlan = field(default_factory=lambda: TruthPlan(random=RandomErrors()))
     trajectory: Trajectory = field(default_factory=Trajectory)
     source: Path | None = None
-    effects: tuple[Effect, ...] = ()
+    effects: tuple[SimulatedEffect, ...] = ()
+    session: Session | None = None
+    temperatures: Mapping[str, Temperature] = field(default_factory=dict)
 
 
 def read_scenario(path: str | Path) -> Scenario:
@@ -75,10 +78,12 @@ def read_scenario(path: str | Path) -> Scenario:
         trajectory=read_trajectory(root.section("trajectory", required=False)),
         source=source,
         effects=read_effects(root.sections("effects")),
+        session=read_session(root.section("session")) if "session" in root else None,
+        temperatures=read_temperatures(root.section("temperatures", required=False)),
     )
     root.finish()
     if isinstance(scenario.instrument, SimulatedSixDof):
-        for key in ("trajectory", "effects"):
+        for key in ("trajectory", "effects", "session", "temperatures"):
             if key in root.data:
                 raise root.fail(key, "belongs to other instruments; a six-DOF instrument runs along the axes")
     return scenario

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -71,6 +71,9 @@ class Stops:
     time_s : time of reading since the first stop began, shape (n,).
     approach : last direction of travel of each axis, +1, -1 or 0 while it has not moved, shape (n, 3).
     tool_mm : tool offset at each stop, shape (n, 3), or None for the machine's own.
+    covariates : further numbers by column name (feed_mm_min, load_kg, temp_<name>_c), each (n,).
+    labels : further whole numbers by column name (line, repeat, block, setup), each (n,).
+    way_mm : motion from the stop before, shape (n, 3); of the first from where the machine came.
     """
 
     position_mm: FloatArray
@@ -79,6 +82,9 @@ class Stops:
     time_s: FloatArray
     approach: FloatArray
     tool_mm: FloatArray | None = None
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    labels: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    way_mm: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __len__(self) -> int:
         """Return the number of stops."""
@@ -210,9 +216,9 @@ def plan_stops(trajectory: Trajectory, machine: Machine, repeats: int = 1) -> St
     InputError
         if a point lies outside the machine's travel.
     """
-    there = trajectory_points(trajectory, machine)
-    _check_travel(there, machine)
-    passes = [there, there[::-1]] if trajectory.there_and_back else [there]
+    passes = passes_of(trajectory, machine)
+    there = passes[0]
+    check_stops(there, machine)
     tools = np.round(np.array(trajectory.tools_mm or [machine.tool_offset_mm]), POSITION_DECIMALS)
     one_tool = np.concatenate(passes)
     runs = np.repeat(np.arange(1, len(passes) + 1), len(there))
@@ -220,15 +226,23 @@ def plan_stops(trajectory: Trajectory, machine: Machine, repeats: int = 1) -> St
     moves = np.diff(position_mm, axis=0, prepend=[trajectory.start_mm or machine.reference_point_mm])
     return Stops(
         position_mm=position_mm,
-        point=_labels(position_mm),
+        point=label_points(position_mm),
         run=np.tile(runs, repeats * len(tools)),
         time_s=_times(moves, trajectory),
         approach=approach_of(moves),
         tool_mm=np.tile(np.repeat(tools, len(one_tool), axis=0), (repeats, 1)) if trajectory.tools_mm else None,
+        way_mm=moves,
     )
 
 
-def _check_travel(points: FloatArray, machine: Machine) -> None:
+def passes_of(trajectory: Trajectory, machine: Machine) -> list[FloatArray]:
+    """Points of one pass there and, if asked for, back, each (n, 3), mm."""
+    there = trajectory_points(trajectory, machine)
+    return [there, there[::-1]] if trajectory.there_and_back else [there]
+
+
+def check_stops(points: FloatArray, machine: Machine) -> None:
+    """Raise InputError for a point outside the travel."""
     slack_mm = 10.0**-POSITION_DECIMALS
     outside = (points < machine.lower_mm - slack_mm) | (points > machine.upper_mm + slack_mm)
     if outside.any():
@@ -241,7 +255,8 @@ def _check_travel(points: FloatArray, machine: Machine) -> None:
         )
 
 
-def _labels(position_mm: FloatArray) -> tuple[str, ...]:
+def label_points(position_mm: FloatArray) -> tuple[str, ...]:
+    """Number the points in the order in which they first come; equal positions have equal labels."""
     numbers: dict[tuple[float, ...], int] = {}
     order = [numbers.setdefault(tuple(row), len(numbers) + 1) for row in position_mm.tolist()]
     width = max(4, len(str(len(numbers))))

@@ -1,0 +1,9 @@
+"""Effects: what acts on a simulated machine and its tracers besides the geometric errors, as forward formulas."""
+
+from compgen.simulate.effects.read import EFFECTS, SimulatedEffect, read_effects
+from compgen.simulate.effects.scene import Displacement, LengthEffect, Sights
+
+#: An effect that moves the tip; plug-ins return one.
+Effect = Displacement
+
+__all__ = ["EFFECTS", "Displacement", "Effect", "LengthEffect", "Sights", "SimulatedEffect", "read_effects"]
