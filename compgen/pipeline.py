@@ -31,12 +31,12 @@ from compgen.identify import (
     covariance,
     describe,
     identify_measurement,
-    read_measurement,
 )
 from compgen.identify.evidence import evidence_files
 from compgen.identify.measurement import Measurement
 from compgen.identify.monte_carlo import SelfCheck
 from compgen.identify.reversal import SIGNIFICANT
+from compgen.imports import open_measurement
 from compgen.verify import Verification, read_tables, verify
 from compgen.verify.active import ActiveTables, without_active
 from compgen.verify.check_program import check_files
@@ -299,7 +299,7 @@ def run(
         controller_named(name).read_settings(machine)
         usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
-    measurement = read_measurement(measurements, checks.get("instrument"))
+    measurement = open_measurement(measurements, checks.get("instrument"))
     provenance = provenance_of(machine.source, *measurements, checks.get("instrument"))
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):

@@ -10,6 +10,7 @@ from compgen.cli import (
     diagnose_commands,
     export_commands,
     identify_commands,
+    import_commands,
     listing_commands,
     options_commands,
     plan_commands,
@@ -41,6 +42,7 @@ def cli() -> None:
 
 MODULES = (
     run_commands,
+    import_commands,
     simulate_commands,
     identify_commands,
     diagnose_commands,

@@ -20,7 +20,6 @@ from compgen.cli.emphasis_options import emphasis_options
 from compgen.cli.options_commands import explain_option
 from compgen.cli.safety_options import active_options, limits_option
 from compgen.cli.sample_options import sample_options
-from compgen.controllers.error_files import read_error_file
 from compgen.core.error_table import format_errors
 from compgen.core.files import OutputFolder, write_file
 from compgen.core.machine import Machine
@@ -28,6 +27,7 @@ from compgen.core.points import format_points, read_points
 from compgen.core.reversal import read_reversal
 from compgen.effects import effects_reversal
 from compgen.export import export
+from compgen.imports import open_errors
 from compgen.pipeline import provenance_of, write_all
 from compgen.report.explain_text import explanation_markdown
 from compgen.report.text import verification_table
@@ -87,7 +87,7 @@ def export_command(
       compgen export zha-gantry fitted/fitted.errors.csv --controller siemens-cec --out tables/
     """
     OutputFolder(out)
-    table, beside = read_error_file(errors), {}
+    table, beside = open_errors(errors), {}
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     if active is not None:
         table, lost_um = bare_errors(machine, table, active)
@@ -192,7 +192,7 @@ def verify_command(
     OutputFolder(out)
     where = read_points(points) if points else None
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
-    parsed, table = read_tables(machine, tables, controller), read_error_file(errors)
+    parsed, table = read_tables(machine, tables, controller), open_errors(errors)
     result = verify(machine, parsed, table, where, reversal=both, limits=limits)
     write_all(out, verification_files(result))
     if as_json:

@@ -12,7 +12,6 @@ import click
 from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.cli.fit_options import covariance_of, covariance_options, fitting_options
 from compgen.cli.safety_options import active_options
-from compgen.controllers.error_files import read_error_file
 from compgen.core.files import OutputFolder
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
@@ -22,12 +21,12 @@ from compgen.identify import (
     IdentifyOptions,
     SystematicInputs,
     describe,
-    read_measurement,
     read_stations,
 )
 from compgen.identify.evidence import evidence_files
 from compgen.identify.monte_carlo import self_check
 from compgen.identify.noise import METHODS
+from compgen.imports import open_errors, open_measurement
 from compgen.pipeline import failure_reported, fit_files, identification_files, identify_bare, provenance_of, write_all
 from compgen.report.text import fit_table, identification_table
 from compgen.verify.active import ActiveTables
@@ -173,7 +172,7 @@ def identify_command(
     OutputFolder(out)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
-        measurement = read_measurement(measurements, instrument)
+        measurement = open_measurement(measurements, instrument)
         show(f"identifying: {describe(measurement)}")
         options = identify_options(u_length_um, u_length_um_per_m, keep_all, systematic, choices)
         with failure_reported(out):
@@ -229,7 +228,7 @@ def fit_command(
       compgen fit zha-gantry identified/identified.errors.csv --max-abs linear=20 --out fitted/
     """
     OutputFolder(out)
-    table = read_error_file(errors)
+    table = open_errors(errors)
     known = covariance_of(errors, table, covariance, independent=independent)
     result = fit(machine, table, fitting, covariance=known)
     write_all(out, fit_files(result))

@@ -8,13 +8,13 @@ from pathlib import Path
 import click
 
 from compgen.cli.common import Command, json_option, machine_argument, print_json, progress, stdout
-from compgen.controllers.error_files import read_error_file
 from compgen.core.emphasis import zone_of
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.core.reversal import read_reversal
 from compgen.effects import effects_reversal
 from compgen.errors import InputError
+from compgen.imports import open_errors
 from compgen.pipeline import RunResult, identified_reversal, write_all
 from compgen.report.explain_text import explanation_markdown
 from compgen.report.options_text import options_markdown, options_tables
@@ -94,7 +94,7 @@ def options_command(
         show("fitting every level, exporting for every control and reading back")
         result = capability(
             machine,
-            read_error_file(errors),
+            open_errors(errors),
             tools_mm=[_tool(text) for text in tools],
             zone_mm=zone_of(zone, [axis.range_mm for axis in machine.axes]) if zone else None,
             reversal=read_reversal(reversal) if reversal else effects_reversal(machine),

@@ -20,7 +20,6 @@ from compgen.cli.common import (
 )
 from compgen.cli.safety_options import limits_option
 from compgen.controllers import CONTROLLERS
-from compgen.controllers.error_files import read_error_file
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import format_errors
 from compgen.core.files import OutputFolder
@@ -28,6 +27,7 @@ from compgen.core.machine import Machine
 from compgen.core.points import Points, format_points, read_points
 from compgen.errors import InputError
 from compgen.export import Provenance
+from compgen.imports import open_errors
 from compgen.pipeline import export_and_verify, provenance_of, write_all
 from compgen.report.safety_text import crash_table, difference_table, merge_text
 from compgen.report.text import verification_table
@@ -143,7 +143,7 @@ def merge_command(
     """
     OutputFolder(out)
     active = read_active(machine, old, controller_old or controller)
-    measured = read_error_file(errors)
+    measured = open_errors(errors)
     bare, lost_um = merged_errors(machine, measured, active)
     provenance: Provenance = provenance_of(machine.source, errors, *old)
     done = export_and_verify(
@@ -191,7 +191,7 @@ def crash_test_command(machine: Machine, errors: Path, controllers: tuple[str, .
     Example:
       compgen crash-test zha-gantry fitted.errors.csv --controller siemens-cec
     """
-    table = read_error_file(errors)
+    table = open_errors(errors)
     results: list[CrashTest] = []
     with progress(quiet=as_json) as show:
         for name in _usable(machine, controllers):

@@ -8,7 +8,6 @@ from pathlib import Path
 import click
 
 from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
-from compgen.controllers.error_files import read_error_file
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.files import write_file
@@ -17,6 +16,7 @@ from compgen.core.points import Points, format_points, read_points
 from compgen.effects import active_effects, displacement_of, readings_of_points
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import Covariance, predict_uncertainty, read_covariance
+from compgen.imports import open_errors
 from compgen.model import predict
 from compgen.simulate import (
     SimulatedSixDof,
@@ -92,7 +92,7 @@ def predict_command(
       compgen predict zha-gantry fitted/fitted.errors.csv --points p.points.csv --out predicted.csv
     """
     where = read_points(points)
-    table = read_error_file(errors)
+    table = open_errors(errors)
     covariance = None if uncertainty is None else _covariance(errors, table, uncertainty)
     error_mm = predict(machine, table, where, exact=exact)
     if exact:

@@ -88,13 +88,16 @@ def positioning_errors(
 def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
     """Take the positioning errors of the measured axes from their runs; nothing else shows in them.
 
+    The curves are zero at the reference point, as those of every identification; what was taken off stands in the details.
+
     Raises
     ------
     InputError
         for targets outside the travel.
     """
     _check_travel(machine, runs)
-    errors, reversal, residual = positioning_errors(runs, metadata_of(machine, runs.metadata))
+    raw, reversal, residual = positioning_errors(runs, metadata_of(machine, runs.metadata))
+    errors, offset_um = _zero_at_reference(machine, raw)
     letters = ", ".join(AXES[axis] for axis in runs.axes)
     warnings.warn(
         f"positioning runs of {letters} show {', '.join(errors.names)} along the line that was measured; angular errors, "
@@ -111,7 +114,7 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
     return Identification(
         errors=errors,
         stations=(),
-        residual_mm=residual,
+        residual_mm=-residual,
         accepted=np.ones(len(runs), dtype=bool),
         rms_um=rms_um,
         degrees_of_freedom=len(runs) - len(cells),
@@ -130,15 +133,26 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
         layout=error_parameters(machine, errors.names),
         reversal_curves=reversal,
         method="axis-runs",
-        details={"axes": {AXES[axis]: _axis_summary(runs, axis) for axis in runs.axes}},
+        details={"axes": {AXES[axis]: _axis_summary(runs, axis, offset_um[axis]) for axis in runs.axes}},
     )
+
+
+def _zero_at_reference(machine: Machine, raw: ErrorTable) -> tuple[ErrorTable, dict[int, float]]:
+    """Take off each curve its value at the machine's reference point, um by axis: it depends on where the laser was zeroed."""
+    curves, offset_um = {}, {}
+    for name, curve in raw.curves.items():
+        axis = POSITIONING.index(name)
+        offset = float(np.interp(machine.reference_point_mm[axis], curve.position_mm, curve.value))
+        curves[name] = Curve(curve.position_mm, curve.value - offset, curve.u)
+        offset_um[axis] = offset / MM_PER_UM
+    return raw.replace(curves=curves), offset_um
 
 
 def _missing(errors: ErrorTable) -> list[str]:
     return [name for name in ERROR_NAMES if name not in errors.names]
 
 
-def _axis_summary(runs: AxisRuns, axis: int) -> dict[str, object]:
+def _axis_summary(runs: AxisRuns, axis: int, offset_um: float) -> dict[str, object]:
     own = runs.axis == axis
     return {
         "targets": len(np.unique(np.round(runs.position_mm[own] / SAME_TARGET_MM))),
@@ -146,6 +160,7 @@ def _axis_summary(runs: AxisRuns, axis: int) -> dict[str, object]:
         "directions": sorted(set(runs.direction[own].tolist())),
         "from_mm": float(runs.position_mm[own].min()),
         "to_mm": float(runs.position_mm[own].max()),
+        "taken_off_um": offset_um,
     }
 
 

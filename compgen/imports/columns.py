@@ -1,0 +1,208 @@
+"""What the columns of a foreign table are: fields by the words of their names, units by what stands in brackets."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from compgen.core.names import ERROR_NAMES
+from compgen.core.text import nearest
+from compgen.errors import InputError
+
+MM_PER_LENGTH = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "m": 1e3, "cm": 10.0, "in": 25.4, "mil": 0.0254, "0.1um": 1e-4}
+RAD_PER_ANGLE = {
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "urad": 1e-6,
+    "arcsec": 4.84813681109536e-6,
+    "deg": 0.017453292519943295,
+    "um/m": 1e-6,
+    "mm/m": 1e-3,
+}
+_UNIT_WORDS = {
+    "micron": "um",
+    "microns": "um",
+    "mikrometer": "um",
+    "micrometer": "um",
+    "inch": "in",
+    "inches": "in",
+    '"': "arcsec",
+    "''": "arcsec",
+    "sec": "arcsec",
+    "as": "arcsec",
+    "microrad": "urad",
+    "millimeter": "mm",
+    "degree": "deg",
+    "meter": "m",
+}
+#: Words of column names by field; the words are compared without case, accents, blanks and units.
+FIELDS: Mapping[str, tuple[str, ...]] = {
+    "position": ("position", "pos", "target", "targetposition", "nominal", "nominalposition", "soll", "sollposition",
+                 "sollwert", "command", "commanded", "cmd", "setpoint", "targets", "zielposition", "axisposition"),
+    "actual": ("actual", "actualposition", "measured", "measuredposition", "ist", "istposition", "istwert", "reading",
+               "laserreading", "laserposition", "measurement"),
+    "deviation": ("deviation", "dev", "error", "err", "abweichung", "positionsabweichung", "fehler", "diff", "difference",
+                  "delta", "poserror", "positionerror", "positioningerror", "positiondeviation"),
+    "correction": ("correction", "compensation", "comp", "korrektur", "korrekturwert", "compensationvalue"),
+    "direction": ("direction", "dir", "richtung", "approach", "fahrtrichtung", "way", "anfahrrichtung"),
+    "run": ("run", "cycle", "lauf", "messlauf", "pass", "zyklus", "runno", "runnumber", "cycleno", "messreihe"),
+    "axis": ("axis", "achse"),
+    "station": ("station", "tracer", "stationid", "trackerposition", "standpunkt"),
+    "point": ("point", "pointid", "pt", "punkt", "pointno", "pointname", "target id", "id", "no", "nr"),
+    "length": ("length", "displacement", "distance", "laenge", "lange", "laserlength", "laser", "range", "abstand"),
+    "x": ("x", "xcmd", "xcommanded", "xnom", "xnominal", "xsoll", "xpos", "xposition", "commandedx", "nominalx", "xtarget"),
+    "y": ("y", "ycmd", "ycommanded", "ynom", "ynominal", "ysoll", "ypos", "yposition", "commandedy", "nominaly", "ytarget"),
+    "z": ("z", "zcmd", "zcommanded", "znom", "znominal", "zsoll", "zpos", "zposition", "commandedz", "nominalz", "ztarget"),
+    "dx": ("dx", "xdev", "xerror", "xdeviation", "deltax", "errorx", "ex", "devx", "xabweichung"),
+    "dy": ("dy", "ydev", "yerror", "ydeviation", "deltay", "errory", "ey", "devy", "yabweichung"),
+    "dz": ("dz", "zdev", "zerror", "zdeviation", "deltaz", "errorz", "ez", "devz", "zabweichung"),
+    "xa": ("xactual", "xmeasured", "xmeas", "xist", "actualx", "measuredx", "xact"),
+    "ya": ("yactual", "ymeasured", "ymeas", "yist", "actualy", "measuredy", "yact"),
+    "za": ("zactual", "zmeasured", "zmeas", "zist", "actualz", "measuredz", "zact"),
+    "error": ("errorname", "parameter", "component", "parametername"),
+    "value": ("value", "wert"),
+    "u_value": ("uvalue", "u", "uncertainty", "standarduncertainty", "unsicherheit"),
+    "time": ("time", "zeit", "times", "timestamp", "elapsed"),
+}  # fmt: skip
+_BRACKETS = re.compile(r"\s*[\[(<{]\s*([^\])>}]{1,20}?)\s*[\])>}]\s*")
+_SUFFIX = re.compile(r"^(.*?\w)[\s_/,]+([a-zA-Z\u00b5\u03bc\"']{1,12}|um/m|mm/m)$")
+_WAYS_UP = (
+    "+",
+    "+1",
+    "1",
+    "1.0",
+    "up",
+    "u",
+    "fwd",
+    "forward",
+    "positive",
+    "pos",
+    "plus",
+    "vor",
+    "vorwarts",
+    "\u2191",
+    "\u2192",
+    ">",
+)
+_WAYS_DOWN = ("-", "-1", "-1.0", "down", "d", "bwd", "backward", "back", "reverse", "rev", "negative", "neg", "minus", "ruck",
+              "ruckwarts", "zuruck", "\u2193", "\u2190", "<")  # fmt: skip
+_RUN_COLUMN = re.compile(
+    r"(?:(?P<before>[a-z+\-]{1,10}?)[\s_]*)??(?:run|lauf|cycle|messung|messreihe|measurement|pass|r|m|n)?[\s_#.]*"
+    r"(?P<number>\d{1,3})[\s_]*(?P<after>[a-z]{1,10}|[+\-\u2191\u2193\u2190\u2192<>])?"
+)
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column: its name in the file, the name without unit, and the unit if it says one."""
+
+    name: str
+    word: str
+    unit: str | None
+
+
+@dataclass(frozen=True)
+class RunColumn:
+    """A column of readings of one run: its name, number, and direction (0: not in the name)."""
+
+    name: str
+    number: int
+    direction: int
+
+
+def known_unit(text: str) -> str | None:
+    """Return the name of a unit of length or angle as it is used here; None if it is none.
+
+    >>> known_unit("µm"), known_unit("Inch"), known_unit("arc sec"), known_unit("kg")
+    ('um', 'in', 'arcsec', None)
+    """
+    word = text.strip().lower().replace("\u00c2", "").replace("\u00e2", "").replace(" ", "")
+    word = word.replace("\u00b5", "u").replace("\u03bc", "u")
+    word = _UNIT_WORDS.get(word, word)
+    return word if word in MM_PER_LENGTH or word in RAD_PER_ANGLE else None
+
+
+def split_name(name: str) -> Column:
+    """Split a column's name into words and unit.
+
+    >>> split_name("Pos. [mm]"), split_name("dx_um").unit, split_name("Abweichung / µm").unit
+    (Column(name='Pos. [mm]', word='pos', unit='mm'), 'um', 'um')
+    """
+    bracket = _BRACKETS.search(name)
+    if bracket and known_unit(bracket.group(1)):
+        rest = name[: bracket.start()] + " " + name[bracket.end() :]
+        return Column(name, _word(rest), known_unit(bracket.group(1)))
+    suffix = _SUFFIX.match(name.strip())
+    if suffix and known_unit(suffix.group(2)):
+        return Column(name, _word(suffix.group(1)), known_unit(suffix.group(2)))
+    return Column(name, _word(name), None)
+
+
+def _word(text: str) -> str:
+    flat = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
+    return re.sub(r"[^a-z0-9]", "", flat)
+
+
+def fields_of(header: Sequence[str], given: Mapping[str, str]) -> dict[str, Column]:
+    """Return the column of each field: those that the user gave, then those whose name says so.
+
+    Raises InputError for a field or column that does not exist.
+    """
+    columns = [split_name(name) for name in header]
+    found: dict[str, Column] = {}
+    for key, name in given.items():
+        if key not in FIELDS:
+            raise InputError(f"{key!r} is no field; {nearest(key, FIELDS)}", field="--map")
+        if name not in header:
+            raise InputError(f"there is no column {name!r}; {nearest(name, header)}", field="--map")
+        found[key] = split_name(name)
+    taken = {column.name for column in found.values()}
+    for key, words in FIELDS.items():
+        if key in found:
+            continue
+        matching = [column for column in columns if column.name not in taken and column.word in words]
+        if matching:
+            found[key] = min(matching, key=lambda column: words.index(column.word))
+            taken.add(found[key].name)
+    return found
+
+
+def error_columns(header: Sequence[str]) -> dict[str, Column]:
+    """Return the columns that are called like the errors of ISO 230-1."""
+    columns = [split_name(name) for name in header]
+    return {column.word.upper(): column for column in columns if column.word.upper() in ERROR_NAMES}
+
+
+def way(text: str) -> int | None:
+    """Return the direction that a cell names, +1 or -1; None if it names none.
+
+    >>> way("forward"), way("-"), way("1"), way("x")
+    (1, -1, 1, None)
+    """
+    flat = unicodedata.normalize("NFKD", text.strip().lower())
+    word = "".join(char for char in flat if not unicodedata.combining(char))
+    if word in _WAYS_UP:
+        return 1
+    return -1 if word in _WAYS_DOWN else None
+
+
+def run_columns(header: Sequence[str], taken: Sequence[str]) -> list[RunColumn]:
+    """Return the columns that hold one run each, such as ``Run 1 +``, ``fwd2``, ``r3``.
+
+    >>> run_columns(["target", "Run 1+", "Run 1-", "bwd 2"], ["target"])[1:]
+    [RunColumn(name='Run 1-', number=1, direction=-1), RunColumn(name='bwd 2', number=2, direction=-1)]
+    """
+    found = []
+    for name in header:
+        if name in taken:
+            continue
+        bare = _BRACKETS.sub(" ", name).strip().lower()
+        match = _RUN_COLUMN.fullmatch(bare)
+        if match:
+            parts = [part for part in (match.group("before"), match.group("after")) if part]
+            ways = [way(part) for part in parts if part not in FIELDS["deviation"]]
+            if None not in ways:
+                found.append(RunColumn(name, int(match.group("number")), next((one for one in ways if one), 0)))
+    return found

@@ -1,0 +1,211 @@
+"""From the readers of the single formats to imported objects: units, sign, axis, and what each format leaves open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compgen.controllers.etalon_exchange import errors_from_etalon
+from compgen.core.names import AXES, MM_PER_UM
+from compgen.errors import InputError
+from compgen.imports.capture import read_capture
+from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, known_unit
+from compgen.imports.ecmc import read_ecmc
+from compgen.imports.hypotheses import ABSURD_DECADES, decades_off, unit_of_deviations, usual_deviation_mm
+from compgen.imports.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion
+from compgen.imports.renishaw import UNITS, Renishaw, read_renishaw
+from compgen.imports.result import Imported, ImportOptions, Kind
+from compgen.imports.source import read_source
+from compgen.imports.tables import runs_of
+
+MOST_EXCHANGE_BYTES = 16_000_000
+#: A slope of readings over targets further from 1 is no error of a machine.
+SLOPE_TOLERANCE = 0.01
+_USER_TEXT = (
+    "machine",
+    "serial no",
+    "date",
+    "by",
+    "axis",
+    "location",
+    "title",
+    "owner",
+    "version no",
+    "filetype",
+    "flags",
+)
+
+
+def import_renishaw(path: Path, options: ImportOptions) -> Imported:
+    """Import .rtl, .rta or .rts: axis runs, or with ``options.error`` that error over the axis."""
+    found = read_renishaw(path)
+    angular = found.letter == "a"
+    doubts: list[str] = []
+    notes = [*found.notes, "deviations are measured minus target (errors), as the maker's software has them"]
+    axis = options.axis or axis_in(found.keys.get("axis", ""))
+    runs, unit = _scaled(found, options, doubts, notes)
+    runs = _with_directions(found, runs, options, doubts)
+    if options.sign == "correction":
+        runs = runs.negated()
+        notes.append("the values were said to be corrections: their sign was turned round")
+    understood = {
+        "axis": axis,
+        **_facts(runs, angular=angular),
+        "unit": f"{unit} (by the type of the file; it does not stand in it)" if "value" not in options.units else unit,
+        "sign": "measured minus target" if options.sign != "correction" else "target minus measured, turned round",
+        "directions_from": options.directions or "the order of the targets in each run",
+        "instrument": found.keys.get("owner") or "Renishaw laser software",
+        "encoding": found.encoding,
+        **{key: found.keys[key] for key in _USER_TEXT if found.keys.get(key)},
+    }
+    metadata = {"source": path.name, **({"date": found.keys["date"]} if found.keys.get("date") else {})}
+    if found.letter == "l" and options.error is None:
+        if axis is None:
+            named = f" ('{found.keys['axis']}')" if found.keys.get("axis") else ""
+            doubts.append(f"the file does not say X, Y or Z{named}; give --axis")
+        data = runs_of({axis or "": runs}, str(path), metadata)
+        return Imported(path, "renishaw", "axis", data, understood, tuple(doubts), tuple(notes))
+    error = _error_named(path, axis, options, doubts, angular=angular)
+    table, reversal = errors_of(runs, error, metadata)
+    return Imported(path, "renishaw", "errors", table, understood, tuple(doubts), tuple(notes), reversal)
+
+
+def _error_named(path: Path, axis: str | None, options: ImportOptions, doubts: list[str], *, angular: bool) -> str:
+    """Return the error that the user named; without one a stand-in, with the doubt that keeps it from being used."""
+    if options.error is None:
+        about = "EA?, EB? or EC? with the axis in place of ?" if angular else "the straightness error, for example EYX"
+        doubts.append(f"which error it is does not stand in the file; give --error ({about})")
+        letter = axis or "X"
+        return f"E{'B' if angular else AXES[(AXES.index(letter) + 1) % 3]}{letter}"
+    try:
+        return check_error(options.error, axis, angular=angular)
+    except InputError as error:
+        raise InputError(error.message, file=path, field="--error") from error
+
+
+def _scaled(found: Renishaw, options: ImportOptions, doubts: list[str], notes: list[str]) -> tuple[OneAxis, str]:
+    """Readings in mm or rad; the unit of the type is held against the size of the numbers."""
+    angular = found.letter == "a"
+    units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
+    usual = 1e-5 if angular else usual_deviation_mm(float(np.ptp(found.runs.position_mm)))
+    given = options.units.get("value") or options.units.get("deviation")
+    unit = known_unit(given) if given else UNITS[found.letter]
+    if unit not in units:
+        raise InputError(
+            f"{given!r} is no unit of {'angle' if angular else 'length'}; {', '.join(units)} are", field="--unit"
+        )
+    weighed = {name: units[name] for name in (("urad", "mrad", "arcsec") if angular else ("um", "mm"))}
+    judged = unit_of_deviations(found.runs.value, weighed, usual)
+    if not given and abs(decades_off(found.runs.value, units[unit], usual)) > ABSURD_DECADES:
+        doubts.append(
+            f"such files are in {unit}, but the numbers look like {judged.best}; give --unit value={unit} if it is so"
+        )
+    elif not given:
+        notes.append(f"by the size of the numbers {judged.text()}")
+    return replace(found.runs, value=found.runs.value * units[unit]), unit
+
+
+def _with_directions(found: Renishaw, runs: OneAxis, options: ImportOptions, doubts: list[str]) -> OneAxis:
+    if options.directions == "alternate":
+        _, order = np.unique(found.one_way, return_inverse=True)
+        direction = np.where(order % 2 == 0, 1, -1).astype(np.int64)
+        return replace(runs, direction=direction, run=cycles(direction, found.one_way))
+    if found.sorted_rows and options.directions is None:
+        doubts.append(
+            "its flags say runs in both directions, but every run lists the targets in the same order; give --directions "
+            "alternate (odd runs up, even runs down) or motion"
+        )
+    if not runs.direction.all():
+        doubts.append("a run has a single target: its direction is not known")
+    return runs
+
+
+def _facts(runs: OneAxis, *, angular: bool) -> dict[str, object]:
+    facts = runs.summary()
+    unit, scale = ("urad", 1e-6) if angular else ("um", MM_PER_UM)
+    sizes = {f"{key}_{unit}": float(str(facts.pop(key))) / scale for key in ("rms", "largest")}
+    return {**facts, **sizes}
+
+
+def import_ecmc(path: Path, options: ImportOptions) -> Imported:
+    """Import an ISO 230-2 input file of the ecmc tools; it does not say which axis it is."""
+    found = read_ecmc(path)
+    doubts, notes = [], ["deviations are reading minus target; nothing was taken out of them"]
+    if options.axis is None and options.error is None:
+        doubts.append("the file does not say X, Y or Z; give --axis")
+    if abs(found.slope - 1.0) > SLOPE_TOLERANCE:
+        doubts.append(
+            f"the readings follow the targets with the slope {found.slope:.5g}, which is no error of a machine: a gear ratio or "
+            "a sign is missing; correct the readings first, and say so where the result is used"
+        )
+    runs = found.runs
+    if options.directions == "motion":
+        runs = replace(runs, direction=motion(runs.position_mm, 2 * runs.run + (runs.direction < 0)))
+    if options.sign == "correction":
+        runs = runs.negated()
+    understood = {
+        "axis": options.axis,
+        **_facts(runs, angular=False),
+        "unit": found.keys.get("UNIT", "mm (none stated)"),
+        "sign": "reading minus target",
+        "directions_from": "the order of the targets: FWD goes through them as they are numbered",
+        "slope_of_readings": found.slope,
+        "offset_mm": found.offset_mm,
+        "instrument": found.keys.get("REF_PV"),
+    }
+    metadata = {"source": path.name}
+    if options.error is None:
+        data = runs_of({options.axis or "": runs}, str(path), metadata)
+        return Imported(path, "ecmc-iso230", "axis", data, understood, tuple(doubts), tuple(notes))
+    error = _error_named(path, options.axis, options, doubts, angular=False)
+    table, reversal = errors_of(runs, error, metadata)
+    return Imported(path, "ecmc-iso230", "errors", table, understood, tuple(doubts), tuple(notes), reversal)
+
+
+def import_exchange(path: Path, options: ImportOptions) -> Imported:
+    """Import an Etalon exchange file, variant Vendor: errors in mm and rad, as they stand."""
+    source = read_source(path, most=MOST_EXCHANGE_BYTES)
+    table = errors_from_etalon(source.text, path)
+    notes = [
+        "lengths are mm and angles rad, as the format has them; squareness in the convention of ISO 230-1 (reference X)"
+    ]
+    if options.sign == "correction":
+        curves = {name: replace(curve, value=-curve.value) for name, curve in table.curves.items()}
+        table = table.replace(curves=curves, squareness={k: (-v, u) for k, (v, u) in table.squareness.items()})
+        notes.append("the values were said to be corrections: their sign was turned round")
+    understood = {
+        "errors": list(table.names),
+        "ranges_mm": {name: [float(c.position_mm[0]), float(c.position_mm[-1])] for name, c in table.curves.items()},
+        "points": {name: len(curve.position_mm) for name, curve in table.curves.items()},
+        "largest_um_urad": {
+            **{n: float(np.max(np.abs(c.value))) * (1e3 if n[1] in "XYZ" else 1e6) for n, c in table.curves.items()},
+            **{name: abs(value) * 1e6 for name, (value, _) in table.squareness.items()},
+        },
+        "unit": "mm, rad",
+        "sign": "errors" if options.sign != "correction" else "corrections, turned round",
+        "instrument": "laser tracer software (Etalon exchange)",
+    }
+    kind: Kind = "errors"
+    return Imported(path, "etalon-exchange", kind, table, understood, tuple(_absurd(understood)), tuple(notes))
+
+
+def _absurd(understood: dict[str, Any]) -> list[str]:
+    """Errors of more than 10 mm or 10 mrad are no errors of a machine tool: the unit is another one."""
+    largest = {name: value for name, value in understood["largest_um_urad"].items() if value > 1e4}
+    if not largest:
+        return []
+    name, value = max(largest.items(), key=lambda item: item[1])
+    unit = "um" if name[1] in "XYZ" and name[2] in "XYZ" and name[1] != "0" else "urad"
+    return [f"{name} reaches {value:.4g} {unit}: are the numbers mm and rad?"]
+
+
+def import_capture(path: Path, _: ImportOptions) -> Imported:
+    """Import a dynamic capture: displacement over time."""
+    found = read_capture(path)
+    understood = {**found.summary(), "axis": axis_in(found.keys.get("axis", "")), "instrument": found.keys.get("owner")}
+    understood |= {key: found.keys[key] for key in ("machine", "serial no", "date", "velocity") if found.keys.get(key)}
+    note = "a capture over time has no targets: no other command computes from it"
+    return Imported(path, "renishaw-capture", "capture", found, understood, (), (note,))

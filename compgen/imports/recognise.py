@@ -1,0 +1,116 @@
+"""What a file is, by its first bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from compgen.controllers.etalon_exchange import is_exchange_text
+from compgen.errors import CompgenError, InputError
+from compgen.imports.capture import MOST_BYTES as MOST_CAPTURE
+from compgen.imports.capture import is_capture
+from compgen.imports.ecmc import is_ecmc
+from compgen.imports.grid import grid_of_text
+from compgen.imports.instruments import import_capture, import_ecmc, import_exchange, import_renishaw
+from compgen.imports.renishaw import REFUSED, is_renishaw_text
+from compgen.imports.result import Imported, ImportOptions
+from compgen.imports.sheet import chosen_sheet, read_sheets
+from compgen.imports.source import MOST_BYTES, check_size, decode_head, read_head, read_source, shown
+from compgen.imports.tables import import_table, merged_sheets
+
+#: Columns that make a file one of the project's own.
+OWN = {
+    "lengths": {"station", "point", "x_mm", "y_mm", "z_mm", "length_mm"},
+    "axis": {"axis", "position_mm", "direction", "run", "deviation_um"},
+    "errors": {"error", "position_mm", "value"},
+    "sixdof": {"axis", "position_mm", "displacement_mm"},
+    "deviations": {"x_mm", "y_mm", "z_mm"},
+}
+_DEVIATIONS = {"dx_um", "dy_um", "dz_um"}
+
+
+def own_kind(path: Path) -> str | None:
+    """Return the kind of a file in the project's own format, None for a foreign one; InputError for what is no data."""
+    check_size(path, MOST_CAPTURE)
+    head = read_head(path)
+    if head.startswith((b"PK\x03\x04", b"HEADER::", b"\xff\xfe", b"\xfe\xff")):
+        return None
+    lines = (line.strip() for line in decode_head(head).lstrip("\ufeff").split("\n"))
+    header = next((line for line in lines if line and not line.startswith("#")), "")
+    names = {name.strip().strip('"') for name in header.split(",")}
+    if "y_qd1_mm" in names or "y_psd1_mm" in names:
+        return "sixdof"
+    for kind, needed in OWN.items():
+        if needed <= names and (kind != "deviations" or names & _DEVIATIONS):
+            return kind
+    return None
+
+
+def form_of(path: Path) -> str:
+    """Return the name of a foreign file's format."""
+    check_size(path, MOST_CAPTURE)
+    head = read_head(path)
+    if head.startswith(b"PK\x03\x04"):
+        return "xlsx"
+    if is_capture(head) or path.suffix.lower() == ".rtx":
+        return "renishaw-capture"
+    text = decode_head(head)
+    if is_renishaw_text(text) or path.suffix.lower() in REFUSED:
+        return "renishaw"
+    if is_ecmc(text):
+        return "ecmc-iso230"
+    if is_exchange_text(text.lstrip("\ufeff")):
+        return "etalon-exchange"
+    check_size(path, MOST_BYTES)
+    return "table"
+
+
+def import_file(path: str | Path, options: ImportOptions | None = None) -> Imported:
+    """Import any foreign file that is known.
+
+    Raises
+    ------
+    InputError
+        with file, line and column for one that is damaged, cut, too large or not known.
+    """
+    source, chosen = Path(path), options or ImportOptions()
+    item = READERS[form_of(source)](source, chosen)
+    if chosen.kind is not None and item.kind != chosen.kind:
+        raise InputError(f"holds {item.kind}, not {chosen.kind}", file=source, field="--kind")
+    return item
+
+
+def _import_text(path: Path, options: ImportOptions) -> Imported:
+    return import_table(grid_of_text(read_source(path)), options)
+
+
+def _import_workbook(path: Path, options: ImportOptions) -> Imported:
+    sheets = read_sheets(path)
+    one = chosen_sheet(path, sheets, options.sheet)
+    if one is not None:
+        return _of_sheet(import_table(one[1], options, "xlsx"), one[0])
+    read, reasons = [], []
+    for name, grid in sheets:
+        try:
+            read.append((name, _of_sheet(import_table(grid, options, "xlsx"), name)))
+        except CompgenError as error:
+            reasons.append(f"{shown(name)}: {error}")
+    if not read:
+        raise InputError(f"no sheet holds a table that can be read: {'; '.join(reasons)}"[:1000], file=path)
+    item = merged_sheets(read)
+    return replace(item, notes=(*item.notes, *(f"sheet left out: {reason}" for reason in reasons)))
+
+
+def _of_sheet(item: Imported, name: str) -> Imported:
+    return replace(item, understood={"sheet": name, **item.understood})
+
+
+READERS: dict[str, Callable[[Path, ImportOptions], Imported]] = {
+    "renishaw": import_renishaw,
+    "renishaw-capture": import_capture,
+    "ecmc-iso230": import_ecmc,
+    "etalon-exchange": import_exchange,
+    "xlsx": _import_workbook,
+    "table": _import_text,
+}

@@ -1,0 +1,97 @@
+"""Tables of geometric errors: a row for each value, or a column for each error over the position of one axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.names import ERROR_INDEX, ERROR_NAMES, SQUARENESS_NAMES, error_named
+from compgen.core.text import nearest
+from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, Column
+from compgen.imports.findings import Findings
+from compgen.imports.hypotheses import USUAL_URAD, usual_deviation_mm
+from compgen.imports.source import parse_number, shown
+
+
+def wide_errors(findings: Findings, columns: Mapping[str, Column]) -> ErrorTable:
+    """Return errors that have a column each; those of one axis share the column of positions."""
+    axes = {error_named(name).axis for name in columns if name not in SQUARENESS_NAMES}
+    if len(axes) > 1 and "axis" not in findings.fields:
+        findings.doubts.append("errors of several axes share one column of positions; give one table for each axis")
+    position = findings.positions_mm("position", findings.numbers("position"))
+    order = np.argsort(position, kind="stable")
+    if np.any(np.diff(position[order]) == 0):
+        raise findings.table.grid.fail("a position stands here twice", findings.table.header_line)
+    curves, squareness = {}, {}
+    for name, column in columns.items():
+        values = np.array(findings.table.numbers(column.name, empty=True))
+        known = np.flatnonzero(np.isfinite(values[order]))
+        si = _si(findings, name, column, values[order][known], float(np.ptp(position)))
+        if name in SQUARENESS_NAMES:
+            squareness[name] = (float(si[0]), float("nan"))
+        else:
+            curves[name] = Curve(position[order][known], si, np.full(len(known), np.nan))
+    return _finished(findings, curves, squareness)
+
+
+def long_errors(findings: Findings) -> ErrorTable:
+    """Return errors that have a row for each value: name, position, value."""
+    table = findings.table
+    names = [cell.strip().upper() for cell in table.column(findings.fields["error"].name)]
+    for name, line in zip(names, table.lines, strict=True):
+        if name not in ERROR_INDEX:
+            message = f"{shown(name)} is no error of ISO 230-1; {nearest(name, ERROR_NAMES)}"
+            raise table.grid.fail(message, line, findings.fields["error"].name)
+    cells = table.column(findings.fields["position"].name)
+    values = findings.numbers("value")
+    raw = np.array([np.nan if not cell else parse_number(cell) or 0.0 for cell in cells])
+    span = raw[np.isfinite(raw)]
+    position = np.full(len(raw), np.nan)
+    if span.size:
+        position[np.isfinite(raw)] = findings.positions_mm("position", span)
+    curves, squareness = {}, {}
+    for name in dict.fromkeys(names):
+        rows = np.flatnonzero(np.array(names) == name)
+        si = _si(findings, name, findings.fields["value"], values[rows], float(np.ptp(span)) if span.size else 0.0)
+        if name in SQUARENESS_NAMES:
+            squareness[name] = (float(si[0]), float("nan"))
+            continue
+        order = rows[np.argsort(position[rows])]
+        at = position[order]
+        if not np.all(np.isfinite(at)) or np.any(np.diff(at) == 0):
+            raise table.grid.fail(f"{name} has a position that is empty or stands twice", table.lines[int(rows[0])])
+        curves[name] = Curve(at, si[np.argsort(position[rows])], np.full(len(rows), np.nan))
+    return _finished(findings, curves, squareness)
+
+
+def _si(findings: Findings, name: str, column: Column, values: np.ndarray, span_mm: float) -> np.ndarray:
+    """Values of one error in mm or rad; a length may have an angle's unit (um/m) for squareness only."""
+    if not len(values):
+        raise findings.table.grid.fail("holds no value", findings.table.header_line, column.name)
+    angular = error_named(name).kind != "linear"
+    key = "value"
+    findings.fields = {**findings.fields, key: column}
+    units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
+    declared = findings.given_unit("angle" if angular else "linear") or column.unit
+    if declared in units:
+        findings.understood[f"unit_{'angle' if angular else 'length'}"] = declared
+        return values * units[declared]
+    findings.fields = {**findings.fields, key: Column(column.name, column.word, None)}
+    usual = USUAL_URAD * 1e-6 if angular else usual_deviation_mm(span_mm)
+    return findings.values_si(key, column.name, values, usual, angular=angular)
+
+
+def _finished(findings: Findings, curves: dict[str, Curve], squareness: dict[str, tuple[float, float]]) -> ErrorTable:
+    sign = -1.0 if findings.options.sign == "correction" else 1.0
+    findings.understood |= {
+        "errors": [*curves, *squareness],
+        "sign": "errors" if sign > 0 else "corrections, turned round",
+    }
+    words = " ".join([*findings.table.header, *findings.table.metadata, *findings.table.metadata.values()]).lower()
+    if findings.options.sign is None and any(word in words for word in ("correct", "compensat", "korrektur")):
+        findings.doubts.append("the file speaks of corrections; give --sign error or correction")
+    turned = {name: Curve(curve.position_mm, sign * curve.value, curve.u) for name, curve in curves.items()}
+    constants = {name: (sign * value, u) for name, (value, u) in squareness.items()}
+    return ErrorTable(turned, constants, {"source": findings.table.grid.path.name})

@@ -1,0 +1,174 @@
+"""From a foreign table to the objects of the project: what kind it is, and what each kind needs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from compgen.core.axis_runs import AxisRuns, check_single
+from compgen.core.error_table import ErrorTable
+from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.reversal import ReversalCurves
+from compgen.errors import InputError
+from compgen.imports.columns import error_columns, fields_of
+from compgen.imports.findings import Findings
+from compgen.imports.grid import Grid, find_table
+from compgen.imports.one_axis import OneAxis, check_error, errors_of
+from compgen.imports.result import Data, Imported, ImportOptions, Kind
+from compgen.imports.source import shown
+from compgen.imports.table_axis import axis_readings
+from compgen.imports.table_errors import long_errors, wide_errors
+from compgen.imports.table_points import deviations_of, lengths_of
+
+
+def import_table(grid: Grid, options: ImportOptions, form: str = "table") -> Imported:
+    """Import one table; InputError if it is none or lacks what its kind needs."""
+    table = find_table(grid)
+    findings = Findings(table, fields_of(table.header, options.columns), options)
+    findings.notes.extend(table.grid.notes)
+    kind = options.kind or _kind(findings)
+    findings.understood["columns"] = {key: column.name for key, column in findings.fields.items()}
+    reversal: ReversalCurves | None = None
+    data: Data
+    if kind == "lengths":
+        _need(findings, "length")
+        data = lengths_of(findings)
+    elif kind == "deviations":
+        data = deviations_of(findings)
+    elif kind == "errors" and options.error is None:
+        columns = error_columns(table.header)
+        if not columns:
+            _need(findings, "error", "position", "value")
+        else:
+            _need(findings, "position")
+        data = wide_errors(findings, columns) if columns else long_errors(findings)
+    else:
+        _need(findings, "position")
+        data, reversal, kind = _along_axes(findings)
+    return Imported(
+        grid.path,
+        form,
+        kind,
+        data,
+        findings.understood,
+        tuple(dict.fromkeys(findings.doubts)),
+        tuple(dict.fromkeys(findings.notes)),
+        reversal,
+    )
+
+
+def _kind(findings: Findings) -> Kind:
+    fields = findings.fields
+    space = {"x", "y", "z"} <= set(fields)
+    if space and "length" in fields:
+        return "lengths"
+    if space and not {"dx", "dy", "dz", "xa", "ya", "za"}.isdisjoint(fields):
+        return "deviations"
+    if "position" in fields and (error_columns(findings.table.header) or {"error", "value"} <= set(fields)):
+        return "errors"
+    if "position" in fields:
+        return "axis"
+    header = ", ".join(findings.table.header)
+    raise findings.table.grid.fail(
+        f"its columns are not known: {shown(header)}; say what they are: --map position=COLUMN --map deviation=COLUMN (axis "
+        "runs), x y z length (lengths), x y z dx dy dz (deviations), error position value (errors)",
+        findings.table.header_line,
+    )
+
+
+def _need(findings: Findings, *keys: str) -> None:
+    for key in keys:
+        if key not in findings.fields:
+            header = ", ".join(findings.table.header)
+            raise findings.table.grid.fail(
+                f"no column is known as {key}; the header has {shown(header)}; give --map {key}=COLUMN",
+                findings.table.header_line,
+            )
+
+
+def _along_axes(findings: Findings) -> tuple[Data, ReversalCurves | None, Kind]:
+    error = findings.options.error
+    angular = error is not None and error[1:2] in ("A", "B", "C")
+    found = axis_readings(findings, angular=angular)
+    path = findings.table.grid.path
+    if error is not None:
+        if len(found) > 1:
+            raise InputError("holds several axes; --error names the error of one", file=path)
+        ((letter, runs),) = found.items()
+        check_error(error, letter or None, angular=angular)
+        findings.understood |= _described(runs, 1e-6 if angular else MM_PER_UM)
+        findings.doubts[:] = [text for text in findings.doubts if "--axis" not in text]
+        table, reversal = errors_of(runs, error, {"source": path.name})
+        return table, reversal, "errors"
+    findings.understood["axes"] = {letter or "?": _described(runs, MM_PER_UM) for letter, runs in found.items()}
+    return runs_of(found, str(path), {"source": path.name}), None, "axis"
+
+
+def _described(runs: OneAxis, unit: float) -> dict[str, object]:
+    facts = runs.summary()
+    name = "um" if unit == MM_PER_UM else "urad"
+    return {
+        **{key: value for key, value in facts.items() if key not in ("rms", "largest")},
+        **{f"{key}_{name}": float(facts[key]) / unit for key in ("rms", "largest")},  # type: ignore[arg-type]
+    }
+
+
+def runs_of(found: dict[str, OneAxis], file: str, metadata: dict[str, str]) -> AxisRuns:
+    """Return the readings of all axes as one object; an axis that is not known counts as X until the user has said it."""
+    parts = list(found.items())
+    runs = AxisRuns(
+        axis=np.concatenate([np.full(len(item.value), AXES.index(letter or "X")) for letter, item in parts]),
+        position_mm=np.concatenate([item.position_mm for _, item in parts]),
+        direction=np.concatenate([item.direction for _, item in parts]),
+        run=np.concatenate([item.run for _, item in parts]),
+        deviation_mm=np.concatenate([item.value for _, item in parts]),
+        metadata=metadata,
+        origin=[(file, int(line)) for _, item in parts for line in item.line],
+    )
+    check_single(runs)
+    return runs
+
+
+def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
+    """Return several sheets of one workbook, each the runs of another axis or other errors, as one."""
+    first = parts[0][1]
+    kinds = {item.kind for _, item in parts}
+    names = ", ".join(shown(name) for name, _ in parts)
+    if len(parts) == 1:
+        return first
+    if kinds == {"axis"}:
+        data: Data = _joined_runs([item.data for _, item in parts if isinstance(item.data, AxisRuns)])
+    elif kinds == {"errors"}:
+        data = _joined_errors(first, [item.data for _, item in parts if isinstance(item.data, ErrorTable)])
+    else:
+        raise InputError(f"has several tables ({names}); choose one with --sheet", file=first.path)
+    understood = {f"sheet {name}": dict(item.understood) for name, item in parts}
+    doubts = tuple(f"sheet {name}: {text}" for name, item in parts for text in item.doubts)
+    notes = tuple(dict.fromkeys(text for _, item in parts for text in item.notes))
+    return replace(first, data=data, understood=understood, doubts=doubts, notes=notes)
+
+
+def _joined_runs(parts: Sequence[AxisRuns]) -> AxisRuns:
+    runs = AxisRuns(
+        axis=np.concatenate([item.axis for item in parts]),
+        position_mm=np.concatenate([item.position_mm for item in parts]),
+        direction=np.concatenate([item.direction for item in parts]),
+        run=np.concatenate([item.run for item in parts]),
+        deviation_mm=np.concatenate([item.deviation_mm for item in parts]),
+        metadata=parts[0].metadata,
+        origin=[place for item in parts for place in item.origin],
+    )
+    check_single(runs)
+    return runs
+
+
+def _joined_errors(first: Imported, parts: Sequence[ErrorTable]) -> ErrorTable:
+    names = [name for item in parts for name in item.names]
+    doubled = next((name for name in names if names.count(name) > 1), None)
+    if doubled:
+        raise InputError(f"{doubled} stands on two sheets; choose one with --sheet", file=first.path)
+    curves = {name: curve for item in parts for name, curve in item.curves.items()}
+    squareness = {name: value for item in parts for name, value in item.squareness.items()}
+    return ErrorTable(curves, squareness, parts[0].metadata)
