@@ -192,18 +192,21 @@ class Store:
             path.write_bytes(self.blob(identification.covariance_sha256))
             return read_covariance(path)
 
-    def tables(self, machine: MachineRecord | None = None) -> list[TableRecord]:
-        """Return the sets of tables of a machine (or of all) by version, with their states."""
+    def tables(self, machine: MachineRecord | None = None, *, figures: bool = True) -> list[TableRecord]:
+        """Return the sets of tables of a machine (or of all) by version, with their states.
+
+        Without ``figures`` their summaries stay empty, which saves much where the whole fleet is looked at.
+        """
         decided: dict[int, list[DecisionRecord]] = {}
         for decision in self.decisions(machine):
             decided.setdefault(decision.machine_id, []).append(decision)
         table = schema.tables
-        query = _where(sa.select(table), table, machine).order_by(table.c.machine_id, table.c.version)
+        columns = [column for column in table.c if figures or column.name != "summary"]
+        query = _where(sa.select(*columns), table, machine).order_by(table.c.machine_id, table.c.version)
         found = []
         for row in self._rows(query):
             state = state_of(row.id, decided.get(row.machine_id, []))
-            parts = (row.controllers, row.reasons, row.summary, row.at, state)
-            found.append(TableRecord(row.id, row.machine_id, row.version, row.identification_id, row.accepted, *parts))
+            found.append(TableRecord(**{"summary": {}, **row._mapping}, state=state))
         return found
 
     def table_files(self, table: TableRecord) -> list[TableFile]:

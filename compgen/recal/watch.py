@@ -1,0 +1,136 @@
+"""The long-running form: each machine by its schedule, until it is told to stop; edits of the job file are picked up."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from apscheduler.executors.pool import ThreadPoolExecutor
+from apscheduler.schedulers.background import BackgroundScheduler
+from apscheduler.triggers.combining import OrTrigger
+from apscheduler.triggers.cron import CronTrigger
+from apscheduler.triggers.interval import IntervalTrigger
+
+from compgen.core.files import read_bytes
+from compgen.errors import CompgenError
+from compgen.recal import logs
+from compgen.recal.job import Job, MachineJob, job_of_text
+from compgen.recal.runner import MachineOutcome, run_machine
+from compgen.recal.schedule import DAYS, Cron, Every, Schedule
+
+#: How often the job file is looked at, s.
+POLL_S = 2.0
+#: A machine without a schedule is looked at this often.
+UNSCHEDULED = Every(5)
+
+Work = Callable[[MachineJob, str, Callable[[], bool]], MachineOutcome]
+
+
+def _work(job: MachineJob, url: str, stop: Callable[[], bool]) -> MachineOutcome:
+    return run_machine(job, url, stop)
+
+
+def trigger_of(schedule: Schedule) -> Any:
+    """Return the trigger that means the schedule, in local time."""
+    if isinstance(schedule, Every):
+        return IntervalTrigger(minutes=schedule.minutes)
+    days = {"day": _listed(schedule.days)}
+    weekdays = {"day_of_week": ",".join(DAYS[day] for day in schedule.weekdays)}
+    clock = {"minute": _listed(schedule.minutes), "hour": _listed(schedule.hours), "month": _listed(schedule.months)}
+    if isinstance(schedule, Cron) and not (schedule.any_day or schedule.any_weekday):
+        return OrTrigger([CronTrigger(**clock, **days), CronTrigger(**clock, **weekdays)])
+    return CronTrigger(**clock, **days, **weekdays)
+
+
+def _listed(numbers: tuple[int, ...]) -> str:
+    return ",".join(map(str, numbers))
+
+
+class Watch:
+    """Keeps a job running; ``on_outcome`` is told of every pass over a machine, ``threads`` passes run at once."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        work: Work = _work,
+        threads: int = 1,
+        on_outcome: Callable[[MachineOutcome], None] = lambda _: None,
+        poll_s: float = POLL_S,
+    ) -> None:
+        self.path, self.work, self.on_outcome, self.poll_s = path, work, on_outcome, poll_s
+        self.stopped = threading.Event()
+        self.job: Job | None = None
+        self._content = b""
+        self._scheduler = BackgroundScheduler(
+            executors={"default": ThreadPoolExecutor(threads)},
+            job_defaults={"coalesce": True, "max_instances": 1, "misfire_grace_time": None},
+        )
+
+    def stop(self, *_: object) -> None:
+        """Ask to stop; the measurement that is being processed is finished first."""
+        self.stopped.set()
+
+    def run(self, *, signals: bool = True) -> None:
+        """Run until :meth:`stop`, SIGTERM or SIGINT; InputError if the job file is wrong at the beginning."""
+        self._load()
+        if signals:
+            for number in (signal.SIGTERM, signal.SIGINT):
+                signal.signal(number, self.stop)
+        self._scheduler.start()
+        logs.info("watching", job=str(self.path), machines=len(self.job.machines) if self.job else 0)
+        try:
+            while not self.stopped.wait(self.poll_s):
+                self._reload()
+        finally:
+            self.stopped.set()
+            self._scheduler.shutdown(wait=True)
+            logs.info("stopped", job=str(self.path))
+
+    def _load(self) -> None:
+        content = read_bytes(self.path)
+        job = job_of_text(content.decode("utf-8-sig", "replace"), self.path)
+        self._schedule(job)
+        self.job, self._content = job, content
+
+    def _reload(self) -> None:
+        """Take an edited job file; one that is wrong is reported once, and what was known before stays."""
+        try:
+            content = read_bytes(self.path)
+            if content == self._content:
+                return
+            self._content = content
+            self._load()
+            logs.info("job file read anew", job=str(self.path))
+        except CompgenError as error:
+            if self._content != b"":
+                logs.error("job file not taken", job=str(self.path), problem=str(error))
+            if not self.path.is_file():
+                self._content = b""
+
+    def _schedule(self, job: Job) -> None:
+        """Add, replace and remove what changed against the job before; new and changed machines run at once."""
+        before = {} if self.job is None else self.job.machines
+        same_store = self.job is not None and self.job.store == job.store
+        for name in before.keys() - job.machines.keys():
+            self._scheduler.remove_job(name)
+        for name, machine in job.machines.items():
+            if same_store and before.get(name) == machine:
+                continue
+            self._scheduler.add_job(
+                self._pass,
+                trigger_of(machine.schedule or UNSCHEDULED),
+                args=(machine, job.store),
+                id=name,
+                name=name,
+                replace_existing=True,
+                next_run_time=datetime.now().astimezone(),
+            )
+
+    def _pass(self, machine: MachineJob, url: str) -> None:
+        if not self.stopped.is_set():
+            self.on_outcome(self.work(machine, url, self.stopped.is_set))
