@@ -1,0 +1,307 @@
+"""What stands on the two sides of a comparison: error files, measurements of any kind, predictions."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from compgen.accuracy.compare import (
+    Agreement,
+    CompareOptions,
+    Comparison,
+    agreement,
+    compare_errors,
+    compare_fields,
+    compare_runs,
+)
+from compgen.accuracy.evaluate import volume_fields
+from compgen.accuracy.field import Alignment, Field, aligned
+from compgen.accuracy.figure import ComparedFigure, Figure
+from compgen.accuracy.pairing import MeasuredField, check_same_positions, measured_field
+from compgen.accuracy.runs import RunStatistics, axis_statistics
+from compgen.accuracy.source import ErrorSource, error_source
+from compgen.controllers.error_files import read_error_file
+from compgen.controllers.etalon_exchange import is_exchange_text
+from compgen.core.axis_runs import AxisRuns
+from compgen.core.csvio import FloatArray, read_csv
+from compgen.core.deviations import Deviations
+from compgen.core.error_table import ERROR_COLUMNS, ErrorTable
+from compgen.core.files import read_bytes, read_text, sha256_of
+from compgen.core.lengths import POSITION_COLUMNS, Lengths
+from compgen.core.machine import Machine
+from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.points import Points
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.identify import Identification, IdentifyOptions, identify_measurement, joint_covariance, read_measurement
+from compgen.identify.covariance import Covariance, read_covariance
+from compgen.verify import ReadTables
+
+PREDICTED_COLUMNS = ("ex_um", "ey_um", "ez_um")
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side as it was read: ``kind`` in words, and of the rest what that kind has.
+
+    ``deviations`` and ``lengths`` are identified when errors are asked for (:meth:`errors`); ``predicted`` is a field at
+    points.
+    """
+
+    machine: Machine
+    path: Path
+    kind: str
+    source: ErrorSource | None = None
+    deviations: Deviations | None = None
+    lengths: Lengths | None = None
+    runs: dict[str, RunStatistics] | None = None
+    predicted: Field | None = None
+    reversal: dict[str, Figure] | None = None
+    u_um: float | None = None
+
+    def errors(self) -> Side:
+        """Return the side with a source of errors: identified if it is a measurement, with its warnings."""
+        if self.source is not None:
+            return self
+        measurement = self.lengths or self.deviations
+        if measurement is None:
+            raise InputError(f"holds {self.kind}, from which the errors of the machine do not follow", file=self.path)
+        chosen = IdentifyOptions(u_deviation_um=self.u_um if self.lengths is None else None)
+        found = identify_measurement(self.machine, measurement, chosen)
+        return replace(self, source=_source_of(self.machine, found), reversal=_reversal_figures(found))
+
+    def measured(self) -> MeasuredField:
+        """Return measured positions as a field."""
+        assert self.deviations is not None
+        return measured_field(self.machine, self.deviations, self.u_um)
+
+
+def read_side(machine: Machine, path: str | Path, instrument: Path | None = None, u_um: float | None = None) -> Side:
+    """Read an error file, a measurement, or predicted errors at points (the output of ``compgen predict``).
+
+    Parameters
+    ----------
+    machine : the machine.
+    path : the file; its columns tell what it is.
+    instrument : constants of a six-DOF instrument, for ``*.sixdof.csv``.
+    u_um : standard uncertainty of measured deviations, um; default the file's own.
+    """
+    source = Path(path)
+    text = read_text(source)
+    header = _header(text)
+    if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
+        errors = read_error_file(source)
+        return Side(machine, source, "errors", source=error_source(machine, errors, covariance_beside(source, errors)))
+    if set(PREDICTED_COLUMNS) <= header:
+        return Side(machine, source, "predicted errors at points", predicted=_read_predicted(machine, source))
+    holds_sixdof = "y_qd1_mm" in header
+    measurement = read_measurement([source], instrument if holds_sixdof else None)
+    if isinstance(measurement, AxisRuns):
+        return Side(machine, source, "axis runs", runs=axis_statistics(measurement))
+    if isinstance(measurement, Deviations):
+        return Side(machine, source, "measured positions", deviations=measurement, u_um=u_um)
+    if isinstance(measurement, Lengths):
+        return Side(machine, source, "tracer lengths", lengths=measurement)
+    found = identify_measurement(machine, measurement)
+    return Side(machine, source, "six-DOF readings", source=_source_of(machine, found))
+
+
+def _header(text: str) -> set[str]:
+    line = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+    return {name.strip().strip('"') for name in line.split(",")}
+
+
+def covariance_beside(path: Path, errors: ErrorTable) -> Covariance | None:
+    """Return the covariance file that an errors file names, if it lies beside it and belongs to it; warn if it does not."""
+    name = errors.metadata.get("covariance")
+    beside = path.parent / name if name else None
+    if beside is None or not beside.is_file():
+        return None
+    found = read_covariance(beside)
+    if found.errors_sha256 == sha256_of(read_bytes(path)):
+        return found
+    message = f"{beside} belongs to another version of {path.name}; u_value counts, independent from node to node"
+    warnings.warn(message, CompgenWarning, stacklevel=2)
+    return None
+
+
+def _source_of(machine: Machine, found: Identification) -> ErrorSource:
+    return error_source(machine, found.errors, joint_covariance(found) if found.has_covariance else None)
+
+
+def _reversal_figures(found: Identification) -> dict[str, Figure] | None:
+    """Mean reversal of each axis along itself, as the readings show it."""
+    if found.reversal is None:
+        return None
+    figures = {}
+    for name, axis in found.reversal.axes.items():
+        k = AXES.index(name)
+        value, u = float(axis.vector_mm[k]) / MM_PER_UM, float(axis.u_mm[k]) / MM_PER_UM
+        figures[f"B_{name}"] = Figure(value, u, "um", f"mean reversal error of {name} (ISO 230-2), identified")
+    return figures
+
+
+def _read_predicted(machine: Machine, path: Path) -> Field:
+    """Predicted errors at points as a field without uncertainty of its own."""
+    table = read_csv(path, (*POSITION_COLUMNS, *PREDICTED_COLUMNS), ("tool_x_mm", "tool_y_mm", "tool_z_mm"))
+    position = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
+    error = np.column_stack([table.numbers(name) for name in PREDICTED_COLUMNS]) * MM_PER_UM
+    tool = np.array(machine.tool_offset_mm)
+    if "tool_x_mm" in table.columns:
+        tool = np.column_stack([table.numbers(f"tool_{k}_mm") for k in "xyz"])
+        if np.max(np.abs(tool - np.array(machine.tool_offset_mm))) > 1e-6:
+            raise InputError("has another tool offset than the machine; predict with the machine's own", file=path)
+    return Field(position, position + tool, error, lambda _: 0.0)
+
+
+# --- comparing -----------------------------------------------------------------------------------------------------
+
+
+def compare_sides(before: Side, after: Side, options: CompareOptions) -> Comparison:
+    """Compare two sides of like kind: axis runs, measured positions, or errors (given, or identified first).
+
+    Raises
+    ------
+    InputError
+        for kinds that cannot be compared, and for different points unless ``options.align`` says how to align them.
+    """
+    if before.runs is not None and after.runs is not None:
+        return compare_runs(before.runs, after.runs, options)
+    if before.predicted is not None or after.predicted is not None:
+        side = before if before.predicted is not None else after
+        raise InputError(
+            "holds predicted errors at points; compare them with a measurement: --predicted", file=side.path
+        )
+    if before.runs is not None or after.runs is not None:
+        raise InputError(f"BEFORE holds {before.kind}, AFTER {after.kind}; axis runs compare with axis runs only")
+    if before.deviations is not None and after.deviations is not None and options.align != "model":
+        return _positions(before, after, options)
+    if (before.deviations is None) != (after.deviations is None) and options.align != "model":
+        raise InputError(
+            f"BEFORE holds {before.kind}, AFTER {after.kind}; --align model identifies the errors of each and compares those"
+        )
+    said = []
+    if before.lengths is not None and after.lengths is not None:
+        said.append(check_same_positions(before.lengths, after.lengths, options.align))
+    first, second = before.errors(), after.errors()
+    assert first.source is not None and second.source is not None
+    own = replace(options, align=None if options.align == "model" else options.align)
+    found = compare_errors(first.source, second.source, own)
+    for side in (first, second):
+        if side.kind not in ("errors",):
+            said.append(f"{side.path.name}: errors identified from {side.kind}")
+    groups = {name: dict(group) for name, group in found.groups.items()}
+    for key, item in (first.reversal or {}).items():
+        if second.reversal and key in second.reversal:
+            groups["axes"][key] = ComparedFigure(item, second.reversal[key])
+    return replace(found, groups=groups, statements=(*said, *found.statements))
+
+
+def _positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
+    """Points against points; the errors identified from each side beside them, where they follow from the points."""
+    found = compare_fields(before.machine, before.measured(), after.measured(), options)
+    try:
+        first, second = before.errors().source, after.errors().source
+        assert first is not None and second is not None
+        errors = compare_errors(first, second, replace(options, align=None, alignment=None))
+    except (UndeterminedError, InputError) as error:
+        text = f"single errors are not compared: they do not follow from these points ({error})"
+        return replace(found, statements=(*found.statements, text))
+    rest = {name: group for name, group in errors.groups.items() if name != "volume"}
+    text = "axes, diagonals and single errors: identified from the points of each side; " + errors.statements[-2]
+    return replace(found, groups={**found.groups, **rest}, statements=(*found.statements, text))
+
+
+def compare_prediction(predicted: Side, measured: Side, options: CompareOptions) -> Comparison:
+    """Compare a prediction (errors, or errors at points) with what was measured; verdict by the agreement."""
+    first, second = _both_fields(predicted, measured, options)
+    found = agreement(first, second)
+    statements = (
+        f"prediction {predicted.path.name} against {measured.kind}",
+        f"{len(first)} points, {first.alignment}",
+    )
+    return Comparison("prediction", {"volume": dict(found.figures)}, (), statements, found)
+
+
+def with_prediction(
+    found: Comparison, before: Side, after: Side, tables: ReadTables, options: CompareOptions
+) -> Comparison:
+    """Add to a comparison what the emulated control with its tables predicted for AFTER, from the errors BEFORE."""
+    known = before.errors()
+    assert known.source is not None
+    machine = before.machine
+
+    def correction(points: Points) -> FloatArray:
+        return tables.mean_correction(machine, points.position_mm)
+
+    predicted = replace(known, source=replace(known.source, correction=correction), deviations=None, lengths=None)
+    own = replace(options, align=None if options.align == "model" else options.align)
+    first, second = _both_fields(predicted, after, own)
+    text = (
+        f"prediction: {tables.controller.name} emulated with its tables on the errors BEFORE, mean of both directions"
+    )
+    return replace(found, prediction=agreement(first, second), statements=(*found.statements, text))
+
+
+def _both_fields(predicted: Side, measured: Side, options: CompareOptions) -> tuple[Field, Field]:
+    """Predicted and measured field at the same points, aligned alike."""
+    machine = predicted.machine
+    if measured.runs is not None or predicted.runs is not None:
+        raise InputError("axis runs cannot be compared with a prediction of errors", file=measured.path)
+    if measured.predicted is not None:
+        raise InputError("AFTER is a prediction itself; a measurement is due", file=measured.path)
+    alignment: Alignment = options.alignment or ("as-given" if measured.deviations is not None else "axes")
+    if predicted.predicted is not None:
+        alignment = options.alignment or "as-given"
+    if measured.deviations is not None:
+        second = _own_tool(measured).field
+        first = _predicted_at(predicted, second)
+    elif predicted.predicted is not None:
+        source = measured.errors().source
+        assert source is not None
+        first, second = predicted.predicted, source.field(predicted.predicted.position_mm)
+    else:
+        sources = predicted.errors().source, measured.errors().source
+        assert sources[0] is not None and sources[1] is not None
+        (first, _), (second, _) = volume_fields(machine, (sources[0], sources[1]), alignment)
+        return first, second
+    return aligned(machine, first, alignment), aligned(machine, second, alignment)
+
+
+def _own_tool(side: Side) -> MeasuredField:
+    found = side.measured()
+    if not all(found.measured):
+        raise InputError("a prediction compares with dx, dy and dz; not all were measured", file=side.path)
+    offset = found.field.tip_mm - found.field.position_mm - np.array(side.machine.tool_offset_mm)
+    if float(np.max(np.abs(offset))) > 1e-6:
+        raise InputError(
+            "was measured with another tool offset than the machine's; the prediction has the machine's own",
+            file=side.path,
+        )
+    return found
+
+
+def _predicted_at(predicted: Side, measured: Field) -> Field:
+    """Predicted field at the measured points; a list of points must hold every one of them."""
+    if predicted.predicted is None:
+        source = predicted.errors().source
+        assert source is not None
+        return source.field(measured.position_mm)
+    given = predicted.predicted
+    index = {key: k for k, key in enumerate(map(tuple, np.round(given.position_mm, 3).tolist()))}
+    wanted = list(map(tuple, np.round(measured.position_mm, 3).tolist()))
+    missing = [key for key in wanted if key not in index]
+    if missing:
+        raise InputError(
+            f"predicts nothing at {len(missing)} of {len(wanted)} measured points, the first is {missing[0]} mm; "
+            "predict at the measured points",
+            file=predicted.path,
+        )
+    rows = np.array([index[key] for key in wanted])
+    parts = {"position_mm": given.position_mm[rows], "tip_mm": given.tip_mm[rows], "error_mm": given.error_mm[rows]}
+    return replace(given, **parts)
+
+
+__all__ = ["Agreement", "Side", "compare_prediction", "compare_sides", "read_side", "with_prediction"]
