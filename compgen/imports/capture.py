@@ -17,8 +17,8 @@ from compgen.errors import InputError
 from compgen.imports.source import HEAD_BYTES, check_size, parse_number, shown
 
 _START, _DATA = b"HEADER::\r\n", b"\nData:\r\n"
-#: The end mark stands so close behind the samples.
-_TRAILER_BYTES = 16
+#: The end mark is looked for in so many bytes behind the samples.
+_TRAILER_BYTES, _SAMPLE_BYTES = 16, 8
 MOST_BYTES = 4_000_000_000
 #: More samples than this are not written as text.
 MOST_ROWS = 2_000_000
@@ -69,13 +69,13 @@ def read_capture(path: Path) -> Capture:
     start = head.index(_DATA) + len(_DATA)
     keys = _keys(head[: start - len(_DATA) + 1].decode("utf-8", errors="replace"))
     count = _whole(path, keys, "sample no")
-    if size < start + 8 * count:
-        held = max(0, (size - start) // 8)
+    if size < start + _SAMPLE_BYTES * count:
+        held = max(0, (size - start) // _SAMPLE_BYTES)
         raise InputError(f"declares {count} samples but holds {held}: it was cut", file=path, field="Sample no")
     with path.open("rb") as stream:
-        stream.seek(start + 8 * count)
+        stream.seek(start + _SAMPLE_BYTES * count)
         trailer = stream.read(_TRAILER_BYTES)
-    if b"EOF" not in trailer:
+    if not 0 <= trailer.find(b"EOF") < _SAMPLE_BYTES:  # further off, a sample that is not counted would stand before it
         raise InputError("has no end mark EOF:: behind its samples: it was cut, or Sample no is wrong", file=path)
     value = np.memmap(path, dtype="<f8", mode="r", offset=start, shape=(count,))
     for first in range(0, count, 1_000_000):

@@ -74,8 +74,8 @@ def _measured(path: Path, kind: str | None) -> Plain:
 def _settled(path: Path) -> Imported:
     item = import_file(path)
     item.check_settled()
-    for text in item.notes:
-        warnings.warn(f"{path}: {text}", CompgenWarning, stacklevel=3)
+    facts = "; ".join([f"{item.format}, {item.kind}", *item.notes])
+    warnings.warn(f"{path} was taken as: {facts} ('compgen import' shows all)", CompgenWarning, stacklevel=3)
     return item
 
 
