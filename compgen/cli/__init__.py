@@ -14,6 +14,7 @@ from compgen.cli import (
     listing_commands,
     options_commands,
     plan_commands,
+    recal_commands,
     run_commands,
     safety_commands,
     simulate_commands,
@@ -50,6 +51,7 @@ MODULES = (
     export_commands,
     options_commands,
     safety_commands,
+    recal_commands,
     listing_commands,
 )
 for module in MODULES:
