@@ -19,14 +19,13 @@ Curve = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class HiddenMachine:
-    """A machine: chain, travel (3, 2) mm, screw pitches (3,) mm; ``left_out`` are errors that its model does not know."""
+    """A machine: chain, travel (3, 2) mm, screw pitches (3,) mm, nodes of each curve."""
 
     name: str
     chain: str
     range_mm: np.ndarray
     pitch_mm: np.ndarray
     nodes: int = 11
-    left_out: tuple[str, ...] = ()
 
     def unit(self, axis: int, position_mm: np.ndarray) -> np.ndarray:
         """Position over the travel, -1 ... 1."""

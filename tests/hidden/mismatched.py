@@ -33,7 +33,7 @@ def uneven_expansion(session: Session, rng: np.random.Generator) -> Change:
 
 def saturating_lag(session: Session, rng: np.random.Generator) -> Change:
     """Lag of X that saturates with speed."""
-    return along(session, 0, np.tanh(session.velocity[:, 0] / 60.0))
+    return along(session, 0, np.tanh(session.velocity[:, 0] / 90.0))
 
 
 def soft_backlash(session: Session, rng: np.random.Generator) -> Change:
