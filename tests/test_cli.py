@@ -108,8 +108,11 @@ def test_run_writes_everything_and_exits_with_0(call, small_machine_file, small_
     code, stdout, stderr = call("run", small_machine_file, small_lengths_file, "--controller", "isg-csv", "--out", out)
     assert (code, stderr) == (0, "")
     assert sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()) == [
+        "calibration.json",
         "check/check-program.md",
         "check/check-program.nc",
+        "dossier.json",
+        "dossier.md",
         "fit.json",
         "fitted.errors.csv",
         "identified.covariance.npz",
@@ -118,6 +121,8 @@ def test_run_writes_everything_and_exits_with_0(call, small_machine_file, small_
         "machine.toml",
         "manifest.json",
         "preflight.md",
+        "report.html",
+        "report.json",
         "residuals.csv",
         "result.json",
         "stations.csv",
@@ -510,6 +515,7 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
         ),
         "merge": (small_machine_file, tables / "volcomp0.csv", *files, "--errors", errors_file, "--out", out),
         "options": (small_machine_file, errors_file, "--out", out),
+        "report": (tables, "--out", out),
     }
 
 
@@ -526,6 +532,7 @@ WRITING = [
     "diff",
     "merge",
     "options",
+    "report",
 ]
 
 

@@ -7,6 +7,7 @@ import sys
 import click
 
 from compgen.cli import (
+    compare_commands,
     diagnose_commands,
     export_commands,
     identify_commands,
@@ -15,6 +16,7 @@ from compgen.cli import (
     options_commands,
     plan_commands,
     recal_commands,
+    report_commands,
     run_commands,
     safety_commands,
     simulate_commands,
@@ -49,6 +51,8 @@ MODULES = (
     diagnose_commands,
     plan_commands,
     export_commands,
+    compare_commands,
+    report_commands,
     options_commands,
     safety_commands,
     recal_commands,

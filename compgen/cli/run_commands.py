@@ -27,6 +27,7 @@ from compgen.cli.identify_commands import (
     systematic_options,
 )
 from compgen.cli.options_commands import explain_option, explain_run
+from compgen.cli.report_commands import report_beside
 from compgen.cli.safety_options import active_options, limits_option
 from compgen.cli.sample_options import sample_options
 from compgen.core.machine import Machine
@@ -55,6 +56,7 @@ from compgen.verify.safety import SafetyLimits
 @active_options()
 @limits_option
 @explain_option
+@click.option("--no-report", is_flag=True, help="Write no report.html, and none of the files that belong to it.")
 @json_option
 def run_command(
     machine: Machine,
@@ -73,13 +75,14 @@ def run_command(
     active: ActiveTables | None,
     limits: SafetyLimits,
     explain: bool,
+    no_report: bool,
     as_json: bool,
 ) -> int:
     """Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.
 
     MACHINE is a name in machines/ or the path of a machine TOML; MEASUREMENTS are *.lengths.csv (mm)
     or *.deviations.csv files, or *.sixdof.csv with --instrument FILE. With several --controller each gets its own
-    sub-folder of DIR.
+    sub-folder of DIR. report.html in DIR shows everything; --no-report leaves it out.
 
     \b
     Example:
@@ -100,16 +103,21 @@ def run_command(
             progress=show,
             instrument=instrument,
         )
+        if not no_report:
+            show("drawing the report")
+        report = None if no_report else report_beside(out)
     if explain:
         explain_run(machine, result, out, templates)
     if as_json:
-        print_json(run_json(result))
+        print_json({**run_json(result), "report": None if report is None else str(report)})
     else:
         stdout.print(identification_table(result.identification))
         stdout.print(verification_table([item.verification for item in result.results]))
         for item in result.results:
             for path in item.paths:
                 stdout.print(f"  {path}", markup=False, soft_wrap=True)
+        if report is not None:
+            stdout.print(f"  {report}", markup=False, soft_wrap=True)
     return 0 if result.accepted else 1
 
 

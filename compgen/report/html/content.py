@@ -1,0 +1,266 @@
+"""The report as plain data: what ``report.json`` holds, and what page, dossier and terminal say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from compgen.core.error_table import ErrorTable
+from compgen.core.names import error_named
+from compgen.export import program_version
+from compgen.report.html.curves import COVERAGE, describe_error
+from compgen.report.html.folder import ControlFolder, ResultFolder
+from compgen.report.html.limitations import limitations
+
+#: Figures of a residual field and what they are.
+FIGURES = (
+    ("max_um", "largest error |e|"),
+    ("rms_um", "rms of |e|"),
+    ("p95_um", "95 % of the points below"),
+    ("v_x_um", "V_X, range of the X component (ISO 230-1)"),
+    ("v_y_um", "V_Y, range of the Y component (ISO 230-1)"),
+    ("v_z_um", "V_Z, range of the Z component (ISO 230-1)"),
+)
+VERDICTS = {"accepted": "Accepted", "partial": "Accepted, partial", "rejected": "Not accepted"}
+#: Rows of a generic table of figures.
+MOST_ROWS = 400
+
+
+def content(source: ResultFolder) -> dict[str, Any]:
+    """Return the numbers of the report; only plain values, every text as it stands in the files."""
+    controls = [_control(item) for item in source.controls]
+    return {
+        "format": "compgen report 1",
+        "kind": source.kind,
+        "title": _machine_name(source),
+        "verdict": _verdict(source, controls),
+        "controls": controls,
+        "errors": _errors(source.identified),
+        "measurement": _measurement(source),
+        "accuracy": list(figure_rows(source.accuracy)),
+        "compare": list(figure_rows(source.compare)),
+        "machine": _machine(source),
+        "provenance": _provenance(source),
+        "limitations": limitations(source),
+        "notes": list(source.notes),
+    }
+
+
+def _machine_name(source: ResultFolder) -> str:
+    if source.machine is not None:
+        return source.machine.name
+    for item in source.controls:
+        name = item.manifest.get("machine", {}).get("name")
+        if name:
+            return str(name)
+    if source.identified is not None and source.identified.metadata.get("machine"):
+        return source.identified.metadata["machine"]
+    return str(source.compare.get("machine", source.folder.resolve().name))
+
+
+def _control(item: ControlFolder) -> dict[str, Any]:
+    result = item.result
+    accepted = bool(result.get("accepted"))
+    state = "rejected" if not accepted else "partial" if result.get("partial") else "accepted"
+    return {
+        "name": item.name,
+        "state": state,
+        "verdict": VERDICTS[state],
+        "format": item.manifest.get("format", ""),
+        "evidence": item.manifest.get("evidence", ""),
+        "points": result.get("points"),
+        "before": result.get("before", {}),
+        "after": result.get("after", {}),
+        "before_rigid": result.get("before_rigid_motion_removed", {}),
+        "after_rigid": result.get("after_rigid_motion_removed", {}),
+        "unrepresentable_um": result.get("unrepresentable_um"),
+        "uncorrected": [
+            {"error": name, "um": value, "why": why_uncorrected(name)}
+            for name, value in dict(result.get("uncorrected_um", {})).items()
+        ],
+        "reasons": list(result.get("reasons", [])),
+        "notes": list(result.get("notes", [])),
+        "warnings": list(item.manifest.get("warnings", [])),
+        "sign_statement": item.manifest.get("sign_statement", ""),
+        "parameters": list(item.manifest.get("parameters", [])),
+        "unverified": list(item.manifest.get("unverified", [])),
+        "settings": dict(item.manifest.get("settings", {})),
+        "files": [
+            {"name": f.name, "sha256": f.sha256, "bytes": f.size, "lines": f.lines, "intact": f.intact}
+            for f in item.files
+        ],
+    }
+
+
+def why_uncorrected(name: str) -> str:
+    """Say why an error stays, by its name: what the control would need to take it out."""
+    if name not in _KNOWN:
+        return "acts differently in the two directions of travel; these tables act in both alike"
+    error = error_named(name)
+    if error.kind == "squareness":
+        return "an axis out of square moves another axis in proportion; that needs a table of one axis over another"
+    if error.is_straightness:
+        return "moves another axis than the one that travels; that needs a table of one axis over another"
+    if error.kind == "angular":
+        return "acts through a lever that other axes change; that needs a table times an axis position, or a field"
+    return "the table's steps, rounding or zero point leave this part of it"
+
+
+_KNOWN = {f"E{d}{a}" for d in "XYZABC" for a in "XYZ"} | {"EC0Y", "EB0Z", "EA0Z"}
+
+
+def um(value: Any) -> str:
+    """A figure in um with a sensible number of digits; a dash where there is none.
+
+    >>> um(2964.4), um(12.34), um(0.3959), um(None)
+    ('2964', '12.3', '0.40', '–')
+    """
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return "–"
+    size = abs(value)
+    return f"{value:.{0 if size >= 99.95 else 1 if size >= 9.995 else 2}f}"
+
+
+def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    if controls:
+        states = [item["state"] for item in controls]
+        state = "rejected" if "rejected" in states else "partial" if "partial" in states else "accepted"
+        return {"state": state, "headline": _headline(state, controls), "text": _verdict_text(controls)}
+    if source.kind == "compare":
+        verdict = source.compare.get("verdict", source.compare.get("improved", ""))
+        text = verdict if isinstance(verdict, str) else ""
+        return {"state": "neutral", "headline": "Before and after compared", "text": text}
+    identify = source.identify
+    if identify.get("identified") is False:
+        return {
+            "state": "rejected",
+            "headline": "The errors are not determined",
+            "text": str(identify.get("error", "")),
+        }
+    text = (
+        f"{len(identify.get('identified', []))} errors from {identify.get('readings_used', '–')} of "
+        f"{identify.get('readings', '–')} readings; residual {um(identify.get('residual_rms_um'))} µm rms."
+    )
+    return {"state": "neutral", "headline": "Errors identified", "text": text}
+
+
+def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
+    if len(controls) == 1:
+        return {
+            "accepted": "The tables may be loaded",
+            "partial": "The tables may be loaded, but much of the error is beyond this control",
+            "rejected": "Do not load these tables",
+        }[state]
+    count = {name: sum(item["state"] == name for item in controls) for name in VERDICTS}
+    parts = [f"{count[key]} {VERDICTS[key].lower()}" for key in VERDICTS if count[key]]
+    return f"{len(controls)} controls: {'; '.join(parts)}"
+
+
+def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
+    best = min(controls, key=lambda item: item["after"].get("rms_um", math.inf)) if len(controls) > 1 else controls[0]
+    before, after = best["before"], best["after"]
+    name = f"With {best['name']} the" if len(controls) > 1 else "The"
+    return (
+        f"{name} error of the tool tip over the volume goes from {um(before.get('max_um'))} to {um(after.get('max_um'))} µm "
+        f"at most, from {um(before.get('rms_um'))} to {um(after.get('rms_um'))} µm rms, as the files that were read back say."
+    )
+
+
+def _errors(table: ErrorTable | None) -> list[dict[str, Any]]:
+    """One row for each error: largest value and uncertainty, and all values, in the unit of the files."""
+    rows: list[dict[str, Any]] = []
+    for name in table.names if table is not None else ():
+        assert table is not None
+        unit = error_named(name)
+        row: dict[str, Any] = {"error": name, "meaning": describe_error(name), "unit": unit.unit}
+        if name in table.squareness:
+            value, u = (part / unit.si_per_unit for part in table.squareness[name])
+            row |= {"largest": value, "at_mm": None, "U": COVERAGE * u, "position_mm": [], "value": [value], "u": [u]}
+        else:
+            curve = table.curves[name]
+            k = int(np.argmax(np.abs(curve.value)))
+            row |= {"largest": float(curve.value[k] / unit.si_per_unit), "at_mm": float(curve.position_mm[k])}
+            row |= {
+                "U": float(COVERAGE * np.max(curve.u) / unit.si_per_unit),
+                "position_mm": curve.position_mm.tolist(),
+            }
+            row |= {"value": (curve.value / unit.si_per_unit).tolist(), "u": (curve.u / unit.si_per_unit).tolist()}
+        rows.append(row)
+    return rows
+
+
+def _measurement(source: ResultFolder) -> dict[str, Any]:
+    keys = (
+        "method",
+        "readings",
+        "readings_used",
+        "residual_rms_um",
+        "residual_max_um",
+        "reduced_chi_square",
+        "degrees_of_freedom",
+        "rank",
+        "unknowns",
+        "u_length",
+        "u_deviation",
+        "unobservable",
+        "rejected",
+        "segments",
+        "stations",
+        "corrections",
+        "worst_standard_uncertainty",
+        "systematic",
+        "objections",
+    )
+    return {key: source.identify[key] for key in keys if source.identify.get(key) not in (None, [], {})}
+
+
+def _machine(source: ResultFolder) -> dict[str, Any]:
+    machine = source.machine
+    if machine is None:
+        return next((dict(item.manifest["machine"]) for item in source.controls if "machine" in item.manifest), {})
+    return {
+        "name": machine.name,
+        "chain": machine.chain.name,
+        "squareness_reference": machine.squareness_reference,
+        "tool_offset_mm": list(machine.tool_offset_mm),
+        "reference_point_mm": list(machine.reference_point_mm),
+        "travel_mm": {name: list(axis.range_mm) for name, axis in zip("XYZ", machine.axes, strict=True)},
+    }
+
+
+def _provenance(source: ResultFolder) -> dict[str, Any]:
+    inputs = source.identify.get("inputs", [])
+    if not inputs and source.controls:
+        inputs = source.controls[0].manifest.get("inputs", [])
+    programs = {str(item.manifest.get("program", "")) for item in source.controls} - {""}
+    date = source.identified.metadata.get("date", "") if source.identified is not None else ""
+    return {
+        "tables_made_by": sorted(programs),
+        "report_made_by": f"compgen {program_version()}",
+        "inputs": list(inputs),
+        "date": date,
+        "errors_sha256": sorted({str(item.manifest.get("errors_sha256", "")) for item in source.controls} - {""}),
+    }
+
+
+def figure_rows(data: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Return the scalar values of nested data as rows ``name``, ``value``, at most ``MOST_ROWS``; long lists are left out."""
+    for count, (name, value) in enumerate(_leaves(data, "")):
+        if count >= MOST_ROWS:
+            return
+        yield {"name": name, "value": value}
+
+
+def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _leaves(item, f"{name} · {key}" if name else str(key))
+    elif isinstance(value, list):
+        if len(value) <= 12:
+            for k, item in enumerate(value):
+                yield from _leaves(item, f"{name} · {k + 1}")
+    elif value is not None:
+        yield name, value

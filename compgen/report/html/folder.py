@@ -1,0 +1,236 @@
+"""What stands in a folder that ``run``, ``identify``, ``verify`` or ``compare`` wrote, read back for the report."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.core.csvio import FloatArray, read_csv
+from compgen.core.error_table import ErrorTable, read_errors
+from compgen.core.files import read_bytes, read_text, sha256_of
+from compgen.core.machine import Machine, read_machine
+from compgen.core.text import one_line
+from compgen.errors import CompgenWarning, InputError
+
+Kind = Literal["run", "identify", "verify", "compare"]
+
+#: Files that say what the folder is.
+MARKS = ("result.json", "identify.json", "compare.json")
+#: Lines and characters of a controller file that the report shows.
+PREVIEW_LINES, PREVIEW_CHARACTERS = 40, 4000
+#: A JSON file beyond this is no result of compgen.
+MOST_JSON = 50_000_000
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Error of the tool tip before and after, mm, shapes (n, 3), at commanded positions (n, 3), mm."""
+
+    position_mm: FloatArray
+    before_mm: FloatArray
+    after_mm: FloatArray
+
+
+@dataclass(frozen=True)
+class TableFile:
+    """One file for the control as it stands in the folder.
+
+    ``preview`` is its beginning; ``intact`` is None where no hash of it is known.
+    """
+
+    name: str
+    path: Path
+    size: int
+    sha256: str
+    lines: int
+    preview: str
+    cut: bool
+    intact: bool | None
+
+
+@dataclass(frozen=True)
+class ControlFolder:
+    """What stands there for one control: ``result.json``, ``manifest.json``, ``preflight.md``, files and the volume."""
+
+    name: str
+    folder: Path
+    result: Mapping[str, Any]
+    manifest: Mapping[str, Any]
+    preflight: str
+    files: tuple[TableFile, ...]
+    volume: Volume | None
+
+
+@dataclass(frozen=True)
+class ReadingResiduals:
+    """Residuals of the readings, mm, shape (n,); ``station`` and commanded ``position_mm`` (n, 3) where there are some."""
+
+    residual_mm: FloatArray
+    used: NDArray[np.bool_]
+    station: tuple[str, ...] = ()
+    position_mm: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class ResultFolder:
+    """Everything that the report is made of; what the folder does not hold is empty or None."""
+
+    folder: Path
+    kind: Kind
+    identify: Mapping[str, Any] = field(default_factory=dict)
+    identified: ErrorTable | None = None
+    fitted: ErrorTable | None = None
+    fit: Mapping[str, Any] = field(default_factory=dict)
+    machine: Machine | None = None
+    residuals: ReadingResiduals | None = None
+    controls: tuple[ControlFolder, ...] = ()
+    accuracy: Mapping[str, Any] = field(default_factory=dict)
+    compare: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def read_folder(folder: str | Path) -> ResultFolder:
+    """Read the results in ``folder``; nothing outside it is looked at.
+
+    Raises
+    ------
+    InputError
+        where there is no such folder, no result in it, or a file of it that cannot be read.
+    """
+    base = Path(folder)
+    if not base.is_dir():
+        raise InputError("no such folder; the report needs one that run, identify, verify or compare wrote", file=base)
+    control_folders = [base] if (base / "result.json").is_file() else _below(base)
+    kind = _kind(base, control_folders)
+    notes: list[str] = []
+    machine = _machine(base, notes)
+    return ResultFolder(
+        base,
+        kind,
+        identify=_json(base / "identify.json"),
+        identified=_errors(base / "identified.errors.csv"),
+        fitted=_errors(base / "fitted.errors.csv"),
+        fit=_json(base / "fit.json"),
+        machine=machine,
+        residuals=_residuals(base / "residuals.csv"),
+        controls=_in_order(_control(path) for path in control_folders),
+        accuracy=_json(base / "accuracy.json"),
+        compare=_json(base / "compare.json"),
+        notes=tuple(notes),
+    )
+
+
+def _in_order(controls: Iterable[ControlFolder]) -> tuple[ControlFolder, ...]:
+    """Accepted tables first, partial ones after those, rejected ones last."""
+    return tuple(sorted(controls, key=lambda c: (not c.result.get("accepted"), bool(c.result.get("partial")), c.name)))
+
+
+def _below(base: Path) -> list[Path]:
+    """Folders of single controls that a run for several of them made."""
+    return sorted(path.parent for path in base.glob("*/result.json") if (path.parent / "manifest.json").is_file())
+
+
+def _kind(base: Path, controls: list[Path]) -> Kind:
+    if (base / "compare.json").is_file():
+        return "compare"
+    identified = (base / "identify.json").is_file()
+    if controls and (identified or (base / "manifest.json").is_file()):
+        return "run"
+    if controls:
+        return "verify"
+    if identified:
+        return "identify"
+    raise InputError(
+        f"holds none of {', '.join(MARKS)}; give a folder that run, identify, verify or compare wrote", file=base
+    )
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """Contents of a JSON object; empty if there is no such file."""
+    if not path.is_file():
+        return {}
+    content = read_bytes(path, MOST_JSON + 1)
+    if len(content) > MOST_JSON:
+        raise InputError(f"is larger than {MOST_JSON // 1_000_000} MB; compgen writes no such file", file=path)
+    try:
+        data = json.loads(content.decode("utf-8-sig"))
+    except (UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise InputError(f"is no JSON: {one_line(error)}", file=path) from error
+    if not isinstance(data, dict):
+        raise InputError("holds no JSON object", file=path)
+    return data
+
+
+def _errors(path: Path) -> ErrorTable | None:
+    return read_errors(path) if path.is_file() else None
+
+
+def _machine(base: Path, notes: list[str]) -> Machine | None:
+    path = base / "machine.toml"
+    if not path.is_file():
+        return None
+    try:
+        return read_machine(path)
+    except InputError as error:
+        notes.append(f"machine.toml cannot be used: {error.message}")
+        return None
+
+
+def _residuals(path: Path) -> ReadingResiduals | None:
+    if not path.is_file():
+        return None
+    table = read_csv(path, ("residual_um", "used"), ("station", "x_mm", "y_mm", "z_mm"))
+    used = table.numbers("used") > 0.5
+    residual_mm = table.numbers("residual_um") * 1e-3
+    if "station" not in table.columns:
+        return ReadingResiduals(residual_mm, used)
+    position_mm = np.column_stack([table.numbers(f"{axis}_mm") for axis in "xyz"])
+    return ReadingResiduals(residual_mm, used, tuple(table.text("station")), position_mm)
+
+
+def _volume(path: Path) -> Volume | None:
+    if not path.is_file():
+        return None
+    names = [f"{when}_{axis}_um" for when in ("before", "after") for axis in "xyz"]
+    table = read_csv(path, ("x_mm", "y_mm", "z_mm", *names))
+    position_mm = np.column_stack([table.numbers(f"{axis}_mm") for axis in "xyz"])
+    values_mm = np.column_stack([table.numbers(name) for name in names]) * 1e-3
+    return Volume(position_mm, values_mm[:, :3], values_mm[:, 3:])
+
+
+def _control(folder: Path) -> ControlFolder:
+    result, manifest = _json(folder / "result.json"), _json(folder / "manifest.json")
+    preflight = folder / "preflight.md"
+    text = read_text(preflight) if preflight.is_file() else ""
+    files = tuple(_files(folder, result))
+    name = str(result.get("controller", folder.name))
+    return ControlFolder(name, folder, result, manifest, text, files, _volume(folder / "volume.csv"))
+
+
+def _files(folder: Path, result: Mapping[str, Any]) -> list[TableFile]:
+    """The control's files that ``result.json`` names and that stand beside it; never a path out of the folder."""
+    found = []
+    for item in result.get("files", []):
+        name = str(item.get("name", "")) if isinstance(item, dict) else ""
+        path = folder / name
+        if not name or Path(name).name != name or not path.is_file():
+            continue
+        content = read_bytes(path)
+        lines = content.decode("utf-8", "replace").splitlines()
+        preview = "\n".join(lines[:PREVIEW_LINES])[:PREVIEW_CHARACTERS]
+        cut = len(lines) > PREVIEW_LINES or len("\n".join(lines[:PREVIEW_LINES])) > PREVIEW_CHARACTERS
+        digest = sha256_of(content)
+        known = item.get("sha256")
+        intact = digest == known if isinstance(known, str) else None
+        if intact is False:
+            message = f"{path} is not the file that was verified: its SHA-256 differs from the one in result.json"
+            warnings.warn(message, CompgenWarning, stacklevel=2)
+        found.append(TableFile(name, path, len(content), digest, len(lines), preview, cut, intact))
+    return found
