@@ -26,7 +26,7 @@ _PATH = click.Path(path_type=Path)
 NEEDED = {"sqlalchemy": "SQLAlchemy", "alembic": "alembic", "apscheduler": "APScheduler", "structlog": "structlog"}
 
 
-@click.group("recal", context_settings={"help_option_names": ["-h", "--help"]})
+@click.group("recal")
 def recal() -> None:
     """Scheduled recalibration: new measurements become proposed tables, a person approves, everything can be undone.
 
@@ -64,7 +64,7 @@ def job_option(command: Command) -> Command:
         logs.configure(log)  # type: ignore[arg-type]
         return command(*args, job=read_job(job_file), **options)
 
-    return _job_options(wrapper)
+    return _job_options(wrapper)  # type: ignore[no-any-return]
 
 
 def _job_options(command: Any) -> Any:
