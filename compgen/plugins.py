@@ -7,6 +7,8 @@ from pathlib import Path
 
 from compgen.controllers import CONTROLLERS
 from compgen.core.plugins import Kind, load_entry_points, load_file
+from compgen.effects import FAMILIES
+from compgen.effects.registration import check_family
 from compgen.export.registration import check_control
 from compgen.simulate import EFFECTS, INSTRUMENTS
 from compgen.simulate.registration import check_effect, check_instrument
@@ -15,9 +17,10 @@ from compgen.simulate.registration import check_effect, check_instrument
 KINDS = (
     Kind("control", "CONTROLLERS", "compgen.controllers", CONTROLLERS, check_control),
     Kind("effect", "EFFECTS", "compgen.effects", EFFECTS, check_effect),
+    Kind("effect family", "FAMILIES", "compgen.effect_families", FAMILIES, check_family),
     Kind("instrument", "INSTRUMENTS", "compgen.instruments", INSTRUMENTS, check_instrument),
 )
-CONTROLS, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS = KINDS
+CONTROLS, SIMULATED_EFFECTS, EFFECT_FAMILIES, SIMULATED_INSTRUMENTS = KINDS
 
 
 def load_plugins(paths: Sequence[str | Path] = (), *, installed: bool = True) -> None:
@@ -25,7 +28,8 @@ def load_plugins(paths: Sequence[str | Path] = (), *, installed: bool = True) ->
 
     Parameters
     ----------
-    paths : ``.py`` files or package folders that hold ``CONTROLLERS``, ``EFFECTS`` or ``INSTRUMENTS``.
+    paths : ``.py`` files or package folders that hold ``CONTROLLERS``, ``EFFECTS``, ``FAMILIES`` or
+        ``INSTRUMENTS``.
     installed : also those of installed distributions; one that is broken is left out with a warning.
 
     Raises

@@ -15,11 +15,16 @@ from compgen.controllers import CONTROLLERS
 from compgen.core.machine import machine_files
 from compgen.core.names import AXES
 from compgen.core.plugins import Kind
+from compgen.core.text import nearest
+from compgen.effects import ANY_STATION, FAMILIES, catalogue, listed
+from compgen.effects.of_machine import STATION_NAME
+from compgen.errors import InputError
 from compgen.export import Format, load_format
 from compgen.export.card import control_card
 from compgen.model import modelled_errors
-from compgen.plugins import CONTROLS, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS
+from compgen.plugins import CONTROLS, EFFECT_FAMILIES, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS
 from compgen.report.card_text import card_text
+from compgen.report.effects_text import card_summary, effect_card_text
 
 
 @click.command("controllers")
@@ -71,15 +76,57 @@ def _listed(card: Format) -> dict[str, object]:
 
 
 @click.command("effects")
+@click.argument("name", required=False, metavar="[NAME]")
 @json_option
-def effects_command(as_json: bool) -> int:
-    """List the effects that a scenario may have beside the geometric errors ([[effects]], displacements in mm).
+def effects_command(name: str | None, as_json: bool) -> int:
+    """List the effects beside the geometric errors: what diagnose looks for, simulate makes, and a machine file may name.
+
+    With NAME: the card of one effect: equation, source, columns that it needs, parameters (units in their names: um, urad,
+    ppm), what data may confuse it with, and the measurement that separates them. Effects of plug-ins are listed too.
 
     \b
     Example:
-      compgen effects
+      compgen effects backlash_X
     """
-    return _list_readers(SIMULATED_EFFECTS, as_json)
+    if name is not None:
+        _show_effect(name, as_json)
+        return 0
+    origins = _effect_origins()
+    readers = _readers(SIMULATED_EFFECTS)
+    if as_json:
+        cards = {
+            known: {**card_summary(effect.card), "plugin": origins.get(known)} for known, effect in listed().items()
+        }
+        print_json({**cards, **readers})
+        return 0
+    table = Table("name", "equation", "columns", "resembles", box=box.SIMPLE)
+    for known, effect in listed().items():
+        card = effect.card
+        cells = (known, card.equation, ", ".join(card.covariates), ", ".join(card.aliases))
+        table.add_row(*(Text(cell, overflow="fold") for cell in cells))
+    for reader, row in readers.items():
+        table.add_row(reader, Text(row["title"] or ""), "", f"simulated only; {row['plugin'] or 'built in'}")
+    stdout.print(table)
+    return 0
+
+
+def _effect_origins() -> dict[str, str]:
+    """Plug-in of each effect that comes from one."""
+    found: dict[str, str] = {}
+    for family, origin in EFFECT_FAMILIES.origins.items():
+        found |= {effect.card.name: origin for effect in FAMILIES[family].members((ANY_STATION,))}
+    return found
+
+
+def _show_effect(name: str, as_json: bool) -> None:
+    stations = [match.group(1)] if (match := STATION_NAME.fullmatch(name)) else [ANY_STATION]
+    known, origin = catalogue(stations), _effect_origins().get(name)
+    if name not in known:
+        raise InputError(f"{name!r} is no effect; {nearest(name, [*listed(), *SIMULATED_EFFECTS.registry])}")
+    if as_json:
+        print_json({"name": name, **card_summary(known[name].card), "plugin": origin})
+    else:
+        stdout.print(effect_card_text(known[name].card, origin), markup=False, highlight=False, soft_wrap=True)
 
 
 @click.command("instruments")
@@ -96,10 +143,7 @@ def instruments_command(as_json: bool) -> int:
 
 def _list_readers(kind: Kind, as_json: bool) -> int:
     """Print what a registry of readers holds: the first line of each docstring, and the plug-in that it came from."""
-    rows = {
-        name: {"title": (inspect.getdoc(reader) or "").partition("\n")[0], "plugin": kind.origins.get(name)}
-        for name, reader in sorted(kind.registry.items())
-    }
+    rows = _readers(kind)
     if as_json:
         print_json(rows)
         return 0
@@ -108,6 +152,14 @@ def _list_readers(kind: Kind, as_json: bool) -> int:
         table.add_row(name, Text(row["title"] or ""), Text(row["plugin"] or "built in", overflow="fold"))
     stdout.print(table if rows else f"no {kind.word} is built in; --plugin PATH adds some")
     return 0
+
+
+def _readers(kind: Kind) -> dict[str, dict[str, str | None]]:
+    """First line of the docstring of every reader of a registry, and the plug-in that it came from."""
+    return {
+        name: {"title": (inspect.getdoc(reader) or "").partition("\n")[0], "plugin": kind.origins.get(name)}
+        for name, reader in sorted(kind.registry.items())
+    }
 
 
 @click.command("machines")

@@ -22,6 +22,7 @@ from compgen.core.machine import Machine
 from compgen.core.text import nearest
 from compgen.effects.base import ANY_STATION, Card, DisplacementEffect, Effect
 from compgen.effects.catalogue import catalogue
+from compgen.effects.dead_path import DeadPath
 from compgen.effects.periodic import Periodic
 from compgen.effects.readings import Readings
 from compgen.errors import InputError
@@ -74,16 +75,22 @@ def active_effects(machine: Machine) -> tuple[ActiveEffect, ...]:
     """
     stations = _stations_of(machine)
     known = catalogue(stations)
+    if "dead_path" in machine.effects:
+        known["dead_path"] = DeadPath(tuple(_dead_path_stations(machine)) or (ANY_STATION,))
     return tuple(_read(machine, known, name, section) for name, section in machine.effects.items())
 
 
 def _stations_of(machine: Machine) -> tuple[str, ...]:
     """Names of the stations in the names of effects and parameters."""
     found = [match.group(1) for name in machine.effects if (match := STATION_NAME.fullmatch(name))]
+    return tuple(dict.fromkeys([*found, *_dead_path_stations(machine)]))
+
+
+def _dead_path_stations(machine: Machine) -> list[str]:
+    """Names of the stations in the parameters of the dead path."""
     dead_path = machine.effects.get("dead_path")
     keys = [] if dead_path is None else dead_path.data
-    found += [match.group(1) for key in keys if (match := DEAD_PATH_KEY.fullmatch(key))]
-    return tuple(dict.fromkeys(found))
+    return [match.group(1) for key in keys if (match := DEAD_PATH_KEY.fullmatch(key))]
 
 
 def _read(machine: Machine, known: dict[str, Effect], name: str, raw: tomlio.Section) -> ActiveEffect:
