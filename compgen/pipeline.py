@@ -36,7 +36,7 @@ from compgen.identify.evidence import evidence_files
 from compgen.identify.measurement import Measurement
 from compgen.identify.monte_carlo import SelfCheck
 from compgen.identify.reversal import SIGNIFICANT
-from compgen.imports import open_measurement
+from compgen.imports import given_errors, open_measurement
 from compgen.verify import Verification, read_tables, verify
 from compgen.verify.active import ActiveTables, without_active
 from compgen.verify.check_program import check_files
@@ -221,17 +221,21 @@ def _read_back(
 
 def identify_bare(
     machine: Machine,
-    measurement: Measurement,
+    measurement: Measurement | ErrorTable,
     options: IdentifyOptions | None = None,
     active: ActiveTables | None = None,
 ) -> Identification:
     """Identify the machine without the tables that were active while it was measured, if there were any.
 
+    Errors that another program identified are taken as they are given.
+
     What was taken out stands in ``corrections["active_tables"]`` of the result.
     """
-    if active is None:
+    if active is None and isinstance(measurement, ErrorTable):
+        return given_errors(machine, measurement)
+    if active is None and not isinstance(measurement, ErrorTable):
         return identify_measurement(machine, measurement, options)
-    if not isinstance(measurement, Lengths | Deviations):
+    if active is None or not isinstance(measurement, Lengths | Deviations):
         raise InputError("tables that were active (--active) can be taken out of lengths and deviations only")
     wider, moved, report = without_active(machine, measurement, active)
     result = identify_measurement(wider, moved, options)

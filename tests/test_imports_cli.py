@@ -132,6 +132,23 @@ def test_from_an_exchange_file_and_from_a_sheet_of_errors_to_tables_in_one_comma
     assert (tmp_path / "b" / "volcomp0.csv").exists()
 
 
+def test_an_exchange_file_runs_through_the_whole_chain(capsys, tmp_path, machine):
+    path = tmp_path / "tracer.txt"
+    path.write_text(
+        "// constructed\n[C0Y]\nVALUE = 0.00002\n[EXX]\nGridpoints = {\n0 0.003\n100 0.007\n200 0.002\n400 0.005\n}\n"
+        "[EYX]\nGridpoints = {\n0 0.001\n200 0.006\n400 0.003\n}\n"
+    )
+    code, out, err = call(capsys, "run", machine, path, "--controller", "isg-csv", "--out", tmp_path / "o", "--json")
+    assert code == 0, err
+    facts = json.loads(out)
+    assert facts["identify"]["method"] == "given"
+    errors = read_errors(tmp_path / "o" / "identified.errors.csv")
+    assert [round(1e3 * float(errors.curves["EXX"].at(x)), 6) for x in (0, 100, 200, 400)] == [0, 4, -1, 2]
+    # the line 1 + 2 x / 400 um of the straightness turns X by +5 urad about Z: Y is 5 urad less beyond square to it
+    assert [round(1e3 * float(errors.curves["EYX"].at(x)), 6) for x in (0, 200, 400)] == [0, 4, 0]
+    assert 1e6 * errors.squareness["EC0Y"][0] == pytest.approx(15, abs=1e-6)
+
+
 def test_a_file_that_leaves_something_open_is_not_computed_with(capsys, tmp_path, machine):
     code, _, err = call(
         capsys, "run", machine, GOLDEN / "ecmc_ISO230.dat", "--controller", "isg-csv", "--out", tmp_path / "o"

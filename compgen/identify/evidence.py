@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from compgen.core.csvio import FloatArray, format_csv
+from compgen.core.error_table import ErrorTable
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
@@ -14,7 +15,9 @@ from compgen.identify.measurement import Measurement
 from compgen.identify.result import Identification
 
 
-def evidence_files(machine: Machine, measurement: Measurement, result: Identification) -> dict[str, str | bytes]:
+def evidence_files(
+    machine: Machine, measurement: Measurement | ErrorTable, result: Identification
+) -> dict[str, str | bytes]:
     """Return ``machine.toml``, the machine file byte by byte, and ``residuals.csv``."""
     files: dict[str, str | bytes] = {"residuals.csv": format_residuals(machine, measurement, result)}
     if machine.source is not None and machine.source.is_file():
@@ -22,7 +25,7 @@ def evidence_files(machine: Machine, measurement: Measurement, result: Identific
     return files
 
 
-def format_residuals(machine: Machine, measurement: Measurement, result: Identification) -> str:
+def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, result: Identification) -> str:
     """Return the text of ``residuals.csv``: measurement minus model of every reading, um, in the order of the files.
 
     ``used`` is 0 for readings that were rejected; lengths have their station and commanded position beside them.

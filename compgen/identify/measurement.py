@@ -9,6 +9,7 @@ from typing import overload
 
 from compgen.core.axis_runs import AxisRuns, holds_axis_runs, read_axis_runs
 from compgen.core.deviations import Deviations, holds_deviations, read_deviations
+from compgen.core.error_table import ErrorTable
 from compgen.core.lengths import Lengths, read_lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
@@ -89,8 +90,10 @@ def _read_others(paths: Sequence[str | Path]) -> Lengths | Deviations | AxisRuns
     return read_deviations(paths) if any(kinds) else read_lengths(paths)
 
 
-def describe(measurement: Measurement) -> str:
+def describe(measurement: Measurement | ErrorTable) -> str:
     """Say in words what was measured."""
+    if isinstance(measurement, ErrorTable):
+        return f"{len(measurement.names)} errors of another program"
     if isinstance(measurement, MixedMeasurement):
         return f"{describe(measurement.other)}, {describe(measurement.sixdof)}"
     if isinstance(measurement, SixDofMeasurement):

@@ -68,7 +68,8 @@ class Identification:
     systematic : what systematic inputs contribute, and is part of the standard uncertainties then; None if none is.
     method : "joint", "two-step", "sixdof" for readings of the six-DOF instrument (the residuals are translations about
         the mean of their position), "merged" for those and others, "axis-runs" for
-        runs along single axes, or "deviations" where measured positions were given
+        runs along single axes, "given" for errors of another program (no residuals), or "deviations" where
+        measured positions were given
         in place of lengths; then the residuals are those of the components dx, dy, dz, and ``u_length_um`` is their
         standard uncertainty.
     steps : figures of the single steps of the two-step method.
@@ -179,7 +180,7 @@ class Identification:
 
     def _u_of_the_readings(self) -> dict[str, Any]:
         known = {"source": self.u_source, "constant_um": self.u_length_um}
-        if self.method in ("deviations", "sixdof", "axis-runs"):
+        if self.method in ("deviations", "sixdof", "axis-runs", "given"):
             return {"u_deviation": {**known, "scaled_by": self.u_scale}}
         proportional = {"proportional_um_per_m": self.u_length_um_per_m, "scaled_by": self.u_scale}
         return {"u_length": {**known, **proportional}}

@@ -30,8 +30,8 @@ _OWN_READERS: dict[str | None, Callable[[Path], Plain]] = {
 }
 
 
-def open_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement:
-    """Read measurement files, the project's own and foreign ones.
+def open_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement | ErrorTable:
+    """Read measurement files, the project's own and foreign ones; a foreign file of errors gives those.
 
     Parameters
     ----------
@@ -48,11 +48,20 @@ def open_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
         return read_measurement(paths, instrument)
     if len(paths) == 1 and kinds == [None] and _is_unknown_csv(Path(paths[0])):
         return read_measurement(paths, instrument)
+    if len(paths) == 1:
+        return _measured_or_errors(Path(paths[0]))
     parts: list[Plain] = [_measured(Path(path), kind) for path, kind in zip(paths, kinds, strict=True)]
     if len({type(part) for part in parts}) > 1:
         raise InputError("holds another kind of measurement than the first file; identify them one after the other",
                          file=paths[-1])  # fmt: skip
-    return parts[0] if len(parts) == 1 else _joined(parts)
+    return _joined(parts)
+
+
+def _measured_or_errors(path: Path) -> Plain | ErrorTable:
+    data = _settled(path).data
+    if isinstance(data, Lengths | Deviations | AxisRuns | ErrorTable):
+        return data
+    raise InputError("holds a capture over time, from which no errors are identified", file=path)
 
 
 def _is_unknown_csv(path: Path) -> bool:

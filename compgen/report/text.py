@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from compgen.core.names import error_named
+from compgen.core.text import one_line
 from compgen.fit import FitResult
 from compgen.identify import Identification
 from compgen.pipeline import RunResult
@@ -26,6 +27,9 @@ def identification_table(result: Identification) -> Group:
         return Group(*_sixdof_lines(result), _errors_table(result))
     if result.method == "axis-runs":
         return Group(Text("\n".join(_axis_lines(result))), _errors_table(result))
+    if result.method == "given":
+        text = f"{result.details['values']} values of errors given in {one_line(result.details['file'])}; not identified here"
+        return Group(Text(text), _errors_table(result))
     lengths = result.method != "deviations"
     used = f"{int(result.accepted.sum())} of {len(result.accepted)} "
     used += (
