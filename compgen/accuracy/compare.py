@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from compgen.accuracy.budget import Budget
 from compgen.accuracy.evaluate import accuracy_of_runs, groups_of_errors, narrowed, statements_of, volume_fields
 from compgen.accuracy.field import Alignment, Field, aligned, volume_figures
 from compgen.accuracy.figure import COVERAGE, ComparedFigure, Figure
@@ -37,12 +38,14 @@ class CompareOptions:
     alignment : of the volume; None is ``"axes"`` for errors, ``"as-given"`` for measured positions.
     line : reference line of straightness and squareness.
     edition : of ISO 230-2.
+    budgets : what the set-up adds to the uncertainties of axis runs, by axis.
     """
 
     align: str | None = None
     alignment: Alignment | None = None
     line: str = "ls"
     edition: int = LATEST
+    budgets: Mapping[str, Budget] | None = None
 
 
 @dataclass(frozen=True)
@@ -237,8 +240,8 @@ def compare_runs(
         )
     pairs = {axis: paired_runs(axis, before[axis], after[axis], chosen.align) for axis in axes}
     sides = [
-        accuracy_of_runs({axis: pair[0] for axis, pair in pairs.items()}, chosen.edition),
-        accuracy_of_runs({axis: pair[1] for axis, pair in pairs.items()}, chosen.edition),
+        accuracy_of_runs({axis: pair[0] for axis, pair in pairs.items()}, chosen.edition, chosen.budgets),
+        accuracy_of_runs({axis: pair[1] for axis, pair in pairs.items()}, chosen.edition, chosen.budgets),
     ]
     groups = _pairs(sides[0].groups, sides[1].groups)
     decisive = tuple((axis, next(key for key in DECISIVE_RUNS if key in groups[axis])) for axis in axes)

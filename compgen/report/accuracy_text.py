@@ -1,0 +1,81 @@
+"""Readable summaries of accuracy figures, and of before against after."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from rich import box
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from compgen.accuracy.compare import Comparison
+from compgen.accuracy.evaluate import Accuracy
+from compgen.accuracy.figure import ComparedFigure, Figure
+
+_STYLES = {"better": "green", "worse": "bold red", "larger": "red"}
+
+
+def _number(value: float, digits: int = 2) -> str:
+    return "" if math.isnan(value) else "inf" if math.isinf(value) else f"{value:.{digits}f}"
+
+
+def _with_u(item: Figure) -> str:
+    band = "" if math.isnan(item.u) else f" +/- {item.expanded:.2f}"
+    return f"{item.value:.2f}{band}"
+
+
+def accuracy_table(found: Accuracy) -> Group:
+    """Return all figures with their expanded uncertainties (k = 2)."""
+    parts: list[Table | Text] = []
+    for name, group in found.groups.items():
+        if not group:
+            continue
+        table = Table("figure", "value +/- U (k = 2)", "unit", title=name, title_justify="left", box=box.SIMPLE)
+        for key, item in group.items():
+            table.add_row(key, _with_u(item), item.unit)
+        parts.append(table)
+    return Group(*parts, Text("\n".join(found.statements)))
+
+
+def comparison_table(found: Comparison) -> Group:
+    """Return before, after, improvement factor, E_n and verdict of every figure; the overall verdict first."""
+    return Group(Text(verdict_text(found), style="bold"), *_tables(found.groups, found.kind), *_prediction(found))
+
+
+def verdict_text(found: Comparison) -> str:
+    """Say in one line how it came out, and by which figures."""
+    if found.kind == "prediction" and found.prediction is not None:
+        return f"prediction and measurement: {found.prediction.verdict}"
+    by = ", ".join(f"{group} {key}" for group, key in found.decisive)
+    return f"AFTER against BEFORE: {found.verdict} (decided by {by})"
+
+
+def _tables(groups: Mapping[str, Mapping[str, ComparedFigure]], kind: str) -> list[Table]:
+    first, second = ("predicted", "measured") if kind == "prediction" else ("before", "after")
+    tables = []
+    for name, group in groups.items():
+        if not group:
+            continue
+        table = Table(title=name, title_justify="left", box=box.SIMPLE, pad_edge=False)
+        for heading in ("figure", first, second, "unit", "factor", "En", "verdict"):
+            table.add_column(
+                heading, justify="left" if heading in ("figure", "unit", "verdict") else "right", no_wrap=True
+            )
+        for key, item in group.items():
+            factor = _number(item.factor) + ("" if math.isnan(item.u_factor) else f" +/- {2 * item.u_factor:.2f}")
+            word = "" if kind == "prediction" else item.verdict
+            row = (key, _with_u(item.before), _with_u(item.after), item.before.unit, factor, _number(item.en))
+            table.add_row(*row, Text(word, _STYLES.get(word, "")))
+        tables.append(table)
+    return tables
+
+
+def _prediction(found: Comparison) -> list[Text]:
+    lines = list(found.statements)
+    if found.prediction is not None:
+        agreed = found.prediction
+        parts = [f"{key} {_with_u(item)} um" for key, item in agreed.difference.items()]
+        lines.insert(0, f"prediction {agreed.verdict} with the measurement; difference: {', '.join(parts)}")
+    return [Text("\n".join(lines))]
