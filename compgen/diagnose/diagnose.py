@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,16 +14,20 @@ from compgen.core.names import MM_PER_UM
 from compgen.core.threads import one_thread
 from compgen.diagnose.advice import advice_of
 from compgen.diagnose.analysis import Analysis, analyse
-from compgen.diagnose.base import fit_chosen_base
+from compgen.diagnose.base import BaseFit, fit_chosen_base
 from compgen.diagnose.gap import gap_of
+from compgen.diagnose.gross import correction_of, looks_gross
 from compgen.diagnose.measurement import Measurement
 from compgen.diagnose.observed import Observed, ObservedDeviations, ObservedLengths
 from compgen.diagnose.refit import refit
-from compgen.diagnose.result import Diagnosis
+from compgen.diagnose.result import Classed, Diagnosis
 from compgen.diagnose.verdict import verdict_of
 from compgen.errors import InputError
 
 Show = Callable[[str], None]
+
+#: Residuals of the base model beyond this, mm, are no errors of a machine.
+HOPELESS_MM = 1.0
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,16 @@ def diagnose(
         show("fitting the base model")
         observed = observed_of(machine, measurement)
         fit = fit_chosen_base(observed)
+        classed: list[Classed] = []
+        before = fit
+        if isinstance(observed, ObservedLengths) and looks_gross(observed, fit.rms_mm):
+            show("residuals are gross: trying other axes, signs and labels")
+            corrected = correction_of(machine, observed.lengths, fit.rms_mm)
+            if corrected is not None:
+                classed.append(Classed("axis_mapping", {}, 1.0, corrected.text))
+                measurement = corrected.lengths
+                observed = observed_of(machine, measurement)
+                fit = fit_chosen_base(observed)
         freedom = len(observed) - fit.jacobian.shape[1]
         if freedom < 20:
             raise InputError(
@@ -83,7 +97,7 @@ def diagnose(
             sigma_mm=_sigma_mm(measurement, observed, chosen),
             show=show,
         )
-        return _completed(machine, analysis, chosen, show)
+        return _completed(machine, analysis, chosen, show, before, classed)
 
 
 def observed_of(machine: Machine, measurement: Measurement) -> Observed:
@@ -109,8 +123,15 @@ def _sigma_mm(measurement: Measurement, observed: Observed, options: DiagnoseOpt
     return None if np.isnan(u).any() else np.asarray(u)
 
 
-def _completed(machine: Machine, analysis: Analysis, options: DiagnoseOptions, show: Show) -> Diagnosis:
-    """Verdict, refit and gap."""
+def _completed(
+    machine: Machine,
+    analysis: Analysis,
+    options: DiagnoseOptions,
+    show: Show,
+    before: BaseFit,
+    classed: Sequence[Classed],
+) -> Diagnosis:
+    """Verdict, refit and gap; ``before`` is the fit to the file as it stands."""
     verdict = verdict_of(analysis)
     show("fitting the model with what was found")
     added = [*verdict.added, *_wanted(analysis, options.add, verdict.added)]
@@ -120,7 +141,12 @@ def _completed(machine: Machine, analysis: Analysis, options: DiagnoseOptions, s
     columns = [scene.groups[g].columns @ scene.maps[g] for g in added if scene.size(g)]
     predicting = [scene.groups[g].columns @ scene.maps[g] for g in added if scene.groups[g].predicts and scene.size(g)]
     gap = gap_of(analysis.fit, columns, predicting, analysis.noise)
-    return Diagnosis(machine, analysis, verdict, found, gap, advice=advice_of(analysis, verdict))
+    if before is not analysis.fit:
+        gap = replace(gap, train=replace(gap.train, before_mm=before.rms_mm))
+    if analysis.fit.rms_mm > HOPELESS_MM:
+        text = f"the readings do not fit the commanded positions: {analysis.fit.rms_mm:.3g} mm rms"
+        verdict = replace(verdict, word="not_decidable", reasons=(*verdict.reasons, text))
+    return Diagnosis(machine, analysis, verdict, found, gap, tuple(classed), advice_of(analysis, verdict))
 
 
 def _wanted(analysis: Analysis, names: Sequence[str], present: Sequence[int]) -> list[int]:

@@ -16,8 +16,8 @@ from compgen.core.deviations import Deviations
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.diagnose.layout import IntArray, Layout, layout_of
+from compgen.diagnose.station_start import located
 from compgen.effects import Readings, readings_of_deviations, readings_of_lengths
-from compgen.identify.start import station_start
 from compgen.identify.task import dead_lengths_of
 from compgen.model.volumetric import tool_of
 
@@ -100,7 +100,7 @@ class ObservedLengths(Observed):
             rows = self.lengths.station == k
             own, member = np.unique(self.group[rows], return_inverse=True)
             member = member.ravel().astype(np.int64)
-            found = station_start(target[rows], self.value_mm[rows], member, len(own))
+            found, _ = located(target[rows], self.value_mm[rows], member, len(own))
             stations[k], dead[own] = found.position_mm, found.dead_length_mm
         return np.concatenate([stations.ravel(), dead])
 

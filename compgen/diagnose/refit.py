@@ -106,20 +106,13 @@ def extended_toml(machine: Machine, analysis: Analysis, found: Refit, groups: Se
         lines += ["", f"# found by compgen diagnose: {one_line(item.effect.card.title)}", f"[effects.{item.name}]"]
         for parameter in found.parameters.get(group, ()):
             lines.append(f"{parameter.name} = {_number(parameter.value)}  # u = {parameter.u:.2g}")
-        lines += _scan_lines(item)
+        lines += [f"{key} = {_number(value)}" for key, value in settings_of(analysis, item).items()]
     return "\n".join(lines) + "\n"
 
 
-def _scan_lines(item: Group) -> list[str]:
-    """The scan position of an effect, as the catalogue writes it."""
-    if item.position is None:
-        return []
-    return [f"{scan_key(item)} = {_number(item.position)}"]
-
-
-def scan_key(item: Group) -> str:
-    """Name of the scan position in files: the effect's own, else a time."""
-    return str(getattr(item.effect, "position_name", "at_s"))
+def settings_of(analysis: Analysis, item: Group) -> dict[str, float]:
+    """Settings of an effect that hold for the readings: what a machine file has to keep."""
+    return {} if item.effect is None else item.effect.used(analysis.fit.readings)
 
 
 def _number(value: float) -> str:

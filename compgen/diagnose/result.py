@@ -12,7 +12,7 @@ from compgen.core.names import MM_PER_UM
 from compgen.diagnose.analysis import Analysis
 from compgen.diagnose.gap import Gap
 from compgen.diagnose.noise import TAU
-from compgen.diagnose.refit import Refit, extended_toml, scan_key
+from compgen.diagnose.refit import Refit, extended_toml, settings_of
 from compgen.diagnose.verdict import Named, Unknown, Verdict
 
 
@@ -98,8 +98,8 @@ class Diagnosis:
         }
         if item.name != group.name:
             parameters = {}
-        if group.position is not None:
-            parameters[scan_key(group)] = {"value": group.position, "u": None}
+        for key, value in settings_of(self.analysis, group).items():
+            parameters[key] = {"value": value, "u": None}
         return {
             "name": item.name,
             "alias_set": [{"name": other.name, "weight": round(other.weight, 4)} for other in item.alternatives],

@@ -34,7 +34,7 @@ class Scene:
     maps : matrix (k, k_visible) of each group from its coordinates to the parameters of its columns.
     gram : products of all coordinates, (K, K).
     score : products with the residual, (K,).
-    visible : share of each group that is left beside the base model (RMS over its directions), (groups,).
+    visible : share of each group that is left beside the base model (RMS over its columns), (groups,).
     residual : whitened residual without its part in the base model, (N,).
     base : orthonormal columns of the whitened base model, (N, p).
     directions : the coordinates as whitened columns, (N, K).
@@ -169,4 +169,5 @@ def _reduced(raw: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray,
     share2, axes = np.linalg.eigh(seen.T @ seen)
     visible = share2 > LEAST_VISIBLE**2
     mapping = turn @ (axes[:, visible] / np.sqrt(share2[visible]))
-    return left @ mapping, mapping, float(np.sqrt(np.mean(np.clip(share2, 0.0, None))))
+    share = np.sum((left / norm) ** 2) / max(float(np.sum((raw / norm) ** 2)), 1e-300)
+    return left @ mapping, mapping, float(np.sqrt(share))

@@ -25,7 +25,7 @@ SECONDARY_SHARE = 0.005
 #: A generic group in the covariates of a name, with less than this share of its chi-square, is its inexact shape.
 SHAPE_SHARE = 0.1
 #: What is visible of an effect below this counts as invisible.
-INVISIBLE = 0.02
+INVISIBLE = 0.05
 #: Names of what the readings' scale does, which any misfit can be reshaped into.
 NEVER_CONFIRMED = ("laser_scale",)
 
