@@ -61,12 +61,12 @@ def scan(job: MachineJob, now: datetime) -> Found:
 
 def _fits(job: MachineJob, path: Path) -> bool:
     named = not path.name.startswith(".") and any(fnmatchcase(path.name, pattern) for pattern in job.patterns)
-    return named and path.is_file()
+    return named and (path.is_file() or path.is_symlink())  # a link that leads nowhere is reported when it is read
 
 
 def _settling(job: MachineJob, group: tuple[Path, ...], now: datetime) -> bool:
     """Whether a file is so new that it may still be written; one from the future (a clock that went back) is not."""
-    ages = [now.timestamp() - path.stat().st_mtime for path in group]
+    ages = [now.timestamp() - path.lstat().st_mtime for path in group]
     return any(0.0 <= age < job.settle_s for age in ages)
 
 

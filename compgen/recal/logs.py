@@ -10,6 +10,16 @@ import structlog
 Format = Literal["auto", "json", "text"]
 
 
+class _Stderr:
+    """Writes to what stderr is at the moment."""
+
+    def msg(self, text: str) -> None:
+        sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+
+    info = warning = error = msg
+
+
 def configure(kind: Format = "auto") -> None:
     """Choose the form of the logs; "auto" gives words on a terminal and JSON elsewhere."""
     words = kind == "text" or (kind == "auto" and sys.stderr.isatty())
@@ -22,21 +32,27 @@ def configure(kind: Format = "auto") -> None:
             structlog.processors.TimeStamper(fmt="iso", utc=True),
             last,
         ],
-        logger_factory=structlog.WriteLoggerFactory(file=sys.stderr),
+        logger_factory=lambda *_: _Stderr(),
         cache_logger_on_first_use=False,
     )
 
 
+def _logger() -> Any:
+    if not structlog.is_configured():
+        configure()
+    return structlog.get_logger()
+
+
 def info(event: str, **fields: Any) -> None:
     """Log what was done."""
-    structlog.get_logger().info(event, **fields)
+    _logger().info(event, **fields)
 
 
 def warning(event: str, **fields: Any) -> None:
     """Log what somebody should look at."""
-    structlog.get_logger().warning(event, **fields)
+    _logger().warning(event, **fields)
 
 
 def error(event: str, **fields: Any) -> None:
     """Log what went wrong."""
-    structlog.get_logger().error(event, **fields)
+    _logger().error(event, **fields)

@@ -1,0 +1,419 @@
+"""Scheduled recalibration: what is proposed, held back, refused; approval, rollback; failures; notifications."""
+
+import errno
+import json
+import os
+import sys
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import compgen
+from compgen.core.deviations import Deviations, format_deviations
+from compgen.core.points import Points
+from compgen.model.exact import exact_error
+from compgen.model.grid import volume_grid
+from compgen.recal import actions, decisions, publish, runner
+from compgen.recal.job import read_job
+from compgen.recal.runner import run_jobs
+from compgen.recal.store import Store, open_store
+from compgen.verify import read_tables
+
+NOISE_UM = 0.3
+#: What identification noise and second-order terms leave of the error anywhere, um.
+LEFT_UM = 1.0
+CONTROL = "siemens-cec"
+NOW = datetime.now(UTC)
+
+
+def deviations_text(machine, errors, *, seed, correction=None, temperature_c=None, **metadata):
+    """Deviations of the exact machine under a correction (function of positions (n, 3), mm), with noise, as a file."""
+    position = volume_grid(machine, tuple(axis.nodes_mm for axis in machine.axes)).position_mm
+    added = np.zeros_like(position) if correction is None else correction(position)
+    truth = added + exact_error(machine, errors, position + added)
+    noise = np.random.default_rng(seed).normal(0.0, NOISE_UM * 1e-3, truth.shape)
+    notes = {"u_deviation_um": str(NOISE_UM), **metadata}
+    covariates = {} if temperature_c is None else {"temp_ambient_c": np.linspace(*temperature_c, len(position))}
+    u_mm = np.full_like(truth, NOISE_UM * 1e-3)
+    return format_deviations(Deviations(position, truth + noise, u_mm=u_mm, covariates=covariates, metadata=notes))
+
+
+def drifted(errors, urad):
+    """The errors with EC0Y changed by so many urad."""
+    value, u = errors.squareness["EC0Y"]
+    return errors.replace(squareness={**errors.squareness, "EC0Y": (value + urad * 1e-6, u)})
+
+
+def time_of(hours):
+    return (NOW + timedelta(hours=hours)).isoformat()
+
+
+@pytest.fixture
+def plant(tmp_path, small_machine, small_machine_file, small_errors):
+    """One machine with its inbox: functions to write the job, to measure, to run."""
+    inbox = tmp_path / "inbox"
+    inbox.mkdir()
+
+    def write(text="", policy="", measured_with="bare", machine=small_machine_file, more=""):
+        (tmp_path / "recal.toml").write_text(
+            f'[machines.mill]\nmachine = "{machine}"\ninbox = "inbox"\ncontrollers = ["{CONTROL}"]\nout = "out"\n'
+            f'measured_with = "{measured_with}"\n{text}\n[machines.mill.policy]\n{policy}\n{more}'
+        )
+        return read_job(tmp_path / "recal.toml")
+
+    def measure(name, errors=small_errors, *, hours=0.0, seed=1, **options):
+        text = deviations_text(small_machine, errors, seed=seed, measured_at=time_of(hours), **options)
+        (inbox / f"{name}.deviations.csv").write_text(text)
+
+    def states():
+        store = open_store(job().store)
+        return [table.state for table in store.tables()]
+
+    def job():
+        return read_job(tmp_path / "recal.toml")
+
+    write()
+    return SimpleNamespace(
+        folder=tmp_path, inbox=inbox, out=tmp_path / "out", write=write, measure=measure, states=states, job=job,
+        run=lambda: run_jobs(job()), approve=lambda version=None: actions.approve(job(), "mill", version, "ada"),
+    )  # fmt: skip
+
+
+def active_correction(plant, machine):
+    """What the files behind the pointer add to commanded positions, mm."""
+    tables = read_tables(machine, [plant.out / "active" / "NC_CEC.INI"], CONTROL)
+    return lambda position: tables.correction(machine, Points(position, approach=np.ones_like(position)))
+
+
+def worst_left_um(plant, machine, errors):
+    """Largest error of the tool tip with the active files, rigid motion taken out, by the exact model."""
+    position = volume_grid(machine, tuple(axis.nodes_mm for axis in machine.axes)).position_mm
+    added = active_correction(plant, machine)(position)
+    left = compgen.without_rigid_motion(position, added + exact_error(machine, errors, position + added))
+    return 1e3 * np.max(np.linalg.norm(left, axis=1))
+
+
+def test_a_first_measurement_is_proposed_and_approved_by_a_person(plant, small_machine, small_errors):
+    plant.measure("a")
+    outcome = plant.run()
+    assert (outcome.exit_code, outcome.outcomes[0].waiting) == (0, (1,))
+    assert not (plant.out / "active").exists()
+    assert (plant.out / "proposed" / "v0001" / "NC_CEC.INI").is_file()
+    plant.approve()
+    assert os.readlink(plant.out / "active") == "v0001"
+    assert not list((plant.out / "proposed").iterdir())
+    assert worst_left_um(plant, small_machine, small_errors) < LEFT_UM
+
+
+def test_the_files_are_those_of_compgen_run_byte_for_byte(plant, small_machine):
+    plant.measure("a")
+    plant.run()
+    compgen.run(small_machine, [plant.inbox / "a.deviations.csv"], [CONTROL], plant.folder / "direct")
+    for name in ("NC_CEC.INI", "preflight.md", "manifest.json", "result.json"):
+        assert (plant.out / "proposed/v0001" / name).read_bytes() == (plant.folder / "direct" / name).read_bytes()
+
+
+def test_the_same_inbox_gives_the_same_state_and_the_same_exit_code(plant, listing):
+    plant.measure("a")
+    plant.measure("b", seed=2, hours=1)
+    first = plant.run()
+    plant.approve(2)
+    store = open_store(plant.job().store)
+    counts = {
+        name: len(getattr(store, name)()) for name in ("measurements", "attempts", "tables", "decisions", "events")
+    }
+    files = listing(plant.out)
+    (plant.inbox / "a.deviations.csv").rename(plant.inbox / "copy.deviations.csv")
+    second, third = plant.run(), plant.run()
+    assert second.outcomes[0].processed == () == third.outcomes[0].processed
+    assert second.exit_code == third.exit_code
+    assert first.outcomes[0].processed == ("a.deviations.csv", "b.deviations.csv")
+    assert counts == {name: len(getattr(store, name)()) for name in counts}
+    assert listing(plant.out) == files
+
+
+def test_no_change_beyond_its_uncertainty_is_held_back(plant):
+    plant.measure("a", hours=-2)
+    plant.run()
+    plant.approve()
+    plant.measure("b", seed=2, hours=-1)
+    outcome = plant.run()
+    assert outcome.exit_code == 1
+    assert plant.states() == ["active", "held"]
+    assert "within its uncertainty" in outcome.outcomes[0].messages[0]
+    assert (plant.out / "proposed" / "HELD-v0002").is_dir()
+    with pytest.raises(decisions.DecisionError, match="held back"):
+        plant.approve(2)
+
+
+def test_a_drift_is_proposed_and_the_new_tables_take_it_out(plant, small_machine, small_errors):
+    moved = drifted(small_errors, 40.0)
+    plant.measure("a", hours=-2)
+    plant.run()
+    plant.approve()
+    before = worst_left_um(plant, small_machine, moved)
+    plant.measure("b", moved, seed=2, hours=-1)
+    assert plant.run().exit_code == 0
+    plant.approve()
+    assert plant.states() == ["retired", "active"]
+    # half of a shear is a rotation; the rest is largest at the corners, 250 and 200 mm off the middle
+    assert before == pytest.approx(20e-6 * np.hypot(250.0, 200.0) * 1e3, abs=LEFT_UM)
+    assert worst_left_um(plant, small_machine, moved) < LEFT_UM
+    change = open_store(plant.job().store).tables()[1].summary["change"]
+    levels = [np.linspace(-half, half, 6) for half in (250.0, 200.0)]
+    expected = 20e-6 * 1e3 * np.sqrt(sum(np.mean(level**2) for level in levels))
+    assert change["rms_um"] == pytest.approx(expected, abs=0.2)
+    assert change["significant"]
+
+
+def test_rollback_restores_the_bytes_and_the_reason_is_kept(plant, small_errors, listing):
+    plant.measure("a", hours=-2)
+    plant.run()
+    plant.approve()
+    first = listing(plant.out / "active")
+    plant.measure("b", drifted(small_errors, 12.0), seed=2, hours=-1)
+    plant.run()
+    plant.approve()
+    assert listing(plant.out / "active") != first
+    (plant.out / "v0001" / "NC_CEC.INI").write_text("spoilt")
+    decision = actions.rollback(plant.job(), "mill", "bob", "scrap since Monday")
+    assert listing(plant.out / "active") == first
+    assert (decision.kind, decision.actor, decision.reason) == ("rollback", "bob", "scrap since Monday")
+    actions.rollback(plant.job(), "mill", "bob", "back", to=2)
+    assert os.readlink(plant.out / "active") == "v0002"
+    actions.rollback(plant.job(), "mill", "bob", "none", to=0)
+    assert not (plant.out / "active").exists()
+
+
+def test_a_measurement_with_the_active_tables_gives_the_errors_of_the_bare_machine(plant, small_machine, small_errors):
+    plant.write(measured_with="active", text='approval = "auto"')
+    plant.measure("a", hours=-3)
+    plant.run()
+    moved = drifted(small_errors, 12.0)
+    # approved a moment ago, so this measurement is made afterwards
+    plant.measure("b", moved, seed=2, hours=1, correction=active_correction(plant, small_machine))
+    assert plant.run().exit_code == 0
+    assert os.readlink(plant.out / "active") == "v0002"
+    assert worst_left_um(plant, small_machine, moved) < LEFT_UM
+    store = open_store(plant.job().store)
+    first, second = store.identifications()
+    assert (first.active_table_id, second.active_table_id) == (None, 1)
+    value, u = store.errors_of(second).squareness["EC0Y"]
+    other, u_other = store.errors_of(first).squareness["EC0Y"]
+    assert abs((value - other) * 1e6 - 12.0) < 4.0 * np.hypot(u, u_other) * 1e6
+
+
+def test_the_tables_that_were_active_when_it_was_measured_count_not_those_of_now(plant, small_machine, small_errors):
+    plant.write(measured_with="active", text='approval = "auto"')
+    plant.measure("a", hours=-3)
+    plant.run()
+    plant.measure("early", drifted(small_errors, 12.0), seed=2, hours=-2)  # before a table was active
+    assert plant.run().exit_code == 0
+    assert open_store(plant.job().store).identifications()[1].active_table_id is None
+    assert worst_left_um(plant, small_machine, drifted(small_errors, 12.0)) < LEFT_UM
+
+
+def test_the_file_itself_may_say_which_tables_were_active(plant, small_machine, small_errors):
+    plant.write(text='approval = "auto"')
+    plant.measure("a", hours=-3)
+    plant.run()
+    moved = drifted(small_errors, -15.0)
+    correction = active_correction(plant, small_machine)
+    plant.measure("b", moved, seed=2, hours=-1, correction=correction, active_table="v1")
+    plant.measure("c", moved, seed=3, hours=0, correction=correction, active_table="v9")
+    outcome = plant.run()
+    assert worst_left_um(plant, small_machine, moved) < LEFT_UM
+    assert any("c.deviations.csv" in text and "no such tables" in text for text in outcome.outcomes[0].messages)
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "said"),
+    [
+        ("max_age_days = 2", {"hours": -49}, "2.0 days old"),
+        ("max_age_days = 2", {"hours": -47}, None),
+        ("", {"hours": 30}, "lies in the future"),
+        ("temperature_c = [19, 21]", {}, "no temperature was logged"),
+        ("temperature_c = [19, 21]", {"temperature_c": (19.5, 21.3)}, "21.30 degC"),
+        ("temperature_c = [19, 21]", {"temperature_c": (19.5, 20.9)}, None),
+        ("max_reference_um = 1", {}, "at the reference point"),
+        ("max_reference_um = 60", {}, None),
+    ],
+)
+def test_the_policy_of_age_temperature_and_reference_point(plant, policy, options, said):
+    plant.write(policy=policy)
+    plant.measure("a", **options)
+    outcome = plant.run()
+    assert plant.states() == ["pending" if said is None else "held"]
+    assert said is None or said in outcome.outcomes[0].messages[0]
+
+
+@pytest.mark.parametrize(("limit", "state"), [(2.0, "held"), (20.0, "pending")])
+def test_the_limit_of_the_change_counts_against_the_active_tables(plant, small_errors, limit, state):
+    plant.write(policy=f"max_change_um = {limit}")
+    plant.measure("a", hours=-2)
+    plant.run()
+    plant.approve()  # the first tables are no change
+    plant.measure("b", drifted(small_errors, 12.0), seed=2, hours=-1)
+    plant.run()
+    assert plant.states() == ["active", state]
+
+
+def test_a_measurement_older_than_that_of_the_active_tables_is_held_back(plant, small_errors):
+    plant.measure("a", hours=-2)
+    plant.run()
+    plant.approve()
+    plant.measure("late", drifted(small_errors, 12.0), seed=2, hours=-5)
+    assert "newer measurement" in plant.run().outcomes[0].messages[0]
+
+
+def test_a_newer_proposal_takes_the_place_of_one_that_waits(plant, small_errors):
+    plant.measure("a", hours=-2)
+    plant.run()
+    plant.measure("b", drifted(small_errors, 12.0), seed=2, hours=-1)
+    plant.run()
+    assert plant.states() == ["superseded", "pending"]
+    assert [path.name for path in (plant.out / "proposed").iterdir()] == ["v0002"]
+
+
+def test_tables_that_the_round_trip_refuses_can_never_be_approved(plant):
+    plant.write(policy="max_step_um = 0.5")
+    plant.measure("a")
+    assert plant.run().exit_code == 1
+    assert plant.states() == ["refused"]
+    assert (plant.out / "proposed/NOT-ACCEPTED-v0001/NOT-ACCEPTED-NC_CEC.INI").is_file()
+    with pytest.raises(decisions.DecisionError, match="not accepted"):
+        actions.approve(plant.job(), "mill", 1, "ada", "I want it", override=True)
+
+
+def test_a_held_version_needs_an_override_with_a_reason(plant):
+    plant.write(policy="max_reference_um = 1")
+    plant.measure("a")
+    plant.run()
+    with pytest.raises(decisions.DecisionError, match="reason"):
+        actions.approve(plant.job(), "mill", 1, "ada", " ", override=True)
+    actions.approve(plant.job(), "mill", 1, "ada", "new ball screw", override=True)
+    assert os.readlink(plant.out / "active") == "v0001"
+
+
+def test_a_failing_machine_does_not_stop_the_others_and_a_bad_file_is_not_tried_twice(plant, small_machine_file):
+    other = '[machines.lost]\nmachine = "nowhere.toml"\ninbox = "inbox2"\ncontrollers = ["neutral"]\nout = "out2"\n'
+    plant.write(more=other + 'measured_with = "bare"\n')
+    plant.measure("a")
+    (plant.inbox / "bad.deviations.csv").write_text("x_mm,y_mm,z_mm,dx_um\n0,0,nan,1\n")
+    outcome = plant.run()
+    mill, lost = outcome.outcomes
+    assert (mill.state, lost.state, outcome.exit_code) == ("failed", "failed", 1)
+    assert mill.processed == ("a.deviations.csv",)
+    assert any("bad.deviations.csv" in text and "finite" in text for text in mill.messages)
+    plant.run()
+    store = open_store(plant.job().store)
+    assert [attempt.outcome for attempt in store.attempts()].count("failed") == 1
+    plant.write(policy="confidence = 0.9")  # other settings: tried once more
+    plant.run()
+    assert [attempt.outcome for attempt in store.attempts()].count("failed") == 2
+
+
+def test_what_cannot_be_read_is_reported_once_and_taken_when_it_can(plant):
+    (plant.inbox / "a.deviations.csv").symlink_to(plant.folder / "unplugged.csv")
+    first, second = plant.run(), plant.run()
+    assert first.exit_code == second.exit_code == 1
+    assert "cannot be read" in first.outcomes[0].messages[0]
+    assert len(open_store(plant.job().store).events()) == 1
+    plant.measure("b")
+    (plant.inbox / "b.deviations.csv").rename(plant.folder / "unplugged.csv")
+    assert plant.run().outcomes[0].processed == ("a.deviations.csv",)
+
+
+def test_a_full_disk_is_no_verdict_about_the_measurement(plant, monkeypatch):
+    plant.measure("a")
+    real = runner.process
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(runner, "process", full)
+    assert plant.run().exit_code == 1
+    assert open_store(plant.job().store).attempts() == []
+    monkeypatch.setattr(runner, "process", real)
+    monkeypatch.setattr(publish, "_make", full)
+    outcome = plant.run()
+    assert "cannot be written: No space left" in outcome.outcomes[0].messages[-1]
+    monkeypatch.undo()
+    assert plant.run().exit_code == 0
+    assert plant.states() == ["pending"]
+    assert (plant.out / "proposed/v0001/NC_CEC.INI").is_file()
+
+
+def test_a_clock_that_goes_backwards_is_reported_and_the_order_stays(plant, small_errors, monkeypatch):
+    plant.measure("a", hours=-40)
+    plant.run()
+    decided = plant.approve()
+    monkeypatch.setattr(Store, "now", lambda *_: NOW - timedelta(hours=30))
+    plant.measure("b", drifted(small_errors, 12.0), seed=2, hours=-35)
+    outcome = plant.run()
+    assert outcome.exit_code == 0
+    assert any("clock went backwards" in text for text in outcome.outcomes[0].messages)
+    later = open_store(plant.job().store).decisions()[-1]
+    assert later.sequence > decided.sequence
+    assert later.at >= decided.at
+
+
+def test_other_tables_that_became_active_meanwhile_make_the_judgement_start_again(plant, small_errors, monkeypatch):
+    plant.measure("a", hours=-2)
+    plant.run()
+    plant.measure("b", drifted(small_errors, 12.0), seed=2, hours=-1)
+    real, calls = runner.process, []
+
+    def slow(*parts):
+        calls.append(real(*parts))
+        if len(calls) == 1:
+            plant.approve(1)
+        return calls[-1]
+
+    monkeypatch.setattr(runner, "process", slow)
+    plant.run()
+    assert [call.judged_against for call in calls] == [None, 1]
+    assert plant.states() == ["active", "pending"]
+    assert "change" in open_store(plant.job().store).tables()[1].summary
+
+
+def test_every_decision_and_failure_is_told_once(plant):
+    script = "import sys, pathlib; pathlib.Path(sys.argv[1]).open('a').write(sys.stdin.read())"
+    told = plant.folder / "told.jsonl"
+    words = json.dumps([sys.executable, "-c", script, str(told)])
+    plant.write(text=f"notify = {words}")
+    plant.measure("a")
+    (plant.inbox / "bad.deviations.csv").write_text("x_mm\n")
+    plant.run()
+    plant.approve()
+    plant.run()
+    messages = [json.loads(line) for line in told.read_text().splitlines()]
+    assert sorted(message["event"] for message in messages) == ["approve", "failed", "propose"]
+    assert next(m for m in messages if m["event"] == "approve")["actor"] == "ada"
+
+
+def test_a_notification_that_fails_is_reported_and_sent_by_the_next_run(plant):
+    plant.write(text='notify = ["false"]')
+    plant.measure("a")
+    outcome = plant.run()
+    assert outcome.exit_code == 0
+    assert "false ended with 1" in outcome.outcomes[0].messages[0]
+    plant.write(text=f'notify = ["tee", "{plant.folder}/told"]')
+    plant.run()
+    assert json.loads((plant.folder / "told").read_text())["event"] == "propose"
+
+
+def test_a_folder_in_the_inbox_is_one_measurement(plant, small_machine, small_errors):
+    text = deviations_text(small_machine, small_errors, seed=1).splitlines(keepends=True)
+    head = [k for k, line in enumerate(text) if line.startswith("x_mm")][0] + 1
+    middle = head + (len(text) - head) // 2
+    both = plant.inbox / "monday"
+    both.mkdir()
+    notes = [line for line in text[:head] if "rows" not in line]
+    (both / "1.deviations.csv").write_text("".join([*notes, *text[head:middle]]))
+    (both / "2.deviations.csv").write_text("".join([*notes, *text[middle:]]))
+    outcome = plant.run()
+    assert outcome.outcomes[0].processed == ("monday",)
+    assert plant.states() == ["pending"]
