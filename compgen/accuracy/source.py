@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compgen.accuracy.field import Field, Spread, axis_lines
+from compgen.accuracy.field import Field, Spread, axis_lines, unknown_spread
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -53,6 +53,9 @@ class ErrorSource:
         return Field(position_mm, position_mm + tool, error, self._spread(position_mm))
 
     def _spread(self, position_mm: FloatArray) -> Spread:
+        if self.factor is None:
+            return unknown_spread
+
         def spread(weight: FloatArray) -> float:
             used = np.any(weight != 0.0, axis=1)
             return self.u_of(self._gradient(position_mm[used], weight[used]))
