@@ -515,6 +515,7 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
         ),
         "merge": (small_machine_file, tables / "volcomp0.csv", *files, "--errors", errors_file, "--out", out),
         "options": (small_machine_file, errors_file, "--out", out),
+        "import": (Path(__file__).parent / "golden" / "imports" / "linear.rtl", "--out", out),
         "report": (tables, "--out", out),
     }
 
@@ -532,6 +533,7 @@ WRITING = [
     "diff",
     "merge",
     "options",
+    "import",
     "report",
 ]
 

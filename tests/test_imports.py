@@ -500,3 +500,27 @@ def test_exchange_files_come_in_any_encoding(tmp_path):
         assert table.squareness["EC0Y"][0] == 0.00002
     wrong = import_file(written(tmp_path, text.replace("0.001", "25.0"), "d.txt"))
     assert any("are the numbers mm and rad" in text for text in wrong.doubts)
+
+
+@pytest.mark.parametrize("name", ["linear.rtl", "angular.rta", "ecmc_ISO230.dat", "german.csv", "wide.xlsx"])
+def test_no_damage_to_a_file_ends_in_anything_but_an_answer(tmp_path, name):
+    content = (GOLDEN / name).read_bytes()
+    generator = np.random.default_rng(3)
+    for _ in range(40):
+        data = bytearray(content)
+        for _ in range(int(generator.integers(1, 6))):
+            place, what = int(generator.integers(len(data))), int(generator.integers(4))
+            if what == 0:
+                data[place] = int(generator.integers(256))
+            elif what == 1:
+                del data[place : place + int(generator.integers(1, 40))]
+            elif what == 2:
+                data[place:place] = data[place : place + 30]
+            else:
+                data[place:place] = (b"\xff", b",", b";", b"\0", b"1e999", b"::", b"\n")[int(generator.integers(7))]
+        path = written(tmp_path, bytes(data), name)
+        try:
+            item = import_file(path)
+        except InputError:
+            continue
+        assert item.files()
