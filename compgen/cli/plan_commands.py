@@ -23,11 +23,13 @@ from compgen.plan import (
     Candidate,
     Plan,
     PlannedStations,
+    PlanVisibility,
     Suggestion,
     box_from_text,
     format_stations,
     judge_trajectories,
     plan_of,
+    plan_visibility,
     planned,
     planned_noise,
     read_boxes,
@@ -36,7 +38,7 @@ from compgen.plan import (
     suggest,
 )
 from compgen.plan.suggest import DEFAULT_EVALUATIONS, Criterion
-from compgen.report.plan_text import plan_table, suggestion_table, trajectory_table
+from compgen.report.plan_text import plan_table, suggestion_table, trajectory_table, visibility_table
 
 Progress = Callable[[str], None]
 
@@ -91,7 +93,8 @@ def plan_command(
     """Plan a measurement: what it will determine, and how well, before anything is measured.
 
     Writes plan.json and plan.errors.csv (um, urad; values zero, u_value predicted) to DIR, with --suggest also
-    suggested.stations.csv, with --target-um proposed.points.csv (mm). Without --u-length-um 0.1 um + 0.15 um/m is
+    suggested.stations.csv, with --target-um proposed.points.csv (mm). Says which effects beside the geometric errors the plan
+    can never see (compgen effects), and what to measure in addition. Without --u-length-um 0.1 um + 0.15 um/m is
     assumed. Exit code 1 if an unknown is not determined, or no trajectory reaches the target.
 
     \b
@@ -107,17 +110,19 @@ def plan_command(
         show("predicting")
         setup = planned(machine, given, where, noise)
         result = plan_of(setup)
+        visible = plan_visibility(setup, where)
         suggestion = None
         if search:
             kind = cast(Criterion, criterion)
             suggestion = suggest(setup, regions, criterion=kind, evaluations=evaluations, seed=seed, progress=show)
         best = suggestion.plan.planned.stations if suggestion else given
         judged = None if target_um is None else _judged(machine, best, noise, target_um, show)
-    summary = _write(out, result, suggestion, judged, target_um)
+    summary = _write(out, result, visible, suggestion, judged, target_um)
     if as_json:
         print_json(summary)
     else:
         _show(result, suggestion, judged, target_um)
+        stdout.print(visibility_table(visible))
     reached = judged is None or judged[1] is not None
     return 0 if result.determined and reached else 1
 
@@ -153,12 +158,17 @@ def _boxes(box: tuple[str, ...], boxes: Path | None, *, search: bool) -> dict[st
 
 
 def _write(
-    out: Path, result: Plan, suggestion: Suggestion | None, judged: Judged | None, target_um: float | None
+    out: Path,
+    result: Plan,
+    visible: PlanVisibility,
+    suggestion: Suggestion | None,
+    judged: Judged | None,
+    target_um: float | None,
 ) -> dict[str, Any]:
     """Write the files together and return the contents of plan.json."""
     folder = OutputFolder(out)
     machine = result.planned.machine
-    summary = result.summary()
+    summary = {**result.summary(), "visibility": visible.summary()}
     if suggestion is not None:
         summary["suggestion"] = suggestion.summary()
         folder.add("suggested.stations.csv", format_stations(suggestion.plan.planned.stations, machine))

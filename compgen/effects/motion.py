@@ -27,7 +27,7 @@ def run_of(readings: Readings) -> NDArray[np.int64] | None:
 
 
 def step_times_s(readings: Readings, rows: NDArray[np.bool_] | None = None) -> list[float]:
-    """Times between runs at which something may have changed, at most 200; between stops where no run is labelled.
+    """Times between runs at which something may have changed, at most 200; between stops if there is one run only.
 
     ``rows`` (n,) takes some of the readings.
     """
@@ -40,7 +40,8 @@ def step_times_s(readings: Readings, rows: NDArray[np.bool_] | None = None) -> l
     order = np.argsort(time_s[rows], kind="stable")
     ordered = time_s[rows][order]
     run = run_of(readings)
-    changed = np.diff(ordered) > 0 if run is None else np.diff(run[rows][order]) != 0
+    several = run is not None and np.any(run[rows] != run[rows][0])
+    changed = np.diff(run[rows][order]) != 0 if several and run is not None else np.diff(ordered) > 0
     between = 0.5 * (ordered[1:] + ordered[:-1])[changed & (np.diff(ordered) > 0)]
     if len(between) > MOST_TIMES:
         between = between[np.linspace(0, len(between) - 1, MOST_TIMES).astype(int)]

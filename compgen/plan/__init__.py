@@ -15,12 +15,14 @@ from compgen.plan.stations import (
     shell_around,
 )
 from compgen.plan.suggest import Candidate, Suggestion, candidate_trajectories, judge_trajectories, suggest
+from compgen.plan.visibility import PlanVisibility, plan_visibility
 
 __all__ = [
     "Box",
     "Candidate",
     "Plan",
     "Planned",
+    "PlanVisibility",
     "PlannedStations",
     "Shell",
     "Suggestion",
@@ -31,6 +33,7 @@ __all__ = [
     "judge_trajectories",
     "plan",
     "plan_of",
+    "plan_visibility",
     "planned",
     "planned_noise",
     "planned_stations",

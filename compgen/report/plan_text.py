@@ -11,10 +11,13 @@ from rich.table import Table
 from rich.text import Text
 
 from compgen.core.names import error_named
-from compgen.plan import Candidate, Plan, Suggestion
+from compgen.effects.visibility import separating
+from compgen.plan import Candidate, Plan, PlanVisibility, Suggestion
 
 #: Reasons beyond this number stand in plan.json only.
 MOST_REASONS = 8
+#: Pairs beyond this number stand in plan.json only.
+MOST_PAIRS = 12
 
 
 def plan_table(plan: Plan) -> Group:
@@ -77,3 +80,27 @@ def trajectory_table(judged: Sequence[Candidate], chosen: Candidate | None, targ
         else f"no trajectory reaches {target_um:g} um with these stations"
     )
     return Group(table, Text(verdict, "" if chosen else "red"))
+
+
+def visibility_table(visible: PlanVisibility) -> Group:
+    """Return what the plan can never see of the effects beside the geometric errors, and which look alike."""
+    never = Table("what this plan can never see", "why", "measure in addition", box=box.SIMPLE)
+    for (reason, breaker), names in _grouped(visible).items():
+        never.add_row(", ".join(names), reason, breaker)
+    alike = Table("look alike", "correlation", "measure in addition", box=box.SIMPLE)
+    for pair in visible.pairs[:MOST_PAIRS]:
+        first, second = (visible.cards[name] for name in pair.names)
+        shared = f"{pair.correlation:.3f} ({pair.shared} of {pair.directions} directions)"
+        alike.add_row(" and ".join(pair.names), shared, separating(first, second))
+    notes = [Text(f"assumed: {'; '.join(visible.assumed)}")] if visible.assumed else []
+    if len(visible.pairs) > MOST_PAIRS:
+        notes.append(Text(f"and {len(visible.pairs) - MOST_PAIRS} more pairs in plan.json"))
+    return Group(never, alike, *notes)
+
+
+def _grouped(visible: PlanVisibility) -> dict[tuple[str, str], list[str]]:
+    """Effects that are not seen, by reason and by what would show them."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for name, reason in visible.never.items():
+        found.setdefault((reason.partition(":")[0], visible.cards[name].breaker), []).append(name)
+    return found
