@@ -6,12 +6,11 @@ laboratory. Its parts and units are named alike, so that a laboratory can take t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from compgen.report.html.content import FIGURES
 from compgen.report.html.curves import COVERAGE
-from compgen.report.html.folder import ResultFolder
 
 #: Share of values within the expanded uncertainty, for k = 2 and a normal distribution.
 PROBABILITY = 0.9545
@@ -24,7 +23,7 @@ STATEMENT = (
 )
 
 
-def calibration_record(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, Any]:
+def calibration_record(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the contents of ``calibration.json`` from the numbers of the report."""
     return {
         "format": "compgen calibration record 1",
@@ -48,12 +47,12 @@ def calibration_record(source: ResultFolder, data: Mapping[str, Any]) -> dict[st
     }
 
 
-def _quantity(value: Any, unit: str, expanded: Any = None) -> dict[str, Any]:
-    """A real quantity of D-SI: value, unit, and expanded uncertainty where one is known."""
-    found: dict[str, Any] = {"value": value, "unit": UNITS[unit]}
-    if expanded is not None:
-        found["expandedUnc"] = {
-            "uncertainty": expanded,
+def _list(values: Sequence[Any], unit: str, standard: Sequence[Any] = ()) -> dict[str, Any]:
+    """A list of real quantities as D-SI has it: values, one unit, expanded uncertainties where all are known."""
+    found: dict[str, Any] = {"valueXMLList": list(values), "unitXMLList": [UNITS[unit]]}
+    if standard and None not in standard:
+        found["expandedUncXMLList"] = {
+            "uncertaintyXMLList": [COVERAGE * u for u in standard],
             "coverageFactor": COVERAGE,
             "coverageProbability": PROBABILITY,
             "distribution": "normal",
@@ -61,14 +60,16 @@ def _quantity(value: Any, unit: str, expanded: Any = None) -> dict[str, Any]:
     return found
 
 
+def _quantity(value: Any, unit: str) -> dict[str, Any]:
+    """A real quantity as D-SI has it."""
+    return {"value": value, "unit": UNITS[unit]}
+
+
 def _errors(data: Mapping[str, Any]) -> dict[str, Any]:
     results = []
     for item in data["errors"]:
-        values = [
-            _quantity(value, item["unit"], None if u is None else COVERAGE * u)
-            for value, u in zip(item["value"], item["u"], strict=True)
-        ]
-        positions = [_quantity(position, "mm") for position in item["position_mm"]]
+        values = _list(item["value"], item["unit"], item["u"])
+        positions = _list(item["position_mm"], "mm")
         results.append({"name": item["error"], "meaning": item["meaning"], "positions": positions, "values": values})
     method = data["measurement"].get("method")
     return {"name": "geometric errors (ISO 230-1)", "usedMethod": method, "results": results}

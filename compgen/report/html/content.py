@@ -150,8 +150,8 @@ def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dic
 def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
     if len(controls) == 1:
         return {
-            "accepted": "The tables may be loaded",
-            "partial": "The tables may be loaded, but much of the error is beyond this control",
+            "accepted": "The tables may be loaded, by the preflight list",
+            "partial": "The tables may be loaded, by the preflight list, but much of the error is beyond this control",
             "rejected": "Do not load these tables",
         }[state]
     count = {name: sum(item["state"] == name for item in controls) for name in VERDICTS}

@@ -102,7 +102,7 @@ class _Canvas:
     def __init__(self, controls: Sequence[str]) -> None:
         self.controls = controls
         self.figure: Figure = new_figure(*SIZE_PT)
-        self.axes: Axes = self.figure.add_axes((0.15, 0.19, 0.82, 0.72))
+        self.axes: Axes = self.figure.add_axes((0.185, 0.19, 0.785, 0.74))
         self.axes.axhline(0.0, color=colour("muted"), linewidth=0.6)
         self.axes.locator_params(nbins=5)
 
@@ -166,7 +166,7 @@ def draw_tables(control: str, number: int, curves: Sequence[TableCurve]) -> list
 
 def _draw_table_group(control: str, number: int, axis: str, unit: str, group: Sequence[TableCurve]) -> Picture:
     figure = new_figure(*SIZE_PT)
-    axes = figure.add_axes((0.17, 0.19, 0.62, 0.74))
+    axes = figure.add_axes((0.195, 0.19, 0.60, 0.74))
     for k, curve in enumerate(group):
         style = {"color": colour(CYCLE[k % len(CYCLE)]), "marker": "osx^vD"[k % 6], "markersize": 3}
         axes.plot(curve.position_mm, curve.value, label=curve.name, **style)  # type: ignore[arg-type]
@@ -191,7 +191,7 @@ def draw_squareness(identified: ErrorTable, fitted: ErrorTable | None) -> Pictur
     if not items:
         return None
     figure = new_figure(*SIZE_PT)
-    axes = figure.add_axes((0.17, 0.14, 0.8, 0.78))
+    axes = figure.add_axes((0.195, 0.14, 0.775, 0.78))
     value = np.array([pair[0] for _, pair in items]) * 1e6
     u = np.nan_to_num(np.array([pair[1] for _, pair in items]) * 1e6)
     at = np.arange(len(items))

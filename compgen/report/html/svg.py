@@ -26,6 +26,7 @@ LAYER = "layer-"
 
 _NUMBER = re.compile(r"(-?\d+\.\d\d)\d+")
 _FAMILY = re.compile(r"font-family: [^;\"]*;? ?")
+_IMAGE_ID = re.compile(r' id="image[0-9a-f]+"')
 _ID = re.compile(r'\bid="([^"]+)"')
 _LINK = re.compile(r'(url\(#|href="#)')
 _LAYER_ID = re.compile(rf'id="[^"]*?({LAYER}[a-z0-9-]+?)(?:_\d+)?"')
@@ -96,6 +97,7 @@ def to_svg(figure: Figure, key: str, title: str) -> Markup:
     text = re.sub(r"<style[^>]*>.*?</style>", "", text, flags=re.DOTALL)
     text = re.sub(r"<defs>\s*</defs>", "", text)
     text = _LAYER_ID.sub(lambda found: f'class="layer {found.group(1)}"', text)
+    text = _IMAGE_ID.sub("", text)
     text = _ID.sub(rf'id="{key}-\1"', text)
     text = _LINK.sub(rf"\g<1>{key}-", text)
     text = _FAMILY.sub("", text)

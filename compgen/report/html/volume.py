@@ -144,7 +144,7 @@ def _name_axes(axes: Axes, grid: Grid) -> None:
     )
     for axis, place in places:
         x, y = projected(place)
-        text = f"{AXES[axis]} {low[axis]:g} … {high[axis]:g} mm"
+        text = f"{AXES[axis]} {low[axis]:g} … {high[axis]:g} mm".replace("-", "−")
         offset = ((0, -14), (10, -12), (-8, 0))[axis]
         align = ("center", "left", "right")[axis]
         axes.annotate(text, (x, y), xytext=offset, textcoords="offset points", ha=align, va="center", fontsize=8)
@@ -158,14 +158,16 @@ def draw_slices(grid: Grid, number: int) -> Picture:
         planes = [_slice(grid, field_mm, axis) for axis in (2, 1, 0)]
         top_um = max(float(np.max(np.linalg.norm(plane[2], axis=-1))) for plane in planes) * 1e3 or 1.0
         for column, plane in enumerate(planes):
-            axes = figure.add_axes((0.065 + 0.3 * column, 0.575 - 0.475 * row, 0.235, 0.345))
+            axes = figure.add_axes((0.085 + 0.292 * column, 0.575 - 0.475 * row, 0.215, 0.345))
             image = _draw_slice(axes, plane, top_um)
             axes.set_title(f"{plane[3]}, {when}", fontsize=8, pad=3)
             data["slices"].append(_slice_data(axes, plane))
-        bar = figure.add_axes((0.935, 0.575 - 0.475 * row, 0.014, 0.345))
+        bar = figure.add_axes((0.915, 0.575 - 0.475 * row, 0.014, 0.345))
         figure.colorbar(image, cax=bar).set_label("µm", labelpad=1)
         bar.grid(visible=False)
-    title = "Length of the error vector in µm on the three middle planes, before above and after below"
+    title = (
+        "Length of the error vector in µm on the three middle planes: before above, after below, on scales of their own"
+    )
     svg = to_svg(figure, f"slices-{number}", title)
     return Picture(f"slices-{number}", "Slices through the middle", svg, data, title)
 

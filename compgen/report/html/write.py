@@ -44,7 +44,7 @@ def build_report(folder: str | Path) -> Report:
     source = read_folder(folder)
     data = plain(content(source))
     page = render_page(source, data, draw(source, data))
-    record = plain(calibration_record(source, data))
+    record = calibration_record(data)
     dossier = dossier_data(data)
     return Report(
         {
