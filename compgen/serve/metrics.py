@@ -1,0 +1,178 @@
+"""Prometheus metrics of the dashboard, of the fleet and of a long-running recalibration."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter as Tally
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+from wsgiref.simple_server import WSGIRequestHandler, make_server
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+from compgen.errors import CompgenError, InputError
+from compgen.recal.records import TableState
+from compgen.recal.store import Store
+from compgen.serve.fleet import STATUSES, fleet
+
+if TYPE_CHECKING:
+    from compgen.recal.runner import MachineOutcome
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+STATES: tuple[TableState, ...] = ("pending", "held", "refused", "superseded", "rejected", "active", "retired")
+
+
+class FleetCollector(Collector):
+    """Looks into the store when the metrics are read; a store that cannot be reached is one of them."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def describe(self) -> list[Any]:
+        """Return nothing: the store is not asked before somebody reads the metrics."""
+        return []
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        """Return the gauges of the fleet."""
+        up = GaugeMetricFamily("compgen_store_up", "Whether the store could be read.")
+        try:
+            rows = fleet(self._store)
+        except CompgenError:
+            up.add_metric([], 0.0)
+            yield up
+            return
+        up.add_metric([], 1.0)
+        yield up
+        counts = Tally(row.status for row in rows)
+        machines = GaugeMetricFamily("compgen_machines", "Machines by status.", labels=["status"])
+        for status in STATUSES:
+            machines.add_metric([status], counts[status])
+        yield machines
+        states = Tally(state for row in rows for state in row.states.values())
+        tables = GaugeMetricFamily("compgen_tables", "Sets of tables by state.", labels=["state"])
+        for state in STATES:
+            tables.add_metric([state], states[state])
+        yield tables
+        measured = GaugeMetricFamily(
+            "compgen_last_measurement_timestamp_seconds", "When the newest measurement was made.", labels=["machine"]
+        )
+        active = GaugeMetricFamily("compgen_active_version", "Active tables, 0 if none are.", labels=["machine"])
+        waiting = GaugeMetricFamily("compgen_waiting_tables", "Tables that wait for a person.", labels=["machine"])
+        failed = GaugeMetricFamily(
+            "compgen_last_attempt_failed", "Whether the last attempt failed.", labels=["machine"]
+        )
+        for row in rows:
+            name = [row.machine.name]
+            if row.measured_at is not None:
+                measured.add_metric(name, row.measured_at.timestamp())
+            active.add_metric(name, float(row.active or 0))
+            waiting.add_metric(name, float(len(row.waiting)))
+            failed.add_metric(name, 1.0 if row.failure else 0.0)
+        yield from (measured, active, waiting, failed)
+
+
+class ServeMetrics:
+    """What the dashboard counts about itself, and the fleet."""
+
+    def __init__(self, store: Store, sessions: Callable[[], int]) -> None:
+        self.registry = CollectorRegistry(auto_describe=False)
+        self.requests = Counter(
+            "compgen_http_requests", "Requests.", ["endpoint", "method", "status"], registry=self.registry
+        )
+        self.seconds = Histogram(
+            "compgen_http_request_seconds", "Time of requests, s.", ["endpoint"], registry=self.registry
+        )
+        self.logins = Counter("compgen_logins", "Logins by outcome.", ["outcome"], registry=self.registry)
+        self.decisions = Counter(
+            "compgen_dashboard_decisions", "Decisions made here.", ["kind"], registry=self.registry
+        )
+        self.refused = Counter(
+            "compgen_refused_requests", "Requests refused by reason.", ["reason"], registry=self.registry
+        )
+        Gauge("compgen_sessions", "Users who are logged in.", registry=self.registry).set_function(sessions)
+        self.registry.register(FleetCollector(store))
+
+    def text(self) -> bytes:
+        """Return everything in the text format of Prometheus."""
+        return generate_latest(self.registry)
+
+
+class WatchMetrics:
+    """What ``compgen recal watch`` counts; give :meth:`count` to it as ``on_outcome``."""
+
+    def __init__(self, store: Store | None = None) -> None:
+        self.registry = CollectorRegistry(auto_describe=False)
+        self.passes = Counter(
+            "compgen_recal_passes", "Passes by outcome.", ["machine", "state"], registry=self.registry
+        )
+        self.measurements = Counter(
+            "compgen_recal_measurements", "Measurements that were processed.", ["machine"], registry=self.registry
+        )
+        self.seconds = Histogram(
+            "compgen_recal_pass_seconds",
+            "Time of a pass over one machine, s.",
+            buckets=(0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0),
+            registry=self.registry,
+        )
+        self.last = Gauge(
+            "compgen_recal_last_pass_timestamp_seconds", "When a machine was last looked at.", ["machine"],
+            registry=self.registry,
+        )  # fmt: skip
+        if store is not None:
+            self.registry.register(FleetCollector(store))
+
+    def count(self, outcome: MachineOutcome) -> None:
+        """Count one pass over one machine."""
+        self.passes.labels(outcome.machine, outcome.state).inc()
+        self.measurements.labels(outcome.machine).inc(len(outcome.processed))
+        self.seconds.observe(outcome.seconds)
+        self.last.labels(outcome.machine).set_to_current_time()
+
+    def text(self) -> bytes:
+        """Return everything in the text format of Prometheus."""
+        return generate_latest(self.registry)
+
+
+class _Quiet(WSGIRequestHandler):
+    timeout = 10
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Log nothing: whoever reads metrics comes every few seconds."""
+
+
+def start_metrics(text: Callable[[], bytes], port: int, host: str = "127.0.0.1") -> tuple[int, Callable[[], None]]:
+    """Serve metrics at ``/metrics`` in a thread of their own.
+
+    Returns
+    -------
+    The port (which the system chose if ``port`` is 0) and what stops it.
+
+    Raises
+    ------
+    InputError
+        if the port cannot be used.
+    """
+
+    def answer(environ: dict[str, Any], start_response: Any) -> list[bytes]:
+        headers = [("X-Content-Type-Options", "nosniff"), ("Cache-Control", "no-store")]
+        if environ["PATH_INFO"] != "/metrics" or environ["REQUEST_METHOD"] not in ("GET", "HEAD"):
+            start_response("404 Not Found", [("Content-Type", "text/plain"), *headers])
+            return [b"metrics are at /metrics\n"]
+        start_response("200 OK", [("Content-Type", CONTENT_TYPE), *headers])
+        return [text()]
+
+    try:
+        server = make_server(host, port, answer, handler_class=_Quiet)
+    except OSError as error:
+        raise InputError(f"{host}:{port} cannot be used: {error.strerror or error}", field="--metrics-port") from error
+    thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
+    thread.start()
+
+    def stop() -> None:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+    return server.server_port, stop

@@ -1,0 +1,136 @@
+"""Who may log in: a file of names and password hashes, kept apart from the store.
+
+The store never forgets anything and is copied into backups; a password that was changed must be gone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import tempfile
+import threading
+import unicodedata
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from argon2 import PasswordHasher
+from argon2.exceptions import Argon2Error, InvalidHashError
+
+from compgen.core.files import sha256_of
+from compgen.errors import InputError
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+#: Names that the program itself signs decisions with.
+RESERVED = ("automatic",)
+SHORTEST, LONGEST = 12, 256
+#: Hashes that are worked out at the same time; each takes 64 MiB.
+AT_ONCE = 2
+
+
+class Users:
+    """The file of users; it is read again at every question, so that a change counts at once."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._hasher = PasswordHasher()  # Argon2id with the parameters of RFC 9106, section 4, second choice
+        self._slots = threading.BoundedSemaphore(AT_ONCE)
+        self._nobody = self._hasher.hash("a password that nobody has")
+
+    def names(self) -> list[str]:
+        """Return the names of all users."""
+        return sorted(self._read())
+
+    def stamp(self, name: str) -> str | None:
+        """Return what changes when the user's password does; None for an unknown user."""
+        found = self._read().get(name)
+        return None if found is None else sha256_of(found.encode())
+
+    def verify(self, name: str, password: str) -> bool:
+        """Whether the password is right; an unknown name takes as long as a wrong password."""
+        found = self._read().get(name)
+        if len(password) > LONGEST:
+            return False
+        with self._slots:
+            try:
+                right = self._hasher.verify(found or self._nobody, _normal(password))
+            except (Argon2Error, InvalidHashError):
+                return False
+        return right and found is not None
+
+    def add(self, name: str, password: str) -> bool:
+        """Add a user or change the password; return whether the user is new. InputError for what cannot be taken."""
+        check_name(name)
+        check_password(name, password)
+        users = dict(self._read())
+        new = name not in users
+        others = {known.lower() for known in users if known != name}
+        if name.lower() in others:
+            raise InputError(f"{name!r} differs from another user by capital letters only; choose another name")
+        users[name] = self._hasher.hash(_normal(password))
+        self._write(users)
+        return new
+
+    def remove(self, name: str) -> None:
+        """Remove a user, whose sessions end at once; InputError if there is none."""
+        users = dict(self._read())
+        if name not in users:
+            raise InputError(f"knows no user {name!r}", file=self.path)
+        del users[name]
+        self._write(users)
+
+    def _read(self) -> Mapping[str, str]:
+        try:
+            with self.path.open(encoding="utf-8") as stream:
+                if os.name == "posix" and os.fstat(stream.fileno()).st_mode & 0o022:
+                    raise InputError("others may write this file of users; chmod 600 it", file=self.path)
+                data = json.load(stream)
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot be read as a file of users: {error}", file=self.path) from error
+        users = data.get("users") if isinstance(data, dict) else None
+        if not isinstance(users, dict) or not all(isinstance(item, str) for item in users.values()):
+            raise InputError("is not a file of users; make one with `compgen serve add-user`", file=self.path)
+        return users
+
+    def _write(self, users: Mapping[str, str]) -> None:
+        """Replace the file in one step; only its owner may read it."""
+        text = json.dumps({"users": dict(sorted(users.items()))}, indent=2) + "\n"
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(prefix=".users-", dir=self.path.parent)  # readable by the owner only
+        except OSError as error:
+            raise InputError(f"cannot be written: {error.strerror or error}", file=self.path) from error
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(name, self.path)
+        except OSError as error:
+            with suppress(OSError):
+                os.unlink(name)
+            raise InputError(f"cannot be written: {error.strerror or error}", file=self.path) from error
+
+
+def check_name(name: str) -> None:
+    """Raise InputError unless ``name`` can be that of a user."""
+    if not NAME.fullmatch(name):
+        raise InputError(f"{name!r} is not a name: letters, digits and . _ @ -, at most 64, are allowed")
+    if name.lower() in RESERVED:
+        raise InputError(f"{name!r} is what decisions without a person are signed with; choose another name")
+
+
+def check_password(name: str, password: str) -> None:
+    """Raise InputError for a password that is too short, too long, or the name."""
+    if not SHORTEST <= len(password) <= LONGEST:
+        raise InputError(f"a password has {SHORTEST} to {LONGEST} characters; this one has {len(password)}")
+    if name.lower() in password.lower() or len(set(password)) < 5:
+        raise InputError("this password is easy to guess: it holds the name, or fewer than five different characters")
+
+
+def _normal(password: str) -> str:
+    """One form for letters that keyboards write in several ways."""
+    return unicodedata.normalize("NFC", password)
