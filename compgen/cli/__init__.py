@@ -19,6 +19,7 @@ from compgen.cli import (
     report_commands,
     run_commands,
     safety_commands,
+    serve_commands,
     simulate_commands,
 )
 from compgen.cli.common import run_command
@@ -56,6 +57,7 @@ MODULES = (
     options_commands,
     safety_commands,
     recal_commands,
+    serve_commands,
     listing_commands,
 )
 for module in MODULES:

@@ -156,7 +156,8 @@ def _with_notify(job: Job, command: str | None) -> Job:
 @click.option(
     "--poll-s", default=2.0, show_default=True, type=click.FloatRange(0.05, 3600), help="Look at the job file, s."
 )
-def watch_command(job: Job, poll_s: float) -> int:
+@click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus metrics on 127.0.0.1 at this port.")
+def watch_command(job: Job, poll_s: float, metrics_port: int | None) -> int:
     """Keep running: every machine by its schedule (without one every 5 minutes), until SIGTERM or Ctrl-C.
 
     Edits of the job file are picked up; a wrong one is reported and the one before stays. On a signal the measurement
@@ -168,7 +169,20 @@ def watch_command(job: Job, poll_s: float) -> int:
     """
     from compgen.recal.watch import Watch
 
-    Watch(job.path, poll_s=poll_s).run()
+    if metrics_port is None:
+        Watch(job.path, poll_s=poll_s).run()
+        return 0
+    from compgen.recal.store import open_store
+    from compgen.serve.metrics import WatchMetrics, start_metrics
+
+    store = open_store(job.store)
+    metrics = WatchMetrics(store)
+    _, stop = start_metrics(metrics.text, metrics_port)
+    try:
+        Watch(job.path, poll_s=poll_s, on_outcome=metrics.count).run()
+    finally:
+        stop()
+        store.close()
     return 0
 
 
