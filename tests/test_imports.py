@@ -464,6 +464,7 @@ def test_files_of_500_megabytes_are_refused_within_a_second(tmp_path):
         (b"only words here\nand here\n", "holds no table"),
         ("position [mm],deviation [um]\n0,1\n100".encode("utf-16")[:-1], "cut or damaged UTF-16"),
         (b"position [mm],deviation [um]\n0,1\n100,x\n", "3: column deviation .um.: 'x' is not a number"),
+        (b"position [mm],deviation [um]\n0,1\n100,1e999\n", "'1e999' is not a number"),
         (b"position [mm],deviation [um]\n0,5,1,2\n1,5,1,2\n", "decimal commas and commas between columns"),
         (b"position [mm];deviation [um]\n0,5;1.2\n1,5;1,2\n", "write all numbers in one way"),
         (b"position [mm],deviation [um]\n0,1\n1,2\n3", "it was cut"),

@@ -87,7 +87,7 @@ def import_command(
 
     \b
     Example:
-      compgen import examples/x-axis.rtl --machine zha-gantry --out imported/
+      compgen import x-axis.rtl --machine zha-gantry --out imported/
     """
     target = OutputFolder(out) if out is not None else None
     kind = own_kind(file)

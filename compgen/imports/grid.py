@@ -10,11 +10,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from compgen.errors import InputError
-from compgen.imports.source import Text, parse_number, shown
+from compgen.imports.source import LARGEST, Text, parse_number, shown
 
 MOST_ROWS, MOST_COLUMNS, MOST_CELL = 2_000_000, 500, 2_000
 #: So many lines are looked at for the separator, and for the header.
 _SAMPLE_LINES, _HEADER_LINES = 200, 200
+#: Letters of words that Python takes for numbers (inf, nan), and a comma: a column without them is converted at once.
+_NOT_PLAIN = frozenset("infa,")
 _THOUSANDS_COMMA = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d+")
 _THOUSANDS_POINT = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
@@ -53,8 +55,16 @@ class Table:
 
     def numbers(self, name: str, *, empty: bool = False) -> list[float]:
         """Return a column as numbers; with ``empty`` an empty cell is nan, else it is an error as any text is."""
-        found = []
-        for cell, line in zip(self.column(name), self.lines, strict=True):
+        cells, found = self.column(name), []
+        together = "".join(cells)
+        if together.isascii() and "_" not in together and _NOT_PLAIN.isdisjoint(together.lower()):
+            try:
+                values = [float(cell) for cell in cells]
+            except ValueError:
+                values = [float("inf")]  # the cell is found below
+            if max(map(abs, values)) < LARGEST:
+                return values
+        for cell, line in zip(cells, self.lines, strict=True):
             value = parse_number(cell)
             if value is None and not (empty and not cell):
                 what = "is empty" if not cell else f"{shown(cell)} is not a number"
@@ -106,6 +116,8 @@ def _separator(lines: Sequence[str]) -> str | None:
 
 def _plain_decimals(grid: Grid, rows: list[list[str]], lines: Sequence[int]) -> tuple[list[list[str]], bool]:
     """Turn decimal commas into points if the rows use them; InputError for rows that mix both."""
+    if not any("," in cell for row in rows for cell in row):
+        return rows, False
     comma = point = 0
     for row, line in zip(rows, lines, strict=True):
         for cell in row:

@@ -14,6 +14,8 @@ from compgen.errors import InputError
 MEGABYTE = 1_000_000
 #: Larger files are no measurement in text form: a million tracer lengths have 80 MB.
 MOST_BYTES = 256 * MEGABYTE
+#: Larger numbers are none (a number of 400 digits becomes infinite).
+LARGEST = 1e300
 #: So much of a file says what it is.
 HEAD_BYTES = 65_536
 #: Encodings that are tried in turn when there is no mark; the last one reads everything.
@@ -143,7 +145,7 @@ def parse_number(word: str) -> float | None:
         value = float(text)
     except ValueError:
         return None
-    return value if abs(value) < 1e300 else None
+    return value if abs(value) < LARGEST else None
 
 
 def shown(word: object) -> str:
