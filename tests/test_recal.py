@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import sys
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
@@ -16,7 +17,9 @@ from compgen.core.points import Points
 from compgen.model.exact import exact_error
 from compgen.model.grid import volume_grid
 from compgen.recal import actions, decisions, publish, runner
-from compgen.recal.job import read_job
+from compgen.recal.inbox import measurement_of
+from compgen.recal.job import Policy, read_job
+from compgen.recal.judge import Judgement, judge_measurement
 from compgen.recal.runner import run_jobs
 from compgen.recal.store import Store, open_store
 from compgen.verify import read_tables
@@ -50,35 +53,74 @@ def time_of(hours):
     return (NOW + timedelta(hours=hours)).isoformat()
 
 
-@pytest.fixture
-def plant(tmp_path, small_machine, small_machine_file, small_errors):
-    """One machine with its inbox: functions to write the job, to measure, to run."""
-    inbox = tmp_path / "inbox"
-    inbox.mkdir()
+def plant_in(folder, machine, errors):
+    """One machine with its inbox in ``folder``: functions to write the job, to measure, to run, to approve."""
+    inbox = folder / "inbox"
+    inbox.mkdir(exist_ok=True)
 
-    def write(text="", policy="", measured_with="bare", machine=small_machine_file, more=""):
-        (tmp_path / "recal.toml").write_text(
-            f'[machines.mill]\nmachine = "{machine}"\ninbox = "inbox"\ncontrollers = ["{CONTROL}"]\nout = "out"\n'
+    def write(text="", policy="", measured_with="bare", more=""):
+        (folder / "recal.toml").write_text(
+            f'[machines.mill]\nmachine = "mill.toml"\ninbox = "inbox"\ncontrollers = ["{CONTROL}"]\nout = "out"\n'
             f'measured_with = "{measured_with}"\n{text}\n[machines.mill.policy]\n{policy}\n{more}'
         )
-        return read_job(tmp_path / "recal.toml")
+        return job()
 
-    def measure(name, errors=small_errors, *, hours=0.0, seed=1, **options):
-        text = deviations_text(small_machine, errors, seed=seed, measured_at=time_of(hours), **options)
+    def measure(name, errors=errors, *, hours=0.0, seed=1, **options):
+        text = deviations_text(machine, errors, seed=seed, measured_at=time_of(hours), **options)
         (inbox / f"{name}.deviations.csv").write_text(text)
 
     def states():
-        store = open_store(job().store)
-        return [table.state for table in store.tables()]
+        return [table.state for table in open_store(job().store).tables()]
 
     def job():
-        return read_job(tmp_path / "recal.toml")
+        return read_job(folder / "recal.toml")
 
-    write()
+    def run():
+        return run_jobs(job())
+
+    def approve(version=None):
+        return actions.approve(job(), "mill", version, "ada")
+
     return SimpleNamespace(
-        folder=tmp_path, inbox=inbox, out=tmp_path / "out", write=write, measure=measure, states=states, job=job,
-        run=lambda: run_jobs(job()), approve=lambda version=None: actions.approve(job(), "mill", version, "ada"),
-    )  # fmt: skip
+        folder=folder,
+        inbox=inbox,
+        out=folder / "out",
+        write=write,
+        measure=measure,
+        states=states,
+        job=job,
+        run=run,
+        approve=approve,
+    )
+
+
+@pytest.fixture
+def plant(tmp_path, small_machine, small_machine_file, small_errors):
+    """A machine that was never measured."""
+    shutil.copy(small_machine_file, tmp_path / "mill.toml")
+    made = plant_in(tmp_path, small_machine, small_errors)
+    made.write()
+    return made
+
+
+@pytest.fixture(scope="session")
+def running(tmp_path_factory, small_machine, small_machine_file, small_errors):
+    """The folder of a machine with one measurement, two hours old, whose tables were approved."""
+    folder = tmp_path_factory.mktemp("running")
+    shutil.copy(small_machine_file, folder / "mill.toml")
+    made = plant_in(folder, small_machine, small_errors)
+    made.write()
+    made.measure("a", hours=-2)
+    assert made.run().exit_code == 0
+    made.approve()
+    return folder
+
+
+@pytest.fixture
+def approved(running, tmp_path, small_machine, small_errors):
+    """A copy of that machine, at which nothing is new."""
+    shutil.copytree(running, tmp_path / "plant", symlinks=True)
+    return plant_in(tmp_path / "plant", small_machine, small_errors)
 
 
 def active_correction(plant, machine):
@@ -107,10 +149,11 @@ def test_a_first_measurement_is_proposed_and_approved_by_a_person(plant, small_m
     assert worst_left_um(plant, small_machine, small_errors) < LEFT_UM
 
 
-def test_the_files_are_those_of_compgen_run_byte_for_byte(plant, small_machine):
+def test_the_files_are_those_of_compgen_run_byte_for_byte(plant):
     plant.measure("a")
     plant.run()
-    compgen.run(small_machine, [plant.inbox / "a.deviations.csv"], [CONTROL], plant.folder / "direct")
+    machine = compgen.load_machine(plant.folder / "mill.toml")
+    compgen.run(machine, [plant.inbox / "a.deviations.csv"], [CONTROL], plant.folder / "direct")
     for name in ("NC_CEC.INI", "preflight.md", "manifest.json", "result.json"):
         assert (plant.out / "proposed/v0001" / name).read_bytes() == (plant.folder / "direct" / name).read_bytes()
 
@@ -134,70 +177,61 @@ def test_the_same_inbox_gives_the_same_state_and_the_same_exit_code(plant, listi
     assert listing(plant.out) == files
 
 
-def test_no_change_beyond_its_uncertainty_is_held_back(plant):
-    plant.measure("a", hours=-2)
-    plant.run()
-    plant.approve()
-    plant.measure("b", seed=2, hours=-1)
-    outcome = plant.run()
+def test_no_change_beyond_its_uncertainty_is_held_back(approved):
+    approved.measure("b", seed=2, hours=-1)
+    outcome = approved.run()
     assert outcome.exit_code == 1
-    assert plant.states() == ["active", "held"]
+    assert approved.states() == ["active", "held"]
     assert "within its uncertainty" in outcome.outcomes[0].messages[0]
-    assert (plant.out / "proposed" / "HELD-v0002").is_dir()
+    assert (approved.out / "proposed" / "HELD-v0002").is_dir()
     with pytest.raises(decisions.DecisionError, match="held back"):
-        plant.approve(2)
+        approved.approve(2)
 
 
-def test_a_drift_is_proposed_and_the_new_tables_take_it_out(plant, small_machine, small_errors):
+def test_a_drift_is_proposed_and_the_new_tables_take_it_out(approved, small_machine, small_errors):
     moved = drifted(small_errors, 40.0)
-    plant.measure("a", hours=-2)
-    plant.run()
-    plant.approve()
-    before = worst_left_um(plant, small_machine, moved)
-    plant.measure("b", moved, seed=2, hours=-1)
-    assert plant.run().exit_code == 0
-    plant.approve()
-    assert plant.states() == ["retired", "active"]
+    before = worst_left_um(approved, small_machine, moved)
+    approved.measure("b", moved, seed=2, hours=-1)
+    assert approved.run().exit_code == 0
+    approved.approve()
+    assert approved.states() == ["retired", "active"]
     # half of a shear is a rotation; the rest is largest at the corners, 250 and 200 mm off the middle
     assert before == pytest.approx(20e-6 * np.hypot(250.0, 200.0) * 1e3, abs=LEFT_UM)
-    assert worst_left_um(plant, small_machine, moved) < LEFT_UM
-    change = open_store(plant.job().store).tables()[1].summary["change"]
+    assert worst_left_um(approved, small_machine, moved) < LEFT_UM
+    change = open_store(approved.job().store).tables()[1].summary["change"]
     levels = [np.linspace(-half, half, 6) for half in (250.0, 200.0)]
     expected = 20e-6 * 1e3 * np.sqrt(sum(np.mean(level**2) for level in levels))
     assert change["rms_um"] == pytest.approx(expected, abs=0.2)
     assert change["significant"]
 
 
-def test_rollback_restores_the_bytes_and_the_reason_is_kept(plant, small_errors, listing):
-    plant.measure("a", hours=-2)
-    plant.run()
-    plant.approve()
-    first = listing(plant.out / "active")
-    plant.measure("b", drifted(small_errors, 12.0), seed=2, hours=-1)
-    plant.run()
-    plant.approve()
-    assert listing(plant.out / "active") != first
-    (plant.out / "v0001" / "NC_CEC.INI").write_text("spoilt")
-    decision = actions.rollback(plant.job(), "mill", "bob", "scrap since Monday")
-    assert listing(plant.out / "active") == first
+def test_rollback_restores_the_bytes_and_the_reason_is_kept(approved, small_errors, listing):
+    first = listing(approved.out / "active")
+    approved.measure("b", drifted(small_errors, 12.0), seed=2, hours=-1)
+    approved.run()
+    approved.approve()
+    assert listing(approved.out / "active") != first
+    (approved.out / "v0001" / "NC_CEC.INI").write_text("spoilt")
+    decision = actions.rollback(approved.job(), "mill", "bob", "scrap since Monday")
+    assert listing(approved.out / "active") == first
     assert (decision.kind, decision.actor, decision.reason) == ("rollback", "bob", "scrap since Monday")
-    actions.rollback(plant.job(), "mill", "bob", "back", to=2)
-    assert os.readlink(plant.out / "active") == "v0002"
-    actions.rollback(plant.job(), "mill", "bob", "none", to=0)
-    assert not (plant.out / "active").exists()
+    actions.rollback(approved.job(), "mill", "bob", "back", to=2)
+    assert os.readlink(approved.out / "active") == "v0002"
+    actions.rollback(approved.job(), "mill", "bob", "none", to=0)
+    assert not (approved.out / "active").exists()
 
 
-def test_a_measurement_with_the_active_tables_gives_the_errors_of_the_bare_machine(plant, small_machine, small_errors):
-    plant.write(measured_with="active", text='approval = "auto"')
-    plant.measure("a", hours=-3)
-    plant.run()
+def test_a_measurement_with_the_active_tables_gives_the_errors_of_the_bare_machine(
+    approved, small_machine, small_errors
+):
+    approved.write(measured_with="active", text='approval = "auto"')
     moved = drifted(small_errors, 12.0)
     # approved a moment ago, so this measurement is made afterwards
-    plant.measure("b", moved, seed=2, hours=1, correction=active_correction(plant, small_machine))
-    assert plant.run().exit_code == 0
-    assert os.readlink(plant.out / "active") == "v0002"
-    assert worst_left_um(plant, small_machine, moved) < LEFT_UM
-    store = open_store(plant.job().store)
+    approved.measure("b", moved, seed=2, hours=1, correction=active_correction(approved, small_machine))
+    assert approved.run().exit_code == 0
+    assert os.readlink(approved.out / "active") == "v0002"
+    assert worst_left_um(approved, small_machine, moved) < LEFT_UM
+    store = open_store(approved.job().store)
     first, second = store.identifications()
     assert (first.active_table_id, second.active_table_id) == (None, 1)
     value, u = store.errors_of(second).squareness["EC0Y"]
@@ -205,67 +239,66 @@ def test_a_measurement_with_the_active_tables_gives_the_errors_of_the_bare_machi
     assert abs((value - other) * 1e6 - 12.0) < 4.0 * np.hypot(u, u_other) * 1e6
 
 
-def test_the_tables_that_were_active_when_it_was_measured_count_not_those_of_now(plant, small_machine, small_errors):
-    plant.write(measured_with="active", text='approval = "auto"')
-    plant.measure("a", hours=-3)
-    plant.run()
-    plant.measure("early", drifted(small_errors, 12.0), seed=2, hours=-2)  # before a table was active
-    assert plant.run().exit_code == 0
-    assert open_store(plant.job().store).identifications()[1].active_table_id is None
-    assert worst_left_um(plant, small_machine, drifted(small_errors, 12.0)) < LEFT_UM
+def test_the_tables_that_were_active_when_it_was_measured_count_not_those_of_now(approved, small_machine, small_errors):
+    approved.write(measured_with="active", text='approval = "auto"')
+    approved.measure("early", drifted(small_errors, 12.0), seed=2, hours=-1)  # before a table was active
+    assert approved.run().exit_code == 0
+    assert open_store(approved.job().store).identifications()[1].active_table_id is None
+    assert worst_left_um(approved, small_machine, drifted(small_errors, 12.0)) < LEFT_UM
 
 
-def test_the_file_itself_may_say_which_tables_were_active(plant, small_machine, small_errors):
-    plant.write(text='approval = "auto"')
-    plant.measure("a", hours=-3)
-    plant.run()
+def test_the_file_itself_may_say_which_tables_were_active(approved, small_machine, small_errors):
+    approved.write(text='approval = "auto"')
     moved = drifted(small_errors, -15.0)
-    correction = active_correction(plant, small_machine)
-    plant.measure("b", moved, seed=2, hours=-1, correction=correction, active_table="v1")
-    plant.measure("c", moved, seed=3, hours=0, correction=correction, active_table="v9")
-    outcome = plant.run()
-    assert worst_left_um(plant, small_machine, moved) < LEFT_UM
+    correction = active_correction(approved, small_machine)
+    approved.measure("b", moved, seed=2, hours=-1, correction=correction, active_table="v1")
+    approved.measure("c", moved, seed=3, hours=0, correction=correction, active_table="v9")
+    outcome = approved.run()
+    assert worst_left_um(approved, small_machine, moved) < LEFT_UM
     assert any("c.deviations.csv" in text and "no such tables" in text for text in outcome.outcomes[0].messages)
 
 
 @pytest.mark.parametrize(
-    ("policy", "options", "said"),
+    ("policy", "hours", "temperature_c", "said"),
     [
-        ("max_age_days = 2", {"hours": -49}, "2.0 days old"),
-        ("max_age_days = 2", {"hours": -47}, None),
-        ("", {"hours": 30}, "lies in the future"),
-        ("temperature_c = [19, 21]", {}, "no temperature was logged"),
-        ("temperature_c = [19, 21]", {"temperature_c": (19.5, 21.3)}, "21.30 degC"),
-        ("temperature_c = [19, 21]", {"temperature_c": (19.5, 20.9)}, None),
-        ("max_reference_um = 1", {}, "at the reference point"),
-        ("max_reference_um = 60", {}, None),
+        (Policy(max_age_days=2.0), -49, None, "2.0 days old"),
+        (Policy(max_age_days=2.0), -47, None, None),
+        (Policy(), 30, None, "lies in the future"),
+        (Policy(), 20, None, None),
+        (Policy(temperature_c=(19.0, 21.0)), 0, None, "no temperature was logged"),
+        (Policy(temperature_c=(19.0, 21.0)), 0, (19.5, 21.3), "from 19.50 to 21.30 degC"),
+        (Policy(temperature_c=(19.0, 21.0)), 0, (18.9, 20.0), "from 18.90 to 20.00 degC"),
+        (Policy(temperature_c=(19.0, 21.0)), 0, (19.5, 20.9), None),
     ],
 )
-def test_the_policy_of_age_temperature_and_reference_point(plant, policy, options, said):
-    plant.write(policy=policy)
-    plant.measure("a", **options)
-    outcome = plant.run()
-    assert plant.states() == ["pending" if said is None else "held"]
-    assert said is None or said in outcome.outcomes[0].messages[0]
+def test_the_policy_of_age_and_temperature(small_machine, small_errors, policy, hours, temperature_c, said):
+    options = {} if temperature_c is None else {"temperature_c": temperature_c}
+    text = deviations_text(small_machine, small_errors, seed=1, measured_at=time_of(hours), **options)
+    new = measurement_of("a", {"a": text.encode()}, NOW)
+    judgement = Judgement()
+    judge_measurement(judgement, policy, new, NOW, None)
+    assert [said is not None and said in reason for reason in judgement.hold] == ([] if said is None else [True])
+
+
+@pytest.mark.parametrize(("limit", "state"), [(1.0, "held"), (60.0, "pending")])
+def test_the_correction_at_the_reference_point_is_limited_for_the_first_tables_too(plant, limit, state):
+    plant.write(policy=f"max_reference_um = {limit}")
+    plant.measure("a")
+    plant.run()
+    assert plant.states() == [state]
 
 
 @pytest.mark.parametrize(("limit", "state"), [(2.0, "held"), (20.0, "pending")])
-def test_the_limit_of_the_change_counts_against_the_active_tables(plant, small_errors, limit, state):
-    plant.write(policy=f"max_change_um = {limit}")
-    plant.measure("a", hours=-2)
-    plant.run()
-    plant.approve()  # the first tables are no change
-    plant.measure("b", drifted(small_errors, 12.0), seed=2, hours=-1)
-    plant.run()
-    assert plant.states() == ["active", state]
+def test_the_limit_of_the_change_counts_against_the_active_tables(approved, small_errors, limit, state):
+    approved.write(policy=f"max_change_um = {limit}")
+    approved.measure("b", drifted(small_errors, 12.0), seed=2, hours=-1)
+    approved.run()
+    assert approved.states() == ["active", state]
 
 
-def test_a_measurement_older_than_that_of_the_active_tables_is_held_back(plant, small_errors):
-    plant.measure("a", hours=-2)
-    plant.run()
-    plant.approve()
-    plant.measure("late", drifted(small_errors, 12.0), seed=2, hours=-5)
-    assert "newer measurement" in plant.run().outcomes[0].messages[0]
+def test_a_measurement_older_than_that_of_the_active_tables_is_held_back(approved, small_errors):
+    approved.measure("late", drifted(small_errors, 12.0), seed=2, hours=-5)
+    assert "newer measurement" in approved.run().outcomes[0].messages[0]
 
 
 def test_a_newer_proposal_takes_the_place_of_one_that_waits(plant, small_errors):
