@@ -195,12 +195,13 @@ def test_a_drift_is_proposed_and_the_new_tables_take_it_out(approved, small_mach
     assert approved.run().exit_code == 0
     approved.approve()
     assert approved.states() == ["retired", "active"]
-    # half of a shear is a rotation; the rest is largest at the corners, 250 and 200 mm off the middle
-    assert before == pytest.approx(20e-6 * np.hypot(250.0, 200.0) * 1e3, abs=LEFT_UM)
+    # X moves by 40 urad y; a rotation takes w out, so that (40 - w) y is left in X and w x in Y (least squares)
+    w = 40.0 * 400.0**2 / (400.0**2 + 500.0**2)
+    assert before == pytest.approx(1e-3 * np.hypot((40.0 - w) * 200.0, w * 250.0), abs=LEFT_UM)
     assert worst_left_um(approved, small_machine, moved) < LEFT_UM
     change = open_store(approved.job().store).tables()[1].summary["change"]
-    levels = [np.linspace(-half, half, 6) for half in (250.0, 200.0)]
-    expected = 20e-6 * 1e3 * np.sqrt(sum(np.mean(level**2) for level in levels))
+    along = {half: np.mean(np.linspace(-half, half, 6) ** 2) for half in (200.0, 250.0)}
+    expected = 1e-3 * np.sqrt((40.0 - w) ** 2 * along[200.0] + w**2 * along[250.0])
     assert change["rms_um"] == pytest.approx(expected, abs=0.2)
     assert change["significant"]
 

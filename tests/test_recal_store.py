@@ -1,0 +1,354 @@
+"""The store: append-only, upgraded, leases, states, backup; the change test against brute force."""
+
+import json
+import os
+import sqlite3
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+from alembic import command
+from alembic.autogenerate import compare_metadata
+from alembic.config import Config
+from alembic.migration import MigrationContext
+
+from compgen.core.error_table import Curve
+from compgen.core.names import ERROR_INDEX
+from compgen.errors import InputError
+from compgen.model.gauge import gauge_directions
+from compgen.recal import change, claims, database, decisions, results, schema
+from compgen.recal.backup import backup, restore
+from compgen.recal.database import StoreError
+from compgen.recal.records import NewMeasurement, NewResult, TableFile
+from compgen.recal.store import open_store
+
+DAY = datetime(2026, 3, 1, 12, tzinfo=UTC)
+ERRORS = b"error,position_mm,value\nEC0Y,,12.0\n"
+
+
+@pytest.fixture
+def store(tmp_path):
+    return open_store(f"sqlite:///{tmp_path}/recal.sqlite")
+
+
+def measured(store, machine, number):
+    day = DAY + timedelta(days=number)
+    new = NewMeasurement(f"{number:064x}", f"m{number}", day, "file", {"a.csv": b"content %d" % number})
+    return store.add_measurement(machine, new)
+
+
+def result(number, *, accepted=True, hold=(), approve=False):
+    files = (TableFile("isg-csv", "t.csv", b"table %d" % number), TableFile("isg-csv", "sub/n.md", b"same"))
+    return NewResult(
+        machine_text=b"toml",
+        errors_text=ERRORS,
+        covariance=None,
+        fitted_text=None,
+        summary={"rms": float("nan")},
+        program="1",
+        active_table_id=None,
+        files=files,
+        accepted=accepted,
+        hold=hold,
+        judgement={},
+        approve=approve,
+        settings_sha256="0" * 64,
+        seconds=1.0,
+    )
+
+
+def processed(store, machine, number, **options):
+    claim = claims.take(store, measured(store, machine, number), claims.owner_name())
+    active = decisions.active_table(store, machine)
+    return results.keep_result(store, machine, claim, result(number, **options), active.id if active else None)
+
+
+def states(store, machine):
+    return [table.state for table in store.tables(machine)]
+
+
+def test_what_goes_in_comes_out(store):
+    machine = store.add_machine("mill")
+    table = processed(store, machine, 1)
+    (identification,) = store.identifications(machine)
+    assert store.errors_of(identification).squareness["EC0Y"][0] == pytest.approx(12e-6)
+    assert store.covariance_of(identification) is None
+    assert identification.measured_at == DAY + timedelta(days=1)
+    assert identification.summary == {"rms": None}
+    assert [(file.name, file.content) for file in store.table_files(table)] == [
+        ("t.csv", b"table 1"),
+        ("sub/n.md", b"same"),
+    ]
+    assert store.contents_of(store.measurements()[0]) == {"a.csv": b"content 1"}
+    assert store.measurements()[0].received_at.tzinfo is UTC
+
+
+@pytest.mark.parametrize("table", [table.name for table in schema.ALL])
+@pytest.mark.parametrize("action", ["UPDATE {} SET {} = NULL", "DELETE FROM {}"])
+def test_the_database_refuses_to_change_or_remove_a_row(store, table, action):
+    machine = store.add_machine("mill")
+    processed(store, machine, 1)
+    store.add_event("clock", "clock", "text", machine)
+    connection = sqlite3.connect(store.engine.url.database)
+    columns = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
+    with pytest.raises(sqlite3.IntegrityError, match="new rows only"):
+        connection.execute(action.format(table, columns[-1]))
+    connection.close()
+
+
+def test_the_migrations_lead_to_the_schema_of_the_program(store):
+    with store.engine.connect() as connection:
+        found = compare_metadata(MigrationContext.configure(connection), schema.metadata)
+    assert found == []
+    assert tuple(schema.metadata.tables.values()) == schema.ALL
+
+
+def test_a_store_of_the_first_version_is_upgraded_and_keeps_its_rows(tmp_path):
+    path = tmp_path / "old.sqlite"
+    engine = database.engine_of(str(path))
+    config = Config()
+    config.set_main_option("script_location", os.path.join(os.path.dirname(database.__file__), "migrations"))
+    with engine.begin() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "0001")
+        connection.execute(sa.text("INSERT INTO machines (name, at) VALUES ('old', '2025-01-01 00:00:00')"))
+    engine.dispose()
+    store = open_store(str(path))
+    assert [machine.name for machine in store.machines()] == ["old"]
+    with pytest.raises(sa.exc.IntegrityError, match="new rows only"):
+        store.write(lambda connection: connection.execute(sa.text("DELETE FROM machines")))
+
+
+def test_a_store_of_a_newer_program_is_refused(store):
+    with store.engine.begin() as connection:
+        connection.execute(sa.text("UPDATE alembic_version SET version_num = '9999'"))
+    with pytest.raises(InputError, match="newer compgen"):
+        open_store(store.url)
+
+
+@pytest.mark.parametrize("url", ["mysql://host/name", "sqlite://", "nonsense://x/y"])
+def test_other_databases_are_refused(url):
+    with pytest.raises(InputError, match="store"):
+        open_store(url)
+
+
+def test_a_store_that_cannot_be_reached_is_tried_again_and_reported_without_its_password(monkeypatch):
+    waits = []
+    monkeypatch.setattr(database.retried, "__defaults__", (waits.append,))
+    with pytest.raises(StoreError, match="cannot be used") as caught:
+        open_store("postgresql://user:secret@127.0.0.1:1/name")
+    assert waits == list(database.WAITS_S)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_file_that_is_no_store_is_reported(tmp_path):
+    (tmp_path / "x.sqlite").write_text("not a database, but long enough to be looked at " * 10)
+    with pytest.raises(StoreError, match="not a database"):
+        open_store(str(tmp_path / "x.sqlite"))
+
+
+def test_damaged_contents_are_noticed(store):
+    machine = store.add_machine("mill")
+    table = processed(store, machine, 1)
+    digest = store.read(lambda c: c.execute(sa.select(schema.table_files.c.sha256)).scalar())
+    store.write(lambda c: c.execute(sa.text("DROP TRIGGER append_only_blobs_update")))
+    store.write(lambda c: c.execute(sa.text(f"UPDATE blobs SET deflated = x'00' WHERE sha256 = '{digest}'")))
+    with pytest.raises(StoreError, match="damaged"):
+        store.table_files(table)
+
+
+# --- states --------------------------------------------------------------------------------------------------------
+
+
+def test_each_decision_leads_to_its_state(store):
+    m = store.add_machine("mill")
+    processed(store, m, 1, approve=True)
+    processed(store, m, 2)
+    processed(store, m, 3, hold=["too hot"])
+    processed(store, m, 4, accepted=False, hold=["grows"], approve=True)
+    assert states(store, m) == ["active", "pending", "held", "refused"]
+    decisions.approve(store, m, 2, "ada")
+    assert states(store, m) == ["retired", "active", "held", "refused"]
+    decisions.reject(store, m, 3, "ada", "sun on the table")
+    decisions.reject(store, m, 4, "ada", "seen")
+    assert states(store, m) == ["retired", "active", "rejected", "rejected"]
+    for version in (1, 2, 3, 4):
+        with pytest.raises(decisions.DecisionError, match="only pending or held"):
+            decisions.approve(store, m, version, "ada", "again", override=True)
+
+
+def test_rollbacks_go_back_one_by_one(store):
+    m = store.add_machine("mill")
+    for number in (1, 2, 3):
+        processed(store, m, number, approve=True)
+    found = []
+    for _ in range(3):
+        decisions.rollback(store, m, "ada", "bad parts")
+        active = decisions.active_table(store, m)
+        found.append(active.version if active else None)
+    assert found == [2, 1, None]
+    with pytest.raises(decisions.DecisionError, match="nothing to undo"):
+        decisions.rollback(store, m, "ada", "bad parts")
+    decisions.rollback(store, m, "ada", "it was the fixture", to=3)
+    processed(store, m, 4, approve=True)
+    decisions.rollback(store, m, "ada", "bad parts")
+    assert decisions.active_table(store, m).version == 3
+
+
+@pytest.mark.parametrize(
+    ("action", "said"),
+    [
+        (lambda s, m: decisions.reject(s, m, 1, "ada", " "), "reason is due"),
+        (lambda s, m: decisions.rollback(s, m, "ada", ""), "reason is due"),
+        (lambda s, m: decisions.approve(s, m, 1, " "), "name of who"),
+        (lambda s, m: decisions.approve(s, m, 7, "ada"), "no tables of version 7; it has 1 to 1"),
+        (lambda s, m: decisions.rollback(s, m, "ada", "why", to=1), "only a version that was active"),
+    ],
+)
+def test_a_decision_that_is_not_allowed_changes_nothing(store, action, said):
+    m = store.add_machine("mill")
+    processed(store, m, 1)
+    before = store.decisions()
+    with pytest.raises(decisions.DecisionError, match=said):
+        action(store, m)
+    assert store.decisions() == before
+
+
+# --- leases --------------------------------------------------------------------------------------------------------
+
+
+def test_of_many_runners_one_gets_the_measurement(store):
+    machine = store.add_machine("mill")
+    measurement = measured(store, machine, 1)
+    with ThreadPoolExecutor(8) as pool:
+        claimed = list(pool.map(lambda k: claims.take(open_store(store.url), measurement, f"host{k}/s/1/2"), range(8)))
+    assert sum(claim is not None for claim in claimed) == 1
+
+
+def test_a_lease_of_another_host_ends_with_its_time_and_the_late_one_keeps_nothing(tmp_path):
+    now = [DAY]
+    store = open_store(f"{tmp_path}/recal.sqlite", clock=lambda: now[0])
+    machine = store.add_machine("mill")
+    measurement = measured(store, machine, 1)
+    slow = claims.take(store, measurement, "elsewhere/s/1/2", lease_s=60)
+    now[0] += timedelta(seconds=59)
+    assert claims.take(store, measurement, claims.owner_name()) is None
+    now[0] += timedelta(seconds=2)
+    other = claims.take(store, measurement, claims.owner_name())
+    with pytest.raises(claims.ClaimLostError):
+        results.keep_result(store, machine, slow, result(1), None)
+    with pytest.raises(claims.ClaimLostError):
+        claims.renew(store, slow)
+    assert store.identifications() == []
+    results.keep_result(store, machine, claims.renew(store, other), result(1), None)
+    assert claims.take(store, measurement, "elsewhere/s/1/2") is None  # done
+    assert len(store.identifications()) == 1
+
+
+def test_a_lease_of_a_process_of_this_host_that_died_is_free_at_once(store):
+    machine = store.add_machine("mill")
+    measurement = measured(store, machine, 1)
+    code = (
+        "import sys, os, signal; from compgen.recal import claims; from compgen.recal.store import open_store\n"
+        "s = open_store(sys.argv[1]); c = claims.take(s, s.measurements()[0], claims.owner_name())\n"
+        "print(c is not None, flush=True); sys.stdin.read(1) or os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, store.url], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as runner:
+        assert runner.stdout.readline().strip() == "True"
+        assert claims.take(store, measurement, claims.owner_name()) is None
+        runner.stdin.close()
+        runner.wait()
+    assert runner.returncode == -9
+    assert claims.take(store, measurement, claims.owner_name()) is not None
+
+
+def test_a_result_is_kept_whole_or_not_at_all(store, monkeypatch):
+    machine = store.add_machine("mill")
+    claim = claims.take(store, measured(store, machine, 1), claims.owner_name())
+    monkeypatch.setattr(results, "add_attempt", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        results.keep_result(store, machine, claim, result(1), None)
+    assert store.identifications() == [] == store.tables() == store.decisions()
+    monkeypatch.undo()
+    assert results.keep_result(store, machine, claim, result(1), None).state == "pending"
+
+
+# --- backup --------------------------------------------------------------------------------------------------------
+
+
+def everything(store):
+    with store.engine.connect() as connection:
+        return {table.name: sorted(connection.execute(sa.select(table)).all(), key=repr) for table in schema.ALL}
+
+
+def test_a_backup_restores_every_row_and_the_store_goes_on(store, tmp_path):
+    machine = store.add_machine("mill")
+    for number in range(1, 6):
+        processed(store, machine, number, approve=True)
+    counts = backup(store.url, tmp_path / "b" / "copy.sqlite")
+    assert [path.name for path in (tmp_path / "b").iterdir()] == ["copy.sqlite"]
+    assert counts["tables"] == 5
+    with pytest.raises(InputError, match="never written over"):
+        backup(store.url, tmp_path / "b" / "copy.sqlite")
+    url = f"sqlite:///{tmp_path}/new.sqlite"
+    assert restore(tmp_path / "b" / "copy.sqlite", url) == counts
+    again = open_store(url)
+    assert everything(again) == everything(store)
+    assert processed(again, again.machine("mill"), 6).version == 6
+    with pytest.raises(InputError, match="holds machines already"):
+        restore(tmp_path / "b" / "copy.sqlite", url)
+
+
+def test_what_is_no_backup_is_refused(tmp_path):
+    (tmp_path / "x").write_text("no")
+    for path, said in ((tmp_path / "x", "is not a backup"), (tmp_path / "y", "no such backup")):
+        with pytest.raises(InputError, match=said):
+            restore(path, f"sqlite:///{tmp_path}/new.sqlite")
+
+
+# --- the change against its uncertainty ----------------------------------------------------------------------------
+
+
+def test_the_probability_is_that_of_brute_force():
+    generator = np.random.default_rng(3)
+    factor = generator.normal(size=(12, 5)) * np.array([3.0, 1.0, 0.5, 0.2, 0.1])
+    totals = np.sum((generator.normal(size=(200_000, 5)) @ factor.T) ** 2, axis=1)
+    for share in (0.5, 0.9, 0.95, 0.99):
+        p_value = change._p_value(float(np.quantile(totals, share)), factor)
+        assert p_value == pytest.approx(1.0 - share, rel=0.25, abs=0.01)
+
+
+def test_a_change_of_the_gauge_is_no_change_and_a_shear_is(small_machine, small_errors):
+    known = change.spread_of(small_errors, None)
+    direction = gauge_directions(small_machine, small_errors.names)[3] * 1e-2
+    curves = {}
+    for name, curve in small_errors.curves.items():
+        constant, slope = direction[ERROR_INDEX[name]]
+        curves[name] = Curve(curve.position_mm, curve.value + constant + slope * curve.position_mm, curve.u)
+    squareness = {name: (v + direction[ERROR_INDEX[name]][0], u) for name, (v, u) in small_errors.squareness.items()}
+    same = small_errors.replace(curves=curves, squareness=squareness)
+    moved = max(float(np.max(np.abs(curves[name].value - small_errors.curves[name].value))) for name in curves)
+    assert moved > 1e-6
+    found = change.change_between(small_machine, (same, known), (small_errors, known), 0.95)
+    assert found.max_um < 1e-6
+    assert not found.significant
+    value, u = small_errors.squareness["EB0Z"]
+    sheared = small_errors.replace(squareness={**small_errors.squareness, "EB0Z": (value + 50e-6, u)})
+    found = change.change_between(small_machine, (sheared, known), (small_errors, known), 0.95)
+    # X moves by 50 urad z; the rotation w that takes out most has (50 - w) z^2 against w x^2, summed over the box
+    w = 50e-3 * 240.0**2 / (240.0**2 + 500.0**2)
+    assert found.max_um == pytest.approx(np.hypot((50e-3 - w) * 120.0, w * 250.0), rel=1e-6)
+    assert found.significant
+
+
+def test_records_hold_numbers_that_json_can_hold():
+    assert json.loads(json.dumps(results.clean({"a": [float("inf"), 1.5], "b": (np.float64(2.0),)}))) == {
+        "a": [None, 1.5],
+        "b": [2.0],
+    }
