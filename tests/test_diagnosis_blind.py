@@ -52,7 +52,7 @@ def diagnosis_of(case, folder):
         ("single", 5, Options("range", 1.0, ("lever_ECX",), lines=LINES), "exact"),
         ("double", 6, Options("white", 1.0, ("refractive_index", "periodic_X"), lines=LINES), "exact"),
         ("alias", 7, Options("white", 1.0, ("servo_lag_X",), lines=LINES), "set"),
-        ("invisible", 8, Options("white", 1.0, lines=30), "listed"),
+        ("invisible", 8, Options("white", 1.0, ("lever_EAZ",), lines=28), "listed"),
         ("outside", 9, Options("white", 1.0, ("clamping",), lines=LINES), "unknown"),
         ("gross", 10, Options("white", lines=LINES), "found"),
     ],

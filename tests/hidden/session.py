@@ -140,8 +140,8 @@ def draw_runs(machine: HiddenMachine, plan: Plan, rng: np.random.Generator) -> l
 
 
 def draw_tools(plan: Plan, rng: np.random.Generator) -> np.ndarray:
-    """Tool offset of each set-up, (setups, 3)."""
-    first = [0.0, 0.0, -float(rng.uniform(60.0, 160.0))]
+    """Tool offset of each set-up, (setups, 3): the first straight, later ones and an only one sideways."""
+    first = [0.0 if plan.setups > 1 else 85.0, 0.0 if plan.setups > 1 else -70.0, -float(rng.uniform(60.0, 160.0))]
     rest = [
         [float(rng.choice([-1, 1]) * rng.uniform(60, 140)) for _ in range(2)] + [-float(rng.uniform(150.0, 260.0))]
         for _ in range(plan.setups - 1)

@@ -69,7 +69,7 @@ VARIANTS: dict[str, dict] = {
     "fewer_lines": {"lines": 15},
     "three_stations": {"stations": 3},
     "thrice": {"repeats": 3, "lines": 16},
-    "one_load": {"loads_kg": (0.0,), "lines": 40},
+    "one_load": {"loads_kg": (250.0,), "lines": 40},
     "one_feed": {"feeds_mm_min": (2000.0,)},
     "one_tool": {"setups": 1, "lines": 40},
     "axis_one_feed": {"axis_only": True, "feeds_mm_min": (2000.0,), "approach": "unknown"},
@@ -78,6 +78,15 @@ VARIANTS: dict[str, dict] = {
 }
 #: Variants with which named effects are drawn now and then.
 OTHER_PLANS = ("natural", "in_turn", "no_repeats", "fewer_lines", "three_stations", "thrice")
+
+
+#: Effects that nobody can see, and the plan with which that is so.
+UNSEEN = (
+    {"load_deflection": "one_load", "laser_scale": "one_tool"}
+    | {f"cosine_error_{a}": "standard" for a in "XYZ"}
+    | {f"periodic_{a}": "on_pitch" for a in "XYZ"}
+    | {f"lever_{error}": "one_tool" for error in ("ECX", "EAZ", "EBZ", "ECZ")}
+)
 
 
 def draw_machine(rng: np.random.Generator, chain: str | None) -> HiddenMachine:
@@ -140,17 +149,6 @@ def candidates(session: Session) -> list[str]:
     return found
 
 
-def invisible_choice(rng: np.random.Generator) -> tuple[str, str]:
-    """Plan and effect such that the plan cannot see the effect."""
-    choices = [
-        ("one_load", "load_deflection"),
-        ("standard", "laser_scale"),
-        *(("standard", f"cosine_error_{a}") for a in "XYZ"),
-        *(("one_tool", f"lever_{error}") for error in ("ECX", "EAZ", "EBZ", "ECZ")),
-    ]
-    return choices[int(rng.integers(len(choices)))]
-
-
 def make(kind: str, seed: int, options: Options = Options()) -> Case:  # noqa: B008 - frozen
     """Return the hidden set of a kind and a seed."""
     rng = np.random.default_rng([seed, zlib.crc32(kind.encode())])
@@ -159,8 +157,8 @@ def make(kind: str, seed: int, options: Options = Options()) -> Case:  # noqa: B
     if kind == "alias":
         plan_name = str(rng.choice(["axis_one_feed", "slanted_one_feed"]))
     if kind == "invisible":
-        plan_name, name = invisible_choice(rng)
-        names = names or (name,)
+        names = names or (str(rng.choice(list(UNSEEN))),)
+        plan_name = UNSEEN[names[0]]
     changes = VARIANTS[plan_name] | ({"lines": options.lines} if options.lines else {})
     machine = draw_machine(rng, options.chain)
     session = draw_session(machine, Plan(**changes), STATION_NAMES[int(rng.integers(3))], rng)
