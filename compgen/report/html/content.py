@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from compgen.core.names import error_named
 from compgen.export import program_version
 from compgen.report.html.curves import COVERAGE, describe_error
 from compgen.report.html.folder import ControlFolder, ResultFolder
+from compgen.report.html.iso import accuracy_groups, comparison_groups
 from compgen.report.html.limitations import limitations
 
 #: Figures of a residual field and what they are.
@@ -25,8 +26,6 @@ FIGURES = (
     ("v_z_um", "V_Z, range of the Z component (ISO 230-1)"),
 )
 VERDICTS = {"accepted": "Accepted", "partial": "Accepted, partial", "rejected": "Not accepted"}
-#: Rows of a generic table of figures.
-MOST_ROWS = 400
 
 
 def content(source: ResultFolder) -> dict[str, Any]:
@@ -40,8 +39,8 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "controls": controls,
         "errors": _errors(source.identified),
         "measurement": _measurement(source),
-        "accuracy": list(figure_rows(source.accuracy)),
-        "compare": list(figure_rows(source.compare)),
+        "accuracy": accuracy_groups(source),
+        "compare": comparison_groups(source),
         "machine": _machine(source),
         "provenance": _provenance(source),
         "limitations": limitations(source),
@@ -58,7 +57,7 @@ def _machine_name(source: ResultFolder) -> str:
             return str(name)
     if source.identified is not None and source.identified.metadata.get("machine"):
         return source.identified.metadata["machine"]
-    return str(source.compare.get("machine", source.folder.resolve().name))
+    return str(source.compare.get("machine", source.accuracy.get("machine", source.folder.resolve().name)))
 
 
 def _control(item: ControlFolder) -> dict[str, Any]:
@@ -130,9 +129,13 @@ def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dic
         state = "rejected" if "rejected" in states else "partial" if "partial" in states else "accepted"
         return {"state": state, "headline": _headline(state, controls), "text": _verdict_text(controls)}
     if source.kind == "compare":
-        verdict = source.compare.get("verdict", source.compare.get("improved", ""))
-        text = verdict if isinstance(verdict, str) else ""
-        return {"state": "neutral", "headline": "Before and after compared", "text": text}
+        return _compare_verdict(source.compare)
+    if source.kind == "accuracy":
+        return {
+            "state": "neutral",
+            "headline": "Accuracy evaluated",
+            "text": "The figures of one measurement or error file.",
+        }
     identify = source.identify
     if identify.get("identified") is False:
         return {
@@ -145,6 +148,21 @@ def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dic
         f"{identify.get('readings', '–')} readings; residual {um(identify.get('residual_rms_um'))} µm rms."
     )
     return {"state": "neutral", "headline": "Errors identified", "text": text}
+
+
+def _compare_verdict(compare: Mapping[str, Any]) -> dict[str, str]:
+    """The verdict of a comparison in words; green only where the bands separate."""
+    word = str(compare.get("verdict", ""))
+    state = {"better": "accepted", "worse": "rejected"}.get(word, "neutral")
+    headline = {
+        "better": "Better: the bands before and after separate",
+        "worse": "Worse: the bands before and after separate",
+        "not separated": "No difference beyond the uncertainty",
+        "smaller": "Smaller, by figures without uncertainty",
+        "larger": "Larger, by figures without uncertainty",
+    }.get(word, "Before and after compared")
+    decided = ", ".join(map(str, compare.get("decided_by", [])))
+    return {"state": state, "headline": headline, "text": f"Decided by {decided}." if decided else ""}
 
 
 def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
@@ -235,6 +253,7 @@ def _provenance(source: ResultFolder) -> dict[str, Any]:
     inputs = source.identify.get("inputs", [])
     if not inputs and source.controls:
         inputs = source.controls[0].manifest.get("inputs", [])
+    inputs = inputs or source.compare.get("inputs", []) or source.accuracy.get("inputs", [])
     programs = {str(item.manifest.get("program", "")) for item in source.controls} - {""}
     date = source.identified.metadata.get("date", "") if source.identified is not None else ""
     return {
@@ -244,23 +263,3 @@ def _provenance(source: ResultFolder) -> dict[str, Any]:
         "date": date,
         "errors_sha256": sorted({str(item.manifest.get("errors_sha256", "")) for item in source.controls} - {""}),
     }
-
-
-def figure_rows(data: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Return the scalar values of nested data as rows ``name``, ``value``, at most ``MOST_ROWS``; long lists are left out."""
-    for count, (name, value) in enumerate(_leaves(data, "")):
-        if count >= MOST_ROWS:
-            return
-        yield {"name": name, "value": value}
-
-
-def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _leaves(item, f"{name} · {key}" if name else str(key))
-    elif isinstance(value, list):
-        if len(value) <= 12:
-            for k, item in enumerate(value):
-                yield from _leaves(item, f"{name} · {k + 1}")
-    elif value is not None:
-        yield name, value

@@ -83,8 +83,9 @@ def dossier_text(dossier: Mapping[str, Any]) -> str:
     lines += _section("3. Identification", [*_pairs(dossier["identification"]), "", *_errors(dossier)])
     lines += _section("4. Tables", [line for item in dossier["tables"] for line in _control_tables(item)])
     lines += _section("5. Verification", [line for item in dossier["verification"] for line in _verified(item)])
-    rows = [[item["name"], item["value"]] for item in (*dossier["accuracy"], *dossier["comparison"])]
-    lines += _section("6. Accuracy figures and comparison", _table(["figure", "value"], rows))
+    lines += _section(
+        "6. Accuracy figures and comparison", [*_accuracy(dossier["accuracy"]), *_compared(dossier["comparison"])]
+    )
     lines += _section("7. Limits", [f"- {plain_markdown(text)}" for text in dossier["limits"]])
     lines += _section("8. Provenance", _pairs(dossier["provenance"]))
     return "\n".join(lines).rstrip() + "\n"
@@ -132,6 +133,40 @@ def _errors(dossier: Mapping[str, Any]) -> list[str]:
         known = "–" if item["U"] is None else f"{item['U']:.3f}"
         rows.append([item["error"], item["meaning"], f"{item['largest']:+.3f}", at, known, item["unit"]])
     return _table(["error", "meaning", "largest", "at (mm)", "U (k = 2)", "unit"], rows)
+
+
+def _figure(value: Any, u: Any) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.2f}" if u is None else f"{value:.2f} ± {u:.2f}"
+
+
+def _accuracy(accuracy: Mapping[str, Any]) -> list[str]:
+    rows = [
+        [row["key"], _figure(row["value"], row["U"]), row["unit"], row["meaning"]]
+        for group in accuracy.get("groups", [])
+        for row in group["rows"]
+    ]
+    return [*_table(["figure", "value", "unit", "meaning"], rows), *_statements(accuracy)]
+
+
+def _compared(compare: Mapping[str, Any]) -> list[str]:
+    rows = [
+        [
+            row["key"],
+            _figure(row["before"], row["before_U"]),
+            _figure(row["after"], row["after_U"]),
+            row["unit"],
+            row["verdict"] or "",
+        ]
+        for group in compare.get("groups", [])
+        for row in group["rows"]
+    ]
+    return [*_table(["figure", "before", "after", "unit", "verdict"], rows), *_statements(compare)]
+
+
+def _statements(data: Mapping[str, Any]) -> list[str]:
+    return [*(f"- {plain_markdown(text)}" for text in data.get("statements", [])), ""]
 
 
 def _control_tables(item: Mapping[str, Any]) -> list[str]:

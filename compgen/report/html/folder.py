@@ -19,10 +19,10 @@ from compgen.core.machine import Machine, read_machine
 from compgen.core.text import one_line
 from compgen.errors import CompgenWarning, InputError
 
-Kind = Literal["run", "identify", "verify", "compare"]
+Kind = Literal["run", "identify", "verify", "compare", "accuracy"]
 
 #: Files that say what the folder is.
-MARKS = ("result.json", "identify.json", "compare.json")
+MARKS = ("result.json", "identify.json", "compare.json", "accuracy.json")
 #: Lines and characters of a controller file that the report shows.
 PREVIEW_LINES, PREVIEW_CHARACTERS = 40, 4000
 #: A JSON file beyond this is no result of compgen.
@@ -147,6 +147,8 @@ def _kind(base: Path, controls: list[Path]) -> Kind:
         return "verify"
     if identified:
         return "identify"
+    if (base / "accuracy.json").is_file():
+        return "accuracy"
     raise InputError(
         f"holds none of {', '.join(MARKS)}; give a folder that run, identify, verify or compare wrote", file=base
     )

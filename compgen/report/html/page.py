@@ -69,7 +69,6 @@ def _environment() -> Environment:
         "number": number,
         "markdown": markdown,
         "unit": lambda name: LABEL.get(name, name),
-        "cell": cell,
     }
     return environment
 
@@ -100,15 +99,6 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{value:.{digits}f}"
 
 
-def cell(value: Any) -> str:
-    """A value of unknown kind as text: numbers with five significant digits, yes and no, texts as they are."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.5g}"
-    return str(value)
-
-
 def markdown(text: str) -> Markup:
     """Return the HTML of Markdown without raw HTML, links and pictures; the check boxes of lists become marks."""
     from markdown_it import MarkdownIt
@@ -118,4 +108,4 @@ def markdown(text: str) -> Markup:
     return Markup(html.replace("<li>[ ] ", "<li class='check'>"))
 
 
-__all__ = ["cell", "escape", "markdown", "number", "render_page", "script_data"]
+__all__ = ["escape", "markdown", "number", "render_page", "script_data"]

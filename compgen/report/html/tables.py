@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +13,15 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
+from compgen.core.points import Points
 from compgen.errors import CompgenError
 from compgen.export.synthesis import projector
 from compgen.report.html.folder import ControlFolder
-from compgen.verify import read_tables
+from compgen.verify import ReadTables, read_tables
+
+#: What is raised where machine file, errors and tables of a folder do not fit each other any more. The figures stand in
+#: result.json; only what needs the tables themselves is left out then.
+UNFIT = (CompgenError, ValueError, ArithmeticError, LookupError, OSError)
 
 
 @dataclass(frozen=True)
@@ -43,17 +49,38 @@ def table_curves(machine: Machine | None, errors: ErrorTable | None, control: Co
     """
     if machine is None or errors is None or not control.files or control.name not in CONTROLLERS:
         return ()
+    try:
+        parsed = _parsed(machine, control)
+        return _curves(_as_exported(machine, control), errors, parsed)
+    except UNFIT:
+        return ()
+
+
+def read_back(machine: Machine, control: ControlFolder) -> Callable[[Points], FloatArray] | None:
+    """Return what the files of a control add at points, (n, 3), mm; None where they cannot be read with this machine."""
+    try:
+        parsed = _parsed(machine, control)
+    except UNFIT:
+        return None
+    if control.name not in CONTROLLERS or not control.files:
+        return None
+    moved = _as_exported(machine, control)
+    return lambda points: parsed.mean_correction(moved, points.position_mm)
+
+
+def _as_exported(machine: Machine, control: ControlFolder) -> Machine:
+    """The machine with the settings that the manifest states; options of the run may differ from the machine file."""
     settings = control.manifest.get("settings")
     for key, value in (settings if isinstance(settings, dict) else {}).items():
         machine = machine.with_setting(control.name, key, value)
-    try:
-        return _curves(machine, errors, control)
-    except (CompgenError, ValueError, ArithmeticError, LookupError, OSError):
-        return ()  # the figures stand in result.json; this picture needs a machine file that still fits
+    return machine
 
 
-def _curves(machine: Machine, errors: ErrorTable, control: ControlFolder) -> tuple[TableCurve, ...]:
-    parsed = read_tables(machine, [item.path for item in control.files], control.name)
+def _parsed(machine: Machine, control: ControlFolder) -> ReadTables:
+    return read_tables(_as_exported(machine, control), [item.path for item in control.files], control.name)
+
+
+def _curves(machine: Machine, errors: ErrorTable, parsed: ReadTables) -> tuple[TableCurve, ...]:
     basis = parsed.controller.basis_of(machine, parsed.settings, errors, parsed.tables)
     solver = projector(machine, basis, anchored=parsed.controller.anchored)
     start = np.concatenate([term.start for term in basis])
