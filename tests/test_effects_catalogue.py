@@ -10,6 +10,7 @@ import pytest
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
+from compgen.core.axis_runs import read_axis_runs
 from compgen.core.machine import load_machine
 from compgen.core.plugins import restored
 from compgen.core.points import Points
@@ -240,3 +241,36 @@ def test_wrong_families_are_refused(call, tmp_path, text, message):
     (tmp_path / "p.py").write_text(text)
     code, _, err = call("effects", "--plugin", tmp_path / "p.py")
     assert code == 2 and message in " ".join(err.split())
+
+
+def test_axis_runs_are_simulated_with_effects_of_their_axis(call, small_machine_file, tmp_path):
+    scenario = tmp_path / "runs.toml"
+    scenario.write_text(
+        'seed = 1\n[errors]\nrandom = false\n[instrument]\ntype = "axis-laser"\naxes = ["X", "Z"]\ntargets = 5\n'
+        "cycles = 3\nnoise_um = 0.0\n[temperatures.spindle]\nramp_k_per_h = 1.0\n"
+        '[[effects]]\nname = "backlash_X"\nc_um = 2.0\n[[effects]]\nname = "warmup_drift"\nc_um = 10.0\ntau = 60.0\n'
+    )
+    code, _, err = call("simulate", small_machine_file, "--scenario", scenario, "--out", tmp_path / "o")
+    assert code == 0, err
+    runs = read_axis_runs(tmp_path / "o" / "simulated.axis.csv")
+    time_s = runs.covariates["time_s"]
+    expected = 10.0 * (1.0 - np.exp(-(time_s - time_s[0]) / 60.0)) + np.where(runs.axis == 0, 2.0 * runs.direction, 0.0)
+    np.testing.assert_allclose(
+        runs.deviation_mm * 1e3, expected, atol=1e-3
+    )  # times are written to 1e-6, deviations to 1e-4 um
+    assert len(runs) == 2 * 3 * 2 * 5 and "temp_spindle_c" in runs.covariates
+
+
+def test_effects_that_an_instrument_cannot_show_are_refused(call, small_machine_file, tmp_path):
+    scenario = tmp_path / "s.toml"
+    for instrument, effect in (
+        ('type = "axis-laser"\n', 'name = "laser_scale"\nc_ppm = 1.0\n'),
+        (
+            'type = "laser-tracer"\n[[instrument.stations]]\nname = "A"\nposition_mm = [900.0, 900.0, 900.0]\n'
+            "dead_length_mm = 0.0\n",
+            'name = "warmup_drift"\nc_um = 1.0\ntau = 5.0\n',
+        ),
+    ):
+        scenario.write_text(f"seed = 1\n[instrument]\n{instrument}[[effects]]\n{effect}")
+        code, _, err = call("simulate", small_machine_file, "--scenario", scenario, "--out", tmp_path / "o")
+        assert code == 2 and "acts on" in " ".join(err.split())

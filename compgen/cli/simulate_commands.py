@@ -19,11 +19,14 @@ from compgen.identify import Covariance, predict_uncertainty, read_covariance
 from compgen.imports import open_errors
 from compgen.model import predict
 from compgen.simulate import (
+    AxisLaser,
+    AxisSimulation,
     SimulatedSixDof,
     Simulation,
     SixDofSimulation,
     read_scenario,
     simulate,
+    simulate_axis_runs,
     simulate_sixdof,
     write_simulation,
 )
@@ -39,7 +42,8 @@ from compgen.verify import residuals
 def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | None, as_json: bool) -> int:
     """Simulate a machine and its measurement: writes *.lengths.csv (mm) and truth.errors.csv (um, urad) to DIR.
 
-    A scenario whose instrument has type = "sixdof" writes *.sixdof.csv in place of lengths.
+    A scenario whose instrument has type = "sixdof" writes *.sixdof.csv in place of lengths, one with "axis-laser"
+    *.axis.csv (um).
 
     \b
     Example:
@@ -48,11 +52,16 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
     with progress(quiet=as_json) as show:
         show("simulating")
         planned = read_scenario(scenario)
-        chosen = simulate_sixdof if isinstance(planned.instrument, SimulatedSixDof) else simulate
-        simulation: Simulation | SixDofSimulation = chosen(machine, planned, seed)
+        simulation: Simulation | SixDofSimulation | AxisSimulation
+        if isinstance(planned.instrument, AxisLaser):
+            simulation = simulate_axis_runs(machine, planned, seed)
+        elif isinstance(planned.instrument, SimulatedSixDof):
+            simulation = simulate_sixdof(machine, planned, seed)
+        else:
+            simulation = simulate(machine, planned, seed)
     paths = write_simulation(simulation, out)
     if as_json:
-        if isinstance(simulation, SixDofSimulation):
+        if isinstance(simulation, SixDofSimulation | AxisSimulation):
             summary = {"readings": len(simulation.readings), "stations": []}
         else:
             summary = {"readings": len(simulation.lengths), "stations": list(simulation.lengths.stations)}

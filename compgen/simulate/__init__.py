@@ -1,12 +1,15 @@
 """A virtual machine and virtual instruments: measurement files whose truth is known."""
 
+from compgen.simulate.axis_runs import AxisLaser
 from compgen.simulate.effects import EFFECTS, Effect
 from compgen.simulate.laser_tracer import LaserTracer, Station
 from compgen.simulate.run import (
+    AxisSimulation,
     Simulation,
     SixDofSimulation,
     actual_tips,
     simulate,
+    simulate_axis_runs,
     simulate_sixdof,
     write_simulation,
 )
@@ -18,6 +21,8 @@ from compgen.simulate.truth import RandomErrors, TruthPlan, draw_truth
 __all__ = [
     "EFFECTS",
     "INSTRUMENTS",
+    "AxisLaser",
+    "AxisSimulation",
     "Effect",
     "Instrument",
     "LaserTracer",
@@ -36,6 +41,7 @@ __all__ = [
     "plan_stops",
     "read_scenario",
     "simulate",
+    "simulate_axis_runs",
     "simulate_sixdof",
     "trajectory_points",
     "write_simulation",

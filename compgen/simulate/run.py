@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from compgen.core.axis_runs import AxisRuns, format_axis_runs
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable, format_errors
 from compgen.core.files import OutputFolder
@@ -15,7 +16,8 @@ from compgen.core.lengths import Lengths, format_lengths
 from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.model.exact import tip_position
-from compgen.simulate.effects import Effect, LengthEffect, Sights
+from compgen.simulate.axis_runs import AxisLaser
+from compgen.simulate.effects import Effect, LengthEffect, RunEffect, Sights
 from compgen.simulate.laser_tracer import LaserTracer, Station
 from compgen.simulate.scenario import Scenario
 from compgen.simulate.session import plan_session, with_temperatures
@@ -44,6 +46,15 @@ class Simulation:
     lengths: Lengths
     truth: ErrorTable
     stations: tuple[Station, ...]
+
+
+@dataclass(frozen=True)
+class AxisSimulation:
+    """The axis runs of a virtual machine, and its true errors in mm and rad; ``name`` begins the file names."""
+
+    name: str
+    readings: AxisRuns
+    truth: ErrorTable
 
 
 @dataclass(frozen=True)
@@ -100,6 +111,12 @@ def simulate(
     instrument = scenario.instrument
     if isinstance(instrument, SimulatedSixDof):
         raise InputError("is a six-DOF instrument, which has no lengths; call simulate_sixdof", file=scenario.source)
+    if isinstance(instrument, AxisLaser):
+        raise InputError("runs along axes and has no lengths; call simulate_axis_runs", file=scenario.source)
+    for effect in scenario.effects:
+        if isinstance(effect, RunEffect):
+            message = f"{effect.name} acts on axis runs only; their instrument has type = 'axis-laser'"
+            raise InputError(message, file=scenario.source, field="[[effects]]")
     try:
         stops = with_temperatures(_stops(machine, scenario, seeds, instrument.passes), scenario.temperatures)
     except InputError as error:
@@ -107,7 +124,7 @@ def simulate(
     tools_mm = np.array(scenario.trajectory.tools_mm) if scenario.trajectory.tools_mm else None
     truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), tools_mm)
     truth.warn_outside(stops.position_mm)
-    of_tips = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect)]
+    of_tips = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect | RunEffect)]
     tip_mm = actual_tips(machine, truth, stops, (*of_tips, *effects))
     lengths = instrument.observe(stops, tip_mm, random_stream(seeds, NOISE_STREAM))
     of_lengths = [effect for effect in scenario.effects if isinstance(effect, LengthEffect)]
@@ -157,6 +174,25 @@ def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = Non
     return SixDofSimulation(scenario.name, replace(readings, metadata=metadata), _described(machine, truth, used_seed))
 
 
+def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = None) -> AxisSimulation:
+    """Measure a virtual machine with the laser along axes of the scenario; InputError for another instrument."""
+    used_seed = scenario.seed if seed is None else seed
+    seeds = np.random.SeedSequence(used_seed)
+    if not isinstance(scenario.instrument, AxisLaser):
+        raise InputError("is no laser along axes; call simulate", file=scenario.source, field="[instrument] type")
+    truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
+    moving = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect | RunEffect)]
+    readings = scenario.instrument.measure(
+        machine,
+        lambda stops: actual_tips(machine, truth, stops, moving),
+        scenario.effects,
+        scenario.temperatures,
+        random_stream(seeds, NOISE_STREAM),
+    )
+    metadata = {**_common(machine, used_seed), **readings.metadata}
+    return AxisSimulation(scenario.name, replace(readings, metadata=metadata), _described(machine, truth, used_seed))
+
+
 def _common(machine: Machine, seed: int) -> dict[str, str]:
     return {"machine": machine.name, "seed": str(seed)}
 
@@ -167,10 +203,12 @@ def _described(machine: Machine, truth: ErrorTable, seed: int) -> ErrorTable:
     return truth.replace(metadata={**common, "source": "simulated truth", "reference_point_mm": reference})
 
 
-def write_simulation(simulation: Simulation | SixDofSimulation, folder: str | Path) -> dict[str, Path]:
-    """Write ``<name>.lengths.csv`` (or ``<name>.sixdof.csv``) and ``truth.errors.csv``; return paths by file name."""
+def write_simulation(simulation: Simulation | SixDofSimulation | AxisSimulation, folder: str | Path) -> dict[str, Path]:
+    """Write the readings, e.g. ``<name>.lengths.csv``, and ``truth.errors.csv``; return paths by file name."""
     output = OutputFolder(folder)
-    if isinstance(simulation, SixDofSimulation):
+    if isinstance(simulation, AxisSimulation):
+        output.add(f"{simulation.name}.axis.csv", format_axis_runs(simulation.readings))
+    elif isinstance(simulation, SixDofSimulation):
         output.add(f"{simulation.name}.sixdof.csv", format_sixdof(simulation.readings))
     else:
         output.add(f"{simulation.name}.lengths.csv", format_lengths(simulation.lengths))

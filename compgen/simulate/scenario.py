@@ -13,6 +13,7 @@ import numpy as np
 from compgen.core import tomlio
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
+from compgen.simulate.axis_runs import AxisLaser, read_axis_laser
 from compgen.simulate.effects import SimulatedEffect, read_effects
 from compgen.simulate.laser_tracer import read_laser_tracer
 from compgen.simulate.registration import instrument_problems
@@ -33,10 +34,12 @@ class Instrument(Protocol):
         """Return the readings at stops whose true tips are ``tip_mm`` (n, 3) in the workpiece frame."""
 
 
+AnyInstrument = Instrument | SimulatedSixDof | AxisLaser
 #: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
-INSTRUMENTS: dict[str, Callable[[tomlio.Section], Instrument | SimulatedSixDof]] = {
+INSTRUMENTS: dict[str, Callable[[tomlio.Section], AnyInstrument]] = {
     "laser-tracer": read_laser_tracer,
     "sixdof": read_sixdof_measurement,
+    "axis-laser": read_axis_laser,
 }
 
 
@@ -44,7 +47,7 @@ INSTRUMENTS: dict[str, Callable[[tomlio.Section], Instrument | SimulatedSixDof]]
 class Scenario:
     """A simulated measurement; ``name`` begins the names of its files, ``seed`` starts every random number."""
 
-    instrument: Instrument | SimulatedSixDof
+    instrument: AnyInstrument
     seed: int
     name: str = "simulated"
     errors: TruthPlan = field(default_factory=lambda: TruthPlan(random=RandomErrors()))
@@ -86,12 +89,16 @@ def read_scenario(path: str | Path) -> Scenario:
         for key in ("trajectory", "effects", "session", "temperatures"):
             if key in root.data:
                 raise root.fail(key, "belongs to other instruments; a six-DOF instrument runs along the axes")
+    if isinstance(scenario.instrument, AxisLaser):
+        for key in ("trajectory", "session"):
+            if key in root.data:
+                raise root.fail(key, "belongs to other instruments; a laser along axes runs to and fro along each")
     return scenario
 
 
-def _instrument(kind: str, section: tomlio.Section) -> Instrument | SimulatedSixDof:
+def _instrument(kind: str, section: tomlio.Section) -> AnyInstrument:
     made = INSTRUMENTS[kind](section)
-    if isinstance(made, SimulatedSixDof):
+    if isinstance(made, SimulatedSixDof | AxisLaser):
         return made
     problems = instrument_problems(made)
     if problems:

@@ -1,9 +1,18 @@
 """Effects: what acts on a simulated machine and its tracers besides the geometric errors, as forward formulas."""
 
 from compgen.simulate.effects.read import EFFECTS, SimulatedEffect, read_effects
-from compgen.simulate.effects.scene import Displacement, LengthEffect, Sights
+from compgen.simulate.effects.scene import Displacement, LengthEffect, RunEffect, Sights
 
 #: An effect that moves the tip; plug-ins return one.
 Effect = Displacement
 
-__all__ = ["EFFECTS", "Displacement", "Effect", "LengthEffect", "Sights", "SimulatedEffect", "read_effects"]
+__all__ = [
+    "EFFECTS",
+    "Displacement",
+    "Effect",
+    "LengthEffect",
+    "RunEffect",
+    "Sights",
+    "SimulatedEffect",
+    "read_effects",
+]

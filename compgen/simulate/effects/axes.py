@@ -10,7 +10,7 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
-from compgen.simulate.effects.scene import Displacement, channel, from_reference, over_travel
+from compgen.simulate.effects.scene import Displacement, RunEffect, channel, from_reference, over_travel
 from compgen.simulate.trajectory import Stops
 
 Values = Mapping[str, float]
@@ -87,6 +87,16 @@ def cosine_error(axis: int, p: Values, settings: Values) -> Displacement:
         return _along(axis, stops.position_mm[:, axis] * (math.cos(theta) - 1.0))
 
     return moved
+
+
+def warmup_drift(p: Values, settings: Values) -> RunEffect:
+    """A drift that dies out: the readings of an axis that warms up, or of its sensor."""
+
+    def change(time_s: FloatArray) -> FloatArray:
+        since = time_s - settings.get("start", float(time_s.min()))
+        return p["c_um"] * (1.0 - np.exp(-since / settings["tau"]))
+
+    return RunEffect("warmup_drift", change)
 
 
 AXIS_EFFECTS = {

@@ -14,13 +14,13 @@ from compgen.core.text import nearest
 from compgen.effects import DisplacementEffect, Effect, catalogue, listed, readings_of_points
 from compgen.effects.of_machine import DEAD_PATH_KEY, STATION_NAME, read_values
 from compgen.errors import InputError
-from compgen.simulate.effects.axes import AXIS_EFFECTS
-from compgen.simulate.effects.scene import Displacement, LengthEffect
+from compgen.simulate.effects.axes import AXIS_EFFECTS, warmup_drift
+from compgen.simulate.effects.scene import Displacement, LengthEffect, RunEffect
 from compgen.simulate.effects.sight import LENGTH_EFFECTS, STATION_EFFECTS
 from compgen.simulate.effects.structure import NAMED_EFFECTS, SINGLE_EFFECTS
 from compgen.simulate.trajectory import Stops
 
-SimulatedEffect = Displacement | LengthEffect
+SimulatedEffect = Displacement | LengthEffect | RunEffect
 #: Reader of a section ``[[effects]]`` of a scenario by its ``name``; plug-ins add to it.
 EFFECTS: dict[str, Callable[[tomlio.Section], Displacement]] = {}
 
@@ -35,7 +35,7 @@ def _read_effect(section: tomlio.Section) -> SimulatedEffect:
     if name in EFFECTS:
         return _read_own(name, section)
     known = catalogue(_stations(name, section))
-    if name not in known or not known[name].card.parameters or "".join(known[name].card.kinds) == "axis":
+    if name not in known or not known[name].card.parameters:
         names = [*EFFECTS, *(other for other, effect in listed().items() if effect.card.parameters)]
         reason = why_missing("effect", name)
         raise section.fail("name", f"is no effect; {nearest(name, names)}; --plugin PATH adds some{reason}")
@@ -66,6 +66,8 @@ def _built_in(name: str, p: Mapping[str, float], settings: Mapping[str, float]) 
     """Return the forward formula of an effect of the catalogue, parameters in SI units; None for one of a plug-in."""
     if name in SINGLE_EFFECTS:
         return SINGLE_EFFECTS[name](p, settings)
+    if name == "warmup_drift":
+        return warmup_drift(p, settings)
     if name in LENGTH_EFFECTS:
         return LengthEffect(name, LENGTH_EFFECTS[name](p, settings))
     station = STATION_NAME.fullmatch(name)

@@ -60,6 +60,14 @@ class LengthEffect:
     change: Callable[[Sights], FloatArray]
 
 
+@dataclass(frozen=True)
+class RunEffect:
+    """An effect on the readings of axis runs: ``change`` takes their times (n,) and returns what it adds, (n,), mm."""
+
+    name: str
+    change: Callable[[FloatArray], FloatArray]
+
+
 def channel(stops: Stops, name: str) -> FloatArray:
     """Covariate of each stop (n,); InputError if the scenario has none of that name."""
     if name not in stops.covariates:
