@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.controllers.error_files import read_error_file
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.diagnose import DiagnoseOptions, diagnose
@@ -24,6 +25,12 @@ from compgen.diagnose.measurement import read_diagnosed
 @click.option("--effects", metavar="NAME,...", help="Look for these effects only; default: the whole catalogue.")
 @click.option("--add", "added", multiple=True, metavar="NAME", help="Add this effect whether it was found or not.")
 @click.option("--u-um", type=float, help="Standard uncertainty of a reading, um; used where no line was repeated.")
+@click.option(
+    "--against",
+    type=click.Path(path_type=Path),
+    metavar="ERRORS",
+    help="Errors (*.errors.csv) that the measurement is compared with: which have changed?",
+)
 @json_option
 def diagnose_command(
     machine: Machine,
@@ -33,12 +40,13 @@ def diagnose_command(
     effects: str | None,
     added: tuple[str, ...],
     u_um: float | None,
+    against: Path | None,
     as_json: bool,
 ) -> int:
     """Find where model and measurement disagree, name the missing effect, add it, and see the gap shrink.
 
-    MEASUREMENTS are *.lengths.csv (mm) or *.deviations.csv files. Writes diagnosis.json, diagnosis.md, pages with
-    pictures (index.html), and extended.toml: the machine with the effects that were found.
+    MEASUREMENTS are *.lengths.csv (mm), *.deviations.csv or *.axis.csv files (um). Writes diagnosis.json,
+    diagnosis.md, pages with pictures (index.html), and extended.toml: the machine with the effects that were found.
 
     Exit code 1: it cannot be decided, or the gap does not shrink on lines that were left out.
 
@@ -48,7 +56,8 @@ def diagnose_command(
     """
     OutputFolder(out)
     names = tuple(name.strip() for name in effects.split(",") if name.strip()) if effects else ()
-    options = DiagnoseOptions(max_effects, names, added, u_um)
+    predicted = None if against is None else read_error_file(against)
+    options = DiagnoseOptions(max_effects, names, added, u_um, predicted)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
         measurement = read_diagnosed(measurements)

@@ -13,7 +13,6 @@ from compgen.effects import catalogue
 
 #: Correlation above which a relative is printed beside a name, however decisive the criterion looks.
 NEAR = 0.9
-MOST_INVISIBLE = 12
 
 
 def advice_of(analysis: Analysis, verdict: Verdict) -> tuple[str, ...]:
@@ -31,9 +30,11 @@ def advice_of(analysis: Analysis, verdict: Verdict) -> tuple[str, ...]:
     if verdict.unknown and verdict.unknown[0].covariates:
         depends = ", ".join(verdict.unknown[0].covariates)
         found.append(f"vary {depends} by themselves, each line twice: shows the law of what has no name")
-    for name in verdict.invisible[:MOST_INVISIBLE]:
+    shown: dict[str, list[str]] = {}
+    for name in verdict.invisible:
         if name in cards and cards[name].breaker:
-            found.append(f"{cards[name].breaker}: would show {name}, which this measurement cannot")
+            shown.setdefault(cards[name].breaker, []).append(name)
+    found += [f"{how}: would show {', '.join(names)}, which this measurement cannot" for how, names in shown.items()]
     return tuple(dict.fromkeys(found))
 
 

@@ -139,7 +139,9 @@ def _linearise(
     """Model and derivative at ``unknowns``; ``counts`` receives the number of parameters of every effect."""
     poses = observed.poses
     size = size_of(parts)
-    tip, columns = exact_columns(observed.machine, values_of(parts, unknowns), poses.position_mm, poses.tool_mm)
+    tip, columns = exact_columns(
+        observed.machine, values_of(parts, unknowns, len(poses.position_mm)), poses.position_mm, poses.tool_mm
+    )
     placement = unknowns[size : size + len(observed.placement_names)]
     model, direction, placing = observed.placed(tip, placement)
     moved = tip_columns(parts, columns)

@@ -91,9 +91,9 @@ def names_of(parts: Sequence[Part]) -> list[str]:
     return [part.name for part in parts for _ in range(part.basis.shape[1])]
 
 
-def values_of(parts: Sequence[Part], unknowns: FloatArray) -> FloatArray:
-    """All 21 errors (m, 21) for the unknowns, mm and rad."""
-    values = np.zeros((len(parts[0].basis), len(ERROR_INDEX)))
+def values_of(parts: Sequence[Part], unknowns: FloatArray, poses: int) -> FloatArray:
+    """All 21 errors (poses, 21) for the unknowns, mm and rad."""
+    values = np.zeros((poses, len(ERROR_INDEX)))
     for part in parts:
         values[:, ERROR_INDEX[part.name]] = part.basis @ unknowns[part.place]
     return values

@@ -7,21 +7,30 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from compgen.core.axis_runs import AxisRuns
 from compgen.core.csvio import FloatArray
+from compgen.core.deviations import Deviations
+from compgen.core.error_table import ErrorTable
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.threads import one_thread
 from compgen.diagnose.advice import advice_of
+from compgen.diagnose.against import compared
 from compgen.diagnose.analysis import Analysis, analyse
+from compgen.diagnose.axis_figures import WARM_UP_NOTE, figures_before_after
 from compgen.diagnose.base import BaseFit, fit_chosen_base
+from compgen.diagnose.classes import classes_of, gross_readings
+from compgen.diagnose.evidence import contribution
 from compgen.diagnose.gap import gap_of
 from compgen.diagnose.gross import correction_of, looks_gross
 from compgen.diagnose.measurement import Measurement
 from compgen.diagnose.observed import Observed, ObservedDeviations, ObservedLengths
+from compgen.diagnose.observed_axis import ObservedAxis, fit_axis
 from compgen.diagnose.refit import refit
 from compgen.diagnose.result import Classed, Diagnosis
 from compgen.diagnose.verdict import verdict_of
+from compgen.effects.of_machine import active_effects
 from compgen.errors import InputError
 
 Show = Callable[[str], None]
@@ -40,12 +49,14 @@ class DiagnoseOptions:
     effects : names to look for; default the whole catalogue.
     add : names that are added whether they were found or not.
     u_um : standard uncertainty of a reading in um, if it is known; used without repeats.
+    against : predicted errors that the measurement is compared with.
     """
 
     max_effects: int = 4
     effects: tuple[str, ...] = ()
     add: tuple[str, ...] = ()
     u_um: float | None = None
+    against: ErrorTable | None = None
 
 
 def diagnose(
@@ -73,7 +84,7 @@ def diagnose(
     with one_thread():
         show("fitting the base model")
         observed = observed_of(machine, measurement)
-        fit = fit_chosen_base(observed)
+        fit = _base(observed)
         classed: list[Classed] = []
         before = fit
         if isinstance(observed, ObservedLengths) and looks_gross(observed, fit.rms_mm):
@@ -83,27 +94,53 @@ def diagnose(
                 classed.append(Classed("axis_mapping", {}, 1.0, corrected.text))
                 measurement = corrected.lengths
                 observed = observed_of(machine, measurement)
-                fit = fit_chosen_base(observed)
+                fit = _base(observed)
         freedom = len(observed) - fit.jacobian.shape[1]
         if freedom < 20:
             raise InputError(
                 f"{len(observed)} readings leave {freedom} degrees of freedom beside {fit.jacobian.shape[1]} unknowns; "
                 "a diagnosis needs at least 20: measure more lines"
             )
-        analysis = analyse(
-            fit,
-            most_named=chosen.max_effects,
-            only=(*chosen.effects, *chosen.add) if chosen.effects else (),
-            sigma_mm=_sigma_mm(measurement, observed, chosen),
-            show=show,
-        )
-        return _completed(machine, analysis, chosen, show, before, classed)
+        analysis = _analysed(measurement, observed, fit, chosen, show)
+        gross = gross_readings(analysis)
+        if len(gross):
+            show(f"leaving out {len(gross)} gross readings")
+            observed = observed.part(np.setdiff1d(np.arange(len(observed)), gross))
+            fit = _base(observed)
+            before = fit if before is analysis.fit else before
+            analysis = _analysed(measurement, observed, fit, chosen, show)
+        return _completed(machine, analysis, chosen, show, before, classed, len(gross))
+
+
+def _base(observed: Observed) -> BaseFit:
+    """Fit the base model, with what the machine file switches on taken off the readings."""
+    fit = fit_axis(observed) if isinstance(observed, ObservedAxis) else fit_chosen_base(observed)
+    known = [effect.change_mm(fit.readings) for effect in active_effects(observed.machine)]
+    present = [change for change in known if change is not None]
+    if not present:
+        return fit
+    observed.value_mm = observed.value_mm - sum(present)
+    return fit_axis(observed) if isinstance(observed, ObservedAxis) else fit_chosen_base(observed)
+
+
+def _analysed(
+    measurement: Measurement, observed: Observed, fit: BaseFit, options: DiagnoseOptions, show: Show
+) -> Analysis:
+    return analyse(
+        fit,
+        most_named=options.max_effects,
+        only=(*options.effects, *options.add) if options.effects else (),
+        sigma_mm=_sigma_mm(measurement, observed, options),
+        show=show,
+    )
 
 
 def observed_of(machine: Machine, measurement: Measurement) -> Observed:
     """Return the measurement as scalar readings."""
     if isinstance(measurement, Lengths):
         return ObservedLengths(machine, measurement)
+    if isinstance(measurement, AxisRuns):
+        return ObservedAxis(machine, measurement)
     return ObservedDeviations(machine, measurement)
 
 
@@ -113,10 +150,11 @@ def _sigma_mm(measurement: Measurement, observed: Observed, options: DiagnoseOpt
         if not options.u_um > 0:
             raise InputError(f"an uncertainty of {options.u_um:g} um was given; it must be above zero")
         return np.full(len(observed), options.u_um * MM_PER_UM)
-    if isinstance(measurement, Lengths):
-        own = measurement.covariates.get("u_length_um")
+    if isinstance(observed, ObservedLengths):
+        own = observed.lengths.covariates.get("u_length_um")
         return None if own is None or np.isnan(own).any() else own * MM_PER_UM
-    assert isinstance(observed, ObservedDeviations)
+    if not isinstance(observed, ObservedDeviations) or not isinstance(measurement, Deviations):
+        return None
     if measurement.u_mm is None:
         return None
     u = measurement.u_mm[observed.place, observed.component]
@@ -130,6 +168,7 @@ def _completed(
     show: Show,
     before: BaseFit,
     classed: Sequence[Classed],
+    removed: int,
 ) -> Diagnosis:
     """Verdict, refit and gap; ``before`` is the fit to the file as it stands."""
     verdict = verdict_of(analysis)
@@ -146,7 +185,19 @@ def _completed(
     if analysis.fit.rms_mm > HOPELESS_MM:
         text = f"the readings do not fit the commanded positions: {analysis.fit.rms_mm:.3g} mm rms"
         verdict = replace(verdict, word="not_decidable", reasons=(*verdict.reasons, text))
-    return Diagnosis(machine, analysis, verdict, found, gap, tuple(classed), advice_of(analysis, verdict))
+    advice = advice_of(analysis, verdict)
+    observed = analysis.fit.observed
+    classes = [*classed, *classes_of(analysis, removed)]
+    done = Diagnosis(machine, analysis, verdict, found, gap, tuple(classes), advice)
+    if options.against is not None:
+        against = compared(observed, analysis, options.against)
+        done = replace(done, changes=against.changes, against_rms_mm=against.rms_mm)
+    if not isinstance(observed, ObservedAxis):
+        return done
+    warm = [item.group for item in verdict.named if item.name == "warmup_drift"]
+    change = sum((contribution(scene, analysis.chosen, g)[2] for g in warm), np.zeros(len(observed)))
+    notes = (WARM_UP_NOTE,) if warm else ()
+    return replace(done, notes=notes, iso_230_2=figures_before_after(observed, change))
 
 
 def _wanted(analysis: Analysis, names: Sequence[str], present: Sequence[int]) -> list[int]:

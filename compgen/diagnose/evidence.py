@@ -129,6 +129,14 @@ def _solved(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArr
     return inverse @ right, inverse
 
 
+def leftover(scene: Scene, chosen: Chosen) -> FloatArray:
+    """Whitened residual without base model and chosen set, scaled to the degrees of freedom that are left, (N,)."""
+    basis = orthonormal(scene.directions[:, scene.coordinates(chosen.members)]) if chosen.members else None
+    left = scene.residual if basis is None else scene.residual - basis @ (basis.T @ scene.residual)
+    used = scene.count - scene.freedom + (0 if basis is None else basis.shape[1])
+    return np.asarray(left * np.sqrt(scene.count / max(scene.count - used, 1)))
+
+
 def homogeneity(scene: Scene, chosen: Chosen, member: int, layout: Layout) -> float:
     """p-value of the test that an effect has the same size everywhere.
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from compgen.diagnose.pages import page_of
 from compgen.diagnose.result import Diagnosis
 
 
@@ -15,6 +16,7 @@ def diagnosis_files(found: Diagnosis) -> dict[str, str]:
     files = {
         "diagnosis.json": json.dumps(_strict(found.to_dict()), indent=2, allow_nan=False) + "\n",
         "diagnosis.md": summary(found),
+        "index.html": page_of(found),
     }
     if found.verdict.named and found.machine.source is not None:
         files["extended.toml"] = found.extended()
@@ -56,6 +58,16 @@ def summary(found: Diagnosis) -> str:
         pair = data["gap"][key]
         if pair:
             lines.append(f"| {key.replace('_', ' ')} | {pair['before_rms_um']:.3f} | {pair['after_rms_um']:.3f} |")
+    if "against" in data:
+        lines += ["", f"Against the given errors: {data['against']['rms_um']:.3f} um rms. Errors that have changed:"]
+        for item in data["against"]["changes"]:
+            size = item.get("largest", item.get("value"))
+            lines.append(f"* {item['error']}: {size:.2f} {item['unit']} (chi-square {item['chi2']:.0f})")
+        if not data["against"]["changes"]:
+            lines.append("* none")
+    for axis, figures in data.get("iso_230_2", {}).items():
+        shown = ", ".join(f"{key} {pair['before']:.2f} -> {pair['after']:.2f} um" for key, pair in figures.items())
+        lines += ["", f"ISO 230-2, axis {axis}: {shown}"]
     lines += ["", f"Noise floor {data['gap']['noise_floor_um']:.3f} um ({data['gap']['noise_floor_source']})."]
     lines += [f"Note: {text}." for text in (*data["reasons"], *data["notes"])]
     if data["advice"]:

@@ -110,6 +110,8 @@ def _time_folds(fit: BaseFit) -> IntArray | None:
     layout = fit.observed.layout
     if layout.stops < 8:
         return None
+    if fit.readings.kind == "axis":
+        return (layout.run[layout.stop] % 4).astype(np.int64)
     return np.minimum(layout.stop * 4 // layout.stops, 3).astype(np.int64)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compgen.core.csvio import FloatArray
+from compgen.core.files import read_text
 from compgen.core.machine import Machine
 from compgen.core.text import one_line
 from compgen.diagnose.analysis import Analysis
@@ -15,6 +16,7 @@ from compgen.diagnose.base import BaseFit, fit_base
 from compgen.diagnose.groups import Group
 from compgen.diagnose.scene import Scene
 from compgen.effects import Card, Effect, Readings
+from compgen.effects.of_machine import section_text
 
 
 class FixedColumns(Effect):
@@ -98,23 +100,19 @@ def _parameters(scene: Scene, fit: BaseFit, members: Sequence[int]) -> dict[int,
 
 def extended_toml(machine: Machine, analysis: Analysis, found: Refit, groups: Sequence[int]) -> str:
     """Return the machine file with a section ``[effects.NAME]`` for each of the named ``groups``."""
-    text = machine.source.read_text(encoding="utf-8-sig") if machine.source is not None else ""
+    text = read_text(machine.source) if machine.source is not None else ""
     lines = [text.rstrip("\n"), ""]
     for group in groups:
         item = analysis.scene.groups[group]
         assert item.effect is not None
-        lines += ["", f"# found by compgen diagnose: {one_line(item.effect.card.title)}", f"[effects.{item.name}]"]
-        for parameter in found.parameters.get(group, ()):
-            lines.append(f"{parameter.name} = {_number(parameter.value)}  # u = {parameter.u:.2g}")
-        lines += [f"{key} = {_number(value)}" for key, value in settings_of(analysis, item).items()]
+        fitted = found.parameters.get(group, ())
+        values = [p.value * own.si_per_unit for p, own in zip(fitted, item.effect.card.parameters, strict=True)]
+        u = ", ".join(f"{p.name} {p.u:.2g}" for p in fitted)
+        lines += ["", f"# found by compgen diagnose: {one_line(item.effect.card.title)}; standard uncertainty {u}"]
+        lines.append(section_text(item.effect, found.fit.readings, np.array(values)).rstrip("\n"))
     return "\n".join(lines) + "\n"
 
 
 def settings_of(analysis: Analysis, item: Group) -> dict[str, float]:
     """Settings of an effect that hold for the readings: what a machine file has to keep."""
     return {} if item.effect is None else item.effect.used(analysis.fit.readings)
-
-
-def _number(value: float) -> str:
-    text = f"{value:.9g}"
-    return text if any(mark in text for mark in ".en") else text + ".0"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,6 +37,8 @@ class Diagnosis:
     analysis, verdict, refit, gap : the stages; all None if only a gross error was found.
     classed : noise classes and gross errors.
     advice : measurements that would decide or separate, in words.
+    iso_230_2 : figures of axis runs before and after, by axis and key.
+    changes, against_rms_mm : errors that differ from those that were compared with, and the residual against them.
     notes : what was assumed or left out, in words.
     """
 
@@ -47,7 +50,9 @@ class Diagnosis:
     classed: tuple[Classed, ...] = ()
     advice: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    changes: tuple[dict[str, Any], ...] = field(default=())
+    changes: tuple[dict[str, Any], ...] = ()
+    against_rms_mm: float | None = None
+    iso_230_2: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def acceptable(self) -> bool:
@@ -88,7 +93,8 @@ class Diagnosis:
                 "unknowns": analysis.fit.base_size,
                 "groups": len({group.name for group in analysis.scene.groups}),
             },
-            **({"changes": list(self.changes)} if self.changes else {}),
+            **self._against(),
+            **({"iso_230_2": dict(self.iso_230_2)} if self.iso_230_2 else {}),
         }
 
     def _named(self, item: Named) -> dict[str, Any]:
@@ -112,6 +118,11 @@ class Diagnosis:
             "shape_exact": item.shape_exact,
             "reasons": list(item.reasons),
         }
+
+    def _against(self) -> dict[str, Any]:
+        if self.against_rms_mm is None:
+            return {}
+        return {"against": {"rms_um": self.against_rms_mm / MM_PER_UM, "changes": list(self.changes)}}
 
     def _noise(self) -> dict[str, Any]:
         noise = self.analysis.noise

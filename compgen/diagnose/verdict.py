@@ -12,6 +12,7 @@ from compgen.diagnose.analysis import Analysis
 from compgen.diagnose.evidence import HOMOGENEITY_P, contribution
 from compgen.diagnose.groups import Group
 from compgen.diagnose.search import Alternative, alternatives
+from compgen.effects import catalogue
 
 Grade = Literal["confirmed", "beside_unknown", "tentative"]
 Word = Literal["named", "none", "unknown", "not_decidable"]
@@ -234,4 +235,20 @@ def _invisible(analysis: Analysis) -> tuple[str, ...]:
             best[group.name] = max(best.get(group.name, 0.0), float(scene.visible[g]))
     of_base = {f"squareness_{name[1:]}" for name in SQUARENESS_NAMES if name in analysis.fit.basis.errors}
     hidden = [name for name, share in best.items() if share < INVISIBLE]
-    return tuple(name for name in (*hidden, *analysis.missing) if name not in of_base)
+    lacking = [name for name in analysis.missing if _applies(analysis, name)]
+    return tuple(name for name in (*hidden, *lacking) if name not in of_base)
+
+
+def _applies(analysis: Analysis, name: str) -> bool:
+    """Whether an effect without columns would have some if more had been logged or varied."""
+    if name.startswith("lever_"):
+        return name.removeprefix("lever_") not in analysis.fit.basis.errors
+    readings = analysis.fit.readings
+    for covariate in catalogue(readings.stations)[name].card.covariates:
+        logged = readings.covariates.get(covariate)
+        known = covariate in readings.covariates or covariate.startswith(("temp_", "feed", "load", "time"))
+        if known and (logged is None or np.isnan(logged).any() or np.ptp(logged) == 0.0):
+            return True
+        if covariate.startswith("approach") and readings.approach is None:
+            return True
+    return False

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import lapack, solve_triangular
 
 from compgen.core.csvio import FloatArray
-from compgen.diagnose.layout import Block, Layout
+from compgen.diagnose.layout import Block, IntArray, Layout
 from compgen.diagnose.noise import Noise, kernels, rotated, spacing_of
 
 
@@ -35,6 +35,11 @@ class Whitener:
                 parts.append(_solved(factor, turned[channel]))
         result = np.concatenate(parts)
         return result if columns.ndim == 2 else result[:, 0]
+
+    def order_of(self, stop: IntArray) -> IntArray:
+        """Stop of every whitened row, (n,); ``stop`` is that of every reading."""
+        blocks = self.layout.blocks
+        return np.concatenate([np.tile(stop[block.rows[:, 0]], block.channels) for block in blocks])
 
 
 def _solved(factor: FloatArray, columns: FloatArray) -> FloatArray:

@@ -1,0 +1,97 @@
+"""Classes of noise that have a name of their own: outliers, a trend of the variance with time, quantisation.
+
+They are looked for in what is left when the model, everything that was found and the free generic terms are taken out
+of the readings, so that an effect does not pass for an outlier.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from compgen.core.csvio import FloatArray
+from compgen.core.names import MM_PER_UM
+from compgen.diagnose.analysis import Analysis
+from compgen.diagnose.base import least_norm
+from compgen.diagnose.evidence import leftover
+from compgen.diagnose.layout import IntArray
+from compgen.diagnose.result import Classed
+
+#: A reading further than so many standard deviations from its neighbours in time is gross; readings of 4600 without
+#: gross errors hold one in one of 10^5 sets.
+GROSS = 6.5
+#: Gross readings are the exception: with a larger share something else is the matter.
+MOST_GROSS = 0.03
+#: Neighbours in time whose median a reading is compared with, itself among them.
+NEIGHBOURS = 5
+#: Deviate of the slope of the variance against time that counts as a trend.
+TREND_Z = 6.0
+#: Share of readings that must lie on a grid of the step, and the least step over the noise.
+ON_GRID, COARSE = 0.999, 1.0
+
+
+def classes_of(analysis: Analysis, removed: int = 0) -> list[Classed]:
+    """Return the classes of noise that the readings show beyond doubt; ``removed`` gross readings were left out."""
+    found = _outliers(removed)
+    return [*found, *_trend(analysis, leftover(analysis.scene, analysis.chosen)), *_quantised(analysis)]
+
+
+def gross_readings(analysis: Analysis) -> IntArray:
+    """Rows of readings that lie far from their neighbours when all that was found is taken off; none if they are many."""
+    from scipy.ndimage import median_filter  # imported here: slow to load
+
+    fit, scene = analysis.fit, analysis.scene
+    added = [scene.groups[g].columns @ scene.maps[g] for g in analysis.chosen.members]
+    design = np.hstack([fit.jacobian, *added])
+    left = (fit.residual_mm - design @ least_norm(design, fit.residual_mm)) / analysis.noise.scale
+    layout = fit.observed.layout
+    apart = np.zeros_like(left)
+    for channel in np.unique(layout.channel):
+        rows = np.flatnonzero(layout.channel == channel)
+        rows = rows[np.argsort(layout.stop[rows], kind="stable")]
+        apart[rows] = left[rows] - median_filter(left[rows], NEIGHBOURS, mode="nearest")
+    moved = np.abs(apart[apart != 0.0])
+    if len(moved) < NEIGHBOURS * NEIGHBOURS:
+        return np.zeros(0, dtype=np.int64)
+    found = np.flatnonzero(np.abs(apart) > GROSS * 1.4826 * float(np.median(moved)))
+    return found if len(found) <= MOST_GROSS * len(left) else np.zeros(0, dtype=np.int64)
+
+
+def _outliers(removed: int) -> list[Classed]:
+    if not removed:
+        return []
+    text = f"{removed} reading(s) lie more than {GROSS:g} standard deviations from their neighbours; they were left out"
+    return [Classed("outliers", {"count": float(removed)}, 1.0, text)]
+
+
+def _trend(analysis: Analysis, residual: FloatArray) -> list[Classed]:
+    """Score test of the variance against time (Breusch and Pagan 1979, in the form of Koenker 1981), outliers clipped."""
+    layout = analysis.fit.observed.layout
+    time = analysis.scene.whiten.order_of(layout.stop)
+    t = layout.time[time]
+    if np.ptp(t) == 0.0:
+        return []
+    s = (t - t.mean()) / t.std()
+    square = np.minimum(residual**2, 16.0 * float(np.mean(residual**2)))
+    slope = float(np.mean(s * square) / np.mean(square))
+    z = float(np.mean(s * (square - square.mean())) / (square.std() / np.sqrt(len(square))))
+    if abs(z) < TREND_Z:
+        return []
+    text = f"the variance of the noise {'grows' if slope > 0 else 'falls'} with time"
+    return [Classed("variance_trend", {"slope_per_sd": slope, "z": z}, 1.0, text)]
+
+
+def _quantised(analysis: Analysis) -> list[Classed]:
+    """Readings that all lie on a grid whose step is as large as the noise."""
+    values = analysis.fit.observed.value_mm
+    sigma = float(np.sqrt(analysis.noise.variances.white))
+    apart = np.diff(np.unique(np.round(values, 7)))
+    if not apart.size:
+        return []
+    step = float(apart.min())
+    if step < COARSE * sigma:
+        return []
+    off = np.abs(values / step - np.round(values / step))
+    if float(np.mean(off < 0.01)) < ON_GRID:
+        return []
+    text = f"readings are multiples of {step / MM_PER_UM:g} um, as coarse as the noise"
+    return [Classed("quantisation", {"step_um": step / MM_PER_UM}, 1.0, text)]
