@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from datetime import datetime, timedelta
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,13 +23,14 @@ from compgen.errors import InputError
 from compgen.model.exact import exact_error
 from compgen.model.grid import volume_grid
 from compgen.recal import publish
-from compgen.recal.job import read_job
+from compgen.recal.job import job_of_text, read_job
 from compgen.recal.runner import MachineOutcome, run_jobs
 from compgen.recal.schedule import Every, cron, cron_expression, systemd_lines
 from compgen.recal.store import open_store
 from compgen.recal.units import units
 from compgen.recal.watch import Watch, trigger_of
 
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "recal"
 MACHINE = """\
 [machines.mill]
 machine = "mill.toml"
@@ -209,6 +211,13 @@ def test_machines_with_one_schedule_share_a_timer_and_names_are_quoted(tmp_path)
     cron_lines = files["crontab"].splitlines()
     assert cron_lines[1] == rf"0 6 * * * /opt/compgen recal run m0 m1 --job '{tmp_path}/a b\%/recal.toml'"
     assert cron_lines[2].startswith("# every 45 minutes")
+
+
+def test_the_files_in_examples_are_what_the_command_writes_for_the_example():
+    text = (EXAMPLE / "recal.toml").read_text()
+    files = dict(units(job_of_text(text, Path("/etc/compgen/recal.toml")), "/opt/compgen/bin/compgen"))
+    assert (EXAMPLE / "crontab").read_text() == files.pop("crontab")
+    assert {path.name: path.read_text() for path in (EXAMPLE / "systemd").iterdir()} == files
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
