@@ -49,7 +49,7 @@ def draw_residuals(residuals: ReadingResiduals) -> Picture | None:
     largest = max((float(np.max(np.abs(values))) for values in groups.values() if len(values)), default=0.0)
     if not groups or largest <= 0.0:
         return None
-    columns = min(len(groups), 4)
+    columns = min(len(groups), 2 if len(groups) <= 4 else 4)
     rows = -(-len(groups) // columns)
     figure = new_figure(160.0 * columns, 130.0 * rows)
     for k, values in enumerate(groups.values()):

@@ -116,7 +116,7 @@ def draw_space(grid: Grid, number: int) -> Picture:
     _polylines(axes, lines + before_scale * _at(grid, grid.before_mm, lines), "before", 0.8, "before")
     after = _at(grid, grid.after_mm, lines)
     _polylines(axes, lines + before_scale * after, "after", 0.8, "after")
-    _polylines(axes, lines + after_scale * after, "after", 0.8, "own")
+    _polylines(axes, lines + after_scale * after, "c3", 0.8, "own")
     _name_axes(axes, grid)
     axes.autoscale_view()
     title = f"The working volume, errors enlarged {before_scale:g} times: before and after; after once more {after_scale:g} times"
