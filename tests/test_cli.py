@@ -517,6 +517,9 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
         "options": (small_machine_file, errors_file, "--out", out),
         "import": (Path(__file__).parent / "golden" / "imports" / "linear.rtl", "--out", out),
         "report": (tables, "--out", out),
+        "accuracy": (small_machine_file, errors_file, "--out", out),
+        "compare": (small_machine_file, errors_file, errors_file, "--out", out),
+        "diagnose": (small_machine_file, small_lengths_file, "--out", out),
     }
 
 
@@ -535,6 +538,9 @@ WRITING = [
     "options",
     "import",
     "report",
+    "accuracy",
+    "compare",
+    "diagnose",
 ]
 
 

@@ -137,7 +137,7 @@ def checksum(words: Iterable[str]) -> str:
     """CRC-32 of the words from ``volcomp`` to ``end`` with one blank between two, as 8 hexadecimal digits.
 
     >>> checksum("volcomp 1 end".split())
-    '94EA52A4'
+    'CF835787'
     """
     total, joint = 0, b""
     for word in words:
