@@ -10,21 +10,30 @@ from typing import Any, Literal
 import numpy as np
 
 from compgen.accuracy.budget import Budget
-from compgen.accuracy.evaluate import accuracy_of_runs, groups_of_errors, narrowed, statements_of, volume_fields
+from compgen.accuracy.evaluate import (
+    MOST_IN_PAIRS,
+    accuracy_of_runs,
+    groups_of_errors,
+    narrowed,
+    statements_of,
+    volume_fields,
+)
 from compgen.accuracy.field import Alignment, Field, aligned, volume_figures
 from compgen.accuracy.figure import COVERAGE, ComparedFigure, Figure
 from compgen.accuracy.iso230_2 import LATEST
+from compgen.accuracy.iso_gauge import in_common_gauge
 from compgen.accuracy.pairing import MeasuredField, paired_errors, paired_fields, paired_runs
 from compgen.accuracy.runs import RunStatistics
 from compgen.accuracy.source import ErrorSource
 from compgen.core.machine import Machine
 from compgen.core.names import error_named
 from compgen.errors import InputError
-from compgen.model.gauge import align as gauge_aligned
 
 Overall = Literal["better", "worse", "not separated", "smaller", "larger", "same"]
 #: Figures that decide over a volume, over axis runs (the first that is there), and over errors of single axes.
 DECISIVE_VOLUME = ("rms", "max")
+#: Share of components beyond k = 2 by chance, points at which components are looked at one by one, and what counts as 0.
+CHANCE, MOST_SINGLE, EXACT_MM = 0.05, 300, 1e-9
 DECISIVE_RUNS = ("A", "E", "A_up", "A_down", "E_up", "E_down")
 
 
@@ -50,18 +59,29 @@ class CompareOptions:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Predicted against measured: figures of both, and of the difference field; ``en`` above 1 disagrees."""
+    """Predicted against measured.
+
+    Parameters
+    ----------
+    figures : figures of both fields; those of the measured one hold the noise of the measurement.
+    difference : figures of measured minus predicted, and the difference at single points decides:
+    beyond : share of its components with E_n above 1, (k = 2); nan where an uncertainty is not known.
+    allowed : the largest share that chance explains: 5 % and twice its standard deviation for so many components.
+    components : how many components were looked at.
+    """
 
     figures: Mapping[str, ComparedFigure]
     difference: Mapping[str, Figure]
+    beyond: float
+    allowed: float
+    components: int
 
     @property
     def verdict(self) -> Literal["agrees", "disagrees", "unknown"]:
-        """Whether every decisive figure agrees within the expanded uncertainties; unknown without uncertainties."""
-        numbers = [self.figures[key].en for key in DECISIVE_VOLUME]
-        if any(math.isnan(number) for number in numbers):
+        """Whether measured and predicted errors agree point by point; unknown without uncertainties."""
+        if math.isnan(self.beyond):
             return "unknown"
-        return "agrees" if max(numbers) <= 1.0 else "disagrees"
+        return "agrees" if self.beyond <= self.allowed else "disagrees"
 
     def summary(self) -> dict[str, Any]:
         """Return plain numbers for JSON."""
@@ -70,6 +90,9 @@ class Agreement:
             figures[key] = {"predicted": item.before.summary(), "measured": item.after.summary(), "en": item.en}
         return {
             "verdict": self.verdict,
+            "beyond_en_1": self.beyond,
+            "beyond_en_1_allowed": self.allowed,
+            "components": self.components,
             "figures": figures,
             "difference": {key: item.summary() for key, item in self.difference.items()},
         }
@@ -125,8 +148,9 @@ def _pairs(
 def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOptions | None = None) -> Comparison:
     """Compare two sets of errors of one machine: per volume, axis, diagonal and error.
 
-    AFTER is gauge-aligned to BEFORE first, so that changes which no measurement shows do not count as changes of single
-    errors. The volume is that of the errors as they are, in the stated alignment, on which the gauge has no influence.
+    Both are gauge-aligned first (:func:`compgen.accuracy.iso_gauge.in_common_gauge`), so that what no measurement shows does
+    not count as a change of single errors. The volume is that of the errors as they are, in the stated alignment, on which
+    the gauge has no influence.
 
     Raises
     ------
@@ -138,11 +162,9 @@ def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOpti
     machine, cut = _known_part(first.machine, first)
     first, second = replace(first, machine=machine), replace(second, machine=machine)
     fields = volume_fields(machine, (first, second), chosen.alignment or "axes")
-    shifted = replace(second, errors=gauge_aligned(machine, second.errors, first.errors))
-    if shifted.errors.names != second.errors.names:
-        shifted = second
+    gauged = [in_common_gauge(source) for source in (first, second)]
     groups = []
-    for (full, pairs), source in zip(fields, (first, shifted), strict=True):
+    for (full, pairs), source in zip(fields, gauged, strict=True):
         groups.append({"volume": volume_figures(full, pairs), **groups_of_errors(source, chosen.line)})
     statements = [text, *cut, *statements_of(machine, fields[0][0], chosen.line)]
     statements.append(
@@ -208,7 +230,7 @@ def _components(measured: tuple[bool, bool, bool]) -> list[str]:
     return [] if all(measured) else [f"only d{', d'.join(names)} were measured; the other components count as zero"]
 
 
-def _thinned(field: Field, most: int = 2_500) -> Field:
+def _thinned(field: Field, most: int = MOST_IN_PAIRS) -> Field:
     """Every so-manieth point of a large field, for pairs."""
     if len(field) <= most:
         return field
@@ -253,12 +275,29 @@ def compare_runs(
 def agreement(predicted: Field, measured: Field) -> Agreement:
     """Compare a predicted field with the measured one at the same points, both aligned alike."""
     first, second = (volume_figures(field, _thinned(field)) for field in (predicted, measured))
-    apart = measured.error_mm - predicted.error_mm
 
     def spread(weight: np.ndarray) -> float:
         return math.hypot(predicted.spread(weight), measured.spread(weight))
 
-    rest = replace(measured, error_mm=apart, spread=spread)
+    rest = replace(measured, error_mm=measured.error_mm - predicted.error_mm, spread=spread)
     difference = volume_figures(rest, _thinned(rest))
+    beyond, count = _share_beyond(_thinned(rest, MOST_SINGLE))
+    allowed = CHANCE + 2.0 * math.sqrt(CHANCE * (1.0 - CHANCE) / max(count, 1))
     figures = {key: ComparedFigure(first[key], second[key]) for key in first}
-    return Agreement(figures, {key: difference[key] for key in ("max", "rms", "p95")})
+    return Agreement(figures, {key: difference[key] for key in ("max", "rms", "p95")}, beyond, allowed, count)
+
+
+def _share_beyond(difference: Field) -> tuple[float, int]:
+    """Share of the components of a difference beyond its expanded uncertainty, and the number of components."""
+    beyond = count = 0
+    weight = np.zeros_like(difference.error_mm)
+    for index, value in np.ndenumerate(difference.error_mm):
+        weight[index] = 1.0
+        u = difference.spread(weight)
+        weight[index] = 0.0
+        if math.isnan(u):
+            return math.nan, 0
+        if u > EXACT_MM or abs(value) > EXACT_MM:  # the alignment makes some components exactly zero
+            count += 1
+            beyond += int(abs(value) > COVERAGE * u)
+    return beyond / max(count, 1), count

@@ -28,7 +28,7 @@ from compgen.core.names import error_named
 from compgen.model.grid import volume_grid
 
 #: Points of the volume, and of the smaller grid on which pairs of points are looked at.
-MOST_POINTS, MOST_IN_PAIRS = 20_000, 2_500
+MOST_POINTS, MOST_IN_PAIRS = 20_000, 1_750
 
 Groups = Mapping[str, Mapping[str, Figure]]
 

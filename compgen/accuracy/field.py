@@ -239,8 +239,8 @@ def _largest_pairs(field: Field, block: int = 256) -> tuple[tuple[int, int], tup
     tip, error = field.tip_mm, field.error_mm
     for first in range(0, len(tip), block):
         rows = slice(first, first + block)
-        apart = error[rows, None] - error[None]
-        line = tip[rows, None] - tip[None]
+        apart = error[rows, None] - error[None, first:]
+        line = tip[rows, None] - tip[None, first:]
         squares = np.einsum("ijk,ijk->ij", apart, apart)
         # |line + apart| - |line| without the loss of digits that the difference of two roots has
         before = np.sqrt(np.einsum("ijk,ijk->ij", line, line))
@@ -250,6 +250,6 @@ def _largest_pairs(field: Field, block: int = 256) -> tuple[tuple[int, int], tup
         for k, values in enumerate((squares, sizes)):
             at = int(np.argmax(values))
             if values.flat[at] > best[k][0]:
-                i, j = divmod(at, len(tip))
-                best[k] = (float(values.flat[at]), (first + i, j))
+                i, j = divmod(at, len(tip) - first)
+                best[k] = (float(values.flat[at]), (first + i, first + j))
     return best[0][1], best[1][1]

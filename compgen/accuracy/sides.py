@@ -176,12 +176,11 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
         )
     if before.runs is not None or after.runs is not None:
         raise InputError(f"BEFORE holds {before.kind}, AFTER {after.kind}; axis runs compare with axis runs only")
-    if before.deviations is not None and after.deviations is not None and options.align != "model":
-        return _positions(before, after, options)
-    if (before.deviations is None) != (after.deviations is None) and options.align != "model":
-        raise InputError(
-            f"BEFORE holds {before.kind}, AFTER {after.kind}; --align model identifies the errors of each and compares those"
-        )
+    if options.align != "model":
+        if before.deviations is not None and after.deviations is not None:
+            return _positions(before, after, options)
+        if before.deviations is not None or after.deviations is not None:
+            return _errors_at_positions(before, after, options)
     said = []
     if before.lengths is not None and after.lengths is not None:
         said.append(check_same_positions(before.lengths, after.lengths, options.align))
@@ -207,21 +206,36 @@ def _positions(before: Side, after: Side, options: CompareOptions) -> Comparison
         assert first is not None and second is not None
         errors = compare_errors(first, second, replace(options, align=None, alignment=None))
     except (UndeterminedError, InputError) as error:
-        text = f"single errors are not compared: they do not follow from these points ({error})"
+        text = f"single errors are not compared: they do not follow from these points ({str(error).partition(';')[0]})"
         return replace(found, statements=(*found.statements, text))
     rest = {name: group for name, group in errors.groups.items() if name != "volume"}
     text = "axes, diagonals and single errors: identified from the points of each side; " + errors.statements[-2]
     return replace(found, groups={**found.groups, **rest}, statements=(*found.statements, text))
 
 
+def _errors_at_positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
+    """Errors on one side, taken at the positions that were measured on the other."""
+    measured = _own_tool(after if before.deviations is None else before)
+    other = before if before.deviations is None else after
+    field = _predicted_at(other, measured.field)
+    taken = MeasuredField(field, measured.keys, measured.measured)
+    sides = (taken, measured) if other is before else (measured, taken)
+    found = compare_fields(before.machine, *sides, options)
+    text = f"{other.path.name}: errors, the exact model moved with them to the measured positions"
+    return replace(found, statements=(text, *found.statements))
+
+
 def compare_prediction(predicted: Side, measured: Side, options: CompareOptions) -> Comparison:
     """Compare a prediction (errors, or errors at points) with what was measured; verdict by the agreement."""
     first, second = _both_fields(predicted, measured, options)
     found = agreement(first, second)
-    statements = (
+    statements: tuple[str, ...] = (
         f"prediction {predicted.path.name} against {measured.kind}",
         f"{len(first)} points, {first.alignment}",
     )
+    if predicted.predicted is not None:
+        text = "a list of predicted points has no uncertainty: that of the measurement alone counts"
+        statements = (*statements, f"{text}; where squareness is large, predict with --exact")
     return Comparison("prediction", {"volume": dict(found.figures)}, (), statements, found)
 
 
@@ -259,15 +273,18 @@ def _both_fields(predicted: Side, measured: Side, options: CompareOptions) -> tu
         second = _own_tool(measured).field
         first = _predicted_at(predicted, second)
     elif predicted.predicted is not None:
-        source = measured.errors().source
-        assert source is not None
-        first, second = predicted.predicted, source.field(predicted.predicted.position_mm)
+        first, second = predicted.predicted, _exact(measured).field(predicted.predicted.position_mm)
     else:
-        sources = predicted.errors().source, measured.errors().source
-        assert sources[0] is not None and sources[1] is not None
-        (first, _), (second, _) = volume_fields(machine, (sources[0], sources[1]), alignment)
+        (first, _), (second, _) = volume_fields(machine, (_exact(predicted), _exact(measured)), alignment)
         return first, second
     return aligned(machine, first, alignment), aligned(machine, second, alignment)
+
+
+def _exact(side: Side) -> ErrorSource:
+    """Errors of a side as a source that moves the exact model."""
+    source = side.errors().source
+    assert source is not None
+    return replace(source, exact=True)
 
 
 def _own_tool(side: Side) -> MeasuredField:
@@ -286,9 +303,7 @@ def _own_tool(side: Side) -> MeasuredField:
 def _predicted_at(predicted: Side, measured: Field) -> Field:
     """Predicted field at the measured points; a list of points must hold every one of them."""
     if predicted.predicted is None:
-        source = predicted.errors().source
-        assert source is not None
-        return source.field(measured.position_mm)
+        return _exact(predicted).field(measured.position_mm)
     given = predicted.predicted
     index = {key: k for k, key in enumerate(map(tuple, np.round(given.position_mm, 3).tolist()))}
     wanted = list(map(tuple, np.round(measured.position_mm, 3).tolist()))

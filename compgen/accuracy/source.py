@@ -28,13 +28,15 @@ class ErrorSource:
     """Errors of a machine; ``factor`` (k, r) has F F^T as the covariance of the k values in the order of the table.
 
     ``factor`` is None where the uncertainty is not known. ``correction`` is what active tables add: the field is then that
-    of the machine with them.
+    of the machine with them. ``exact`` moves the exact model, for fields that are compared with measured ones; a correction
+    always does.
     """
 
     machine: Machine
     errors: ErrorTable
     factor: FloatArray | None = None
     correction: Correction | None = None
+    exact: bool = False
 
     @property
     def known(self) -> bool:
@@ -42,11 +44,12 @@ class ErrorSource:
         return self.factor is not None
 
     def field(self, position_mm: FloatArray) -> Field:
-        """Return the errors of the tip at positions (n, 3) with the machine's tool: E = C P, exact with active tables."""
+        """Return the errors of the tip at positions (n, 3) with the machine's tool; uncertainties to first order."""
         points = Points(position_mm)
         tool = tool_of(self.machine, None)
         if self.correction is None:
-            error = volumetric_error(self.machine, self.errors, position_mm)
+            model = exact_error if self.exact else volumetric_error
+            error = model(self.machine, self.errors, position_mm)
         else:  # looked up at the commanded position, as controls do
             added = self.correction(points)
             error = exact_error(self.machine, self.errors, position_mm + added) + added

@@ -14,6 +14,7 @@ from compgen.accuracy.compare import Comparison
 from compgen.accuracy.evaluate import Accuracy
 from compgen.accuracy.figure import ComparedFigure, Figure
 
+_HEADINGS = ("figure", "before", "after", "unit", "factor", "En", "verdict")
 _STYLES = {"better": "green", "worse": "bold red", "larger": "red"}
 
 
@@ -53,22 +54,24 @@ def verdict_text(found: Comparison) -> str:
 
 
 def _tables(groups: Mapping[str, Mapping[str, ComparedFigure]], kind: str) -> list[Table]:
-    first, second = ("predicted", "measured") if kind == "prediction" else ("before", "after")
+    predicted = kind == "prediction"
+    headings = ("figure", "predicted", "measured", "unit", "En") if predicted else _HEADINGS
     tables = []
     for name, group in groups.items():
-        if not group:
-            continue
         table = Table(title=name, title_justify="left", box=box.SIMPLE, pad_edge=False)
-        for heading in ("figure", first, second, "unit", "factor", "En", "verdict"):
-            table.add_column(
-                heading, justify="left" if heading in ("figure", "unit", "verdict") else "right", no_wrap=True
-            )
+        for heading in headings:
+            left = heading in ("figure", "unit", "verdict")
+            table.add_column(heading, justify="left" if left else "right", no_wrap=True)
         for key, item in group.items():
+            row: list[str | Text] = [key, _with_u(item.before), _with_u(item.after), item.before.unit]
+            if predicted:
+                table.add_row(*row, _number(item.en))
+                continue
             factor = _number(item.factor) + ("" if math.isnan(item.u_factor) else f" +/- {2 * item.u_factor:.2f}")
-            word = "" if kind == "prediction" else item.verdict
-            row = (key, _with_u(item.before), _with_u(item.after), item.before.unit, factor, _number(item.en))
-            table.add_row(*row, Text(word, _STYLES.get(word, "")))
-        tables.append(table)
+            verdict = Text(item.verdict, _STYLES.get(item.verdict, ""))
+            table.add_row(*row, factor, _number(item.en), verdict)
+        if group:
+            tables.append(table)
     return tables
 
 
@@ -77,5 +80,12 @@ def _prediction(found: Comparison) -> list[Text]:
     if found.prediction is not None:
         agreed = found.prediction
         parts = [f"{key} {_with_u(item)} um" for key, item in agreed.difference.items()]
-        lines.insert(0, f"prediction {agreed.verdict} with the measurement; difference: {', '.join(parts)}")
+        verdict = "cannot be judged against" if agreed.verdict == "unknown" else f"{agreed.verdict} with"
+        share = (
+            ""
+            if math.isnan(agreed.beyond)
+            else f"; {100 * agreed.beyond:.1f} % of {agreed.components} components beyond U"
+        )
+        share += "" if math.isnan(agreed.beyond) else f" (by chance up to {100 * agreed.allowed:.1f} %)"
+        lines.insert(0, f"prediction {verdict} the measurement{share}; difference: {', '.join(parts)}")
     return [Text("\n".join(lines))]
