@@ -56,6 +56,8 @@ def of_null(given: Said) -> str:
 def of_named(given: Said, truth: set[str]) -> str:
     """``exact``, or what is missing or too much."""
     confirmed = set(given.confirmed)
+    if not confirmed and set(given.tentative) == truth and given.verdict == "named":
+        return "exact, tentative"
     if confirmed == truth:
         if given.unknown or given.tentative:
             return "exact, but flagged"
