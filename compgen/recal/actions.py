@@ -19,7 +19,7 @@ def approve(
     """Approve a version (None: the only one that is pending) and make its files the active ones.
 
     Errors as :func:`compgen.recal.decisions.approve` has them, and InputError if the folder cannot be written: the
-    decision stands then, and the next run or ``status`` publishes it.
+    decision stands then, and the next run publishes it.
     """
 
     def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
