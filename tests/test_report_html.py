@@ -436,3 +436,33 @@ def test_calibration_record_has_units_and_expanded_uncertainties(ran):
 def test_the_machine_file_is_kept_byte_by_byte(ran, small_machine_file):
     assert (ran / "machine.toml").read_bytes() == small_machine_file.read_bytes()
     assert tomllib.loads((ran / "machine.toml").read_text())["name"] == "small-gantry"
+
+
+def test_a_run_on_hostile_labels_comments_and_headers_gives_an_inert_page(
+    small_machine_file, small_lengths_file, tmp_path, capsys
+):
+    """The same elements and attributes as without them: texts of files add text to the page, and nothing else."""
+    evil = "<img src=x onerror=a()></script><script>a()</script>"
+    machine = tmp_path / "evil.toml"
+    machine.write_text(small_machine_file.read_text().replace("small-gantry", evil))
+    lines = small_lengths_file.read_text().splitlines()
+    head = next(k for k, line in enumerate(lines) if not line.startswith("#"))
+    station = lines[head].split(",").index("station")
+    rows = [line.split(",") for line in lines[head + 1 :]]
+    for row in rows:
+        row[station] = f'"{evil} {row[station]}"'
+    text = [*lines[:head], f"# date = {evil}", f"{lines[head]},{evil}", *(",".join([*row, "1"]) for row in rows)]
+    measured = tmp_path / "evil.lengths.csv"
+    measured.write_text("\n".join(text) + "\n")
+    out = tmp_path / "out"
+    assert call("run", machine, measured, "--controller", "isg-csv", "--out", out) == 0
+    assert "is not known and left out" in capsys.readouterr().err
+    plain = tmp_path / "plain"
+    assert call("run", small_machine_file, small_lengths_file, "--controller", "isg-csv", "--out", plain) == 0
+    found, usual = (Page((folder / "report.html").read_text()) for folder in (out, plain))
+    assert evil in "".join(found.texts)
+    assert {tag: found.tags.count(tag) for tag in ("script", "img", "iframe", "style", "a", "svg", "th")} == {
+        tag: usual.tags.count(tag) for tag in ("script", "img", "iframe", "style", "a", "svg", "th")
+    }
+    assert not [name for name, _ in found.attributes if name.startswith("on")]
+    assert not re.search(r"(?<!\\)<", (out / "dossier.md").read_text())
