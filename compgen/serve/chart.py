@@ -9,6 +9,8 @@ from dataclasses import dataclass
 #: Size of a chart and its margins (left, right, top, bottom), px.
 WIDTH, HEIGHT = 620.0, 200.0
 MARGINS = (64.0, 16.0, 12.0, 30.0)
+#: How pages write the units of files.
+UNITS = {"um": "\N{MICRO SIGN}m", "urad": "\N{MICRO SIGN}rad"}
 
 
 @dataclass(frozen=True)

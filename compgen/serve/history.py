@@ -22,7 +22,7 @@ from compgen.recal.records import (
     TableRecord,
 )
 from compgen.recal.store import Store
-from compgen.serve.chart import Chart, Series, chart
+from compgen.serve.chart import UNITS, Chart, Series, chart
 
 #: Expanded uncertainty: this many standard uncertainties, about 95 %.
 COVERAGE = 2.0
@@ -125,7 +125,7 @@ def _trend(name: str, found: Sequence[tuple[datetime, ErrorTable]]) -> Trend:
         spread[-1],
         values[-1] - values[-2] if len(values) > 1 else None,
         values[-1] - values[0] if len(values) > 1 else None,
-        chart(f"{name}, {what}, {error.unit}", [series], time_ticks(times)),
+        chart(f"{name}, {what}, {UNITS[error.unit]}", [series], time_ticks(times)),
     )
 
 

@@ -20,7 +20,7 @@ from compgen.recal.records import (
     TableRecord,
 )
 from compgen.recal.store import Store
-from compgen.serve.chart import Chart, Series, chart
+from compgen.serve.chart import UNITS, Chart, Series, chart
 from compgen.serve.history import COVERAGE, ErrorCache
 
 #: Figures of the volume that are compared, and their names.
@@ -205,7 +205,7 @@ def _curve_chart(name: str, now: ErrorTable, old: Mapping[str, Any]) -> Chart | 
     if name in old:
         other = old[name]
         series.append(Series("behind the active tables", other.position_mm.tolist(), (other.value * factor).tolist()))
-    return chart(f"{name}, {error.unit} over {'XYZ'[error.axis]}, mm", series)
+    return chart(f"{name}, {UNITS[error.unit]} over {'XYZ'[error.axis]}, mm", series)
 
 
 def file_views(store: Store, table: TableRecord, active: TableRecord | None) -> list[FileView]:
