@@ -40,12 +40,12 @@ def advice_of(analysis: Analysis, verdict: Verdict) -> tuple[str, ...]:
 
 def relatives(scene: Scene, group: int, known: Sequence[str]) -> list[str]:
     """Names whose visible part is nearly that of a member."""
-    place = scene.place(group)
+    rows = scene.rows([group])
     found: dict[str, float] = {}
     for g, other in enumerate(scene.groups):
         if other.tier != "named" or other.name in known or other.name == scene.groups[group].name or not scene.size(g):
             continue
-        between = np.linalg.svd(scene.gram[place, scene.place(g)], compute_uv=False)
+        between = np.linalg.svd(rows[:, scene.place(g)], compute_uv=False)
         found[other.name] = max(
             found.get(other.name, 0.0), float(between[: min(scene.size(g), scene.size(group))].min())
         )

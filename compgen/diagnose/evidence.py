@@ -112,7 +112,7 @@ def _directed(scene: Scene, chosen: Chosen) -> tuple[Remaining, ...]:
 def contribution(scene: Scene, chosen: Chosen, member: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Parameters (k,) of a member fitted beside the others, their covariance (k, k), and its raw contribution (n,)."""
     index = scene.coordinates(chosen.members)
-    solution, inverse = _solved(scene.gram[np.ix_(index, index)], scene.score[index])
+    solution, inverse = _solved(scene.rows(chosen.members)[:, index], scene.score[index])
     offsets = np.cumsum([0, *(scene.size(g) for g in chosen.members)])
     k = chosen.members.index(member)
     at, end = int(offsets[k]), int(offsets[k + 1])

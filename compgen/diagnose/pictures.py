@@ -51,7 +51,8 @@ def _where(found: Diagnosis) -> str:
     panels = _covariates(found)
     columns = 3
     rows = -(-len(panels) // columns)
-    figure, axes = pyplot.subplots(rows, columns, figsize=(10, 2.3 * rows), squeeze=False, layout="constrained")
+    figure, axes = pyplot.subplots(rows, columns, figsize=(10, 2.3 * rows), squeeze=False)
+    figure.subplots_adjust(left=0.07, right=0.99, top=1 - 0.1 / rows, bottom=0.22 / rows, hspace=0.45, wspace=0.28)
     for k, (label, values) in enumerate(panels):
         _panel(axes.flat[k], label, values, found)
     for k in range(len(panels), rows * columns):
@@ -106,7 +107,8 @@ def _volume(found: Diagnosis) -> str:
 
     position = found.analysis.fit.readings.position_mm
     rows = _some(len(position))
-    figure, axes = pyplot.subplots(2, 3, figsize=(10, 5.2), layout="constrained")
+    figure, axes = pyplot.subplots(2, 3, figsize=(10, 5.2))
+    figure.subplots_adjust(left=0.07, right=0.93, top=0.94, bottom=0.1, hspace=0.4, wspace=0.3)
     largest = float(np.quantile(np.abs(found.gap.residual_before_mm), 0.99)) / MM_PER_UM or 1.0
     shown: Any = None
     for row, (title, residual) in enumerate(
@@ -121,7 +123,7 @@ def _volume(found: Diagnosis) -> str:
             panel.set_xlabel(f"{'XYZ'[a]} in mm")
             panel.set_ylabel(f"{'XYZ'[b]} in mm")
             panel.set_title(title)
-    figure.colorbar(shown, ax=axes, label="residual in um", shrink=0.8)
+    figure.colorbar(shown, ax=axes, label="residual in um", shrink=0.8, pad=0.02)
     return _text_of(figure)
 
 
@@ -151,7 +153,8 @@ def _suspects(found: Diagnosis) -> str:
 
     ranked = suspects_of(found)
     chosen = {item.name for item in found.verdict.named}
-    figure, axes = pyplot.subplots(figsize=(7, 0.35 * len(ranked) + 1.0), layout="constrained")
+    figure, axes = pyplot.subplots(figsize=(7, 0.35 * len(ranked) + 1.0))
+    figure.subplots_adjust(left=0.28, right=0.97, top=0.97, bottom=0.15)
     names: Sequence[str] = [name for name, _, _ in ranked]
     colours = [AFTER if name in chosen else "#bbbbbb" for name in names]
     axes.barh(range(len(ranked)), [max(chi2, 0.5) for _, chi2, _ in ranked], color=colours)

@@ -1,4 +1,4 @@
-"""The whitened problem with the base model projected out: one Gram matrix on which all sets of groups are compared.
+"""The whitened problem with the base model projected out: products of columns on which all sets of groups are compared.
 
 Frisch-Waugh-Lovell: what the base model can do as well is invisible, so both residual and columns lose their part in
 the span of the base Jacobian first.
@@ -7,7 +7,7 @@ the span of the base Jacobian first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -32,7 +32,6 @@ class Scene:
     groups : the groups.
     start : first coordinate of each group, (groups + 1,).
     maps : matrix (k, k_visible) of each group from its coordinates to the parameters of its columns.
-    gram : products of all coordinates, (K, K).
     score : products with the residual, (K,).
     visible : share of each group that is left beside the base model (RMS over its columns), (groups,).
     residual : whitened residual without its part in the base model, (N,).
@@ -45,7 +44,6 @@ class Scene:
     groups: tuple[Group, ...]
     start: IntArray
     maps: tuple[FloatArray, ...]
-    gram: FloatArray
     score: FloatArray
     visible: FloatArray
     residual: FloatArray
@@ -53,6 +51,14 @@ class Scene:
     directions: FloatArray
     whiten: Whitener
     fit: BaseFit
+    _rows: dict[int, FloatArray] = field(default_factory=dict)
+
+    def rows(self, members: Sequence[int]) -> FloatArray:
+        """Products of the coordinates of ``members`` with all coordinates, (r, K), computed when first asked for."""
+        for g in members:
+            if g not in self._rows:
+                self._rows[g] = self.directions[:, self.place(g)].T @ self.directions
+        return np.vstack([self._rows[g] for g in members]) if members else np.zeros((0, len(self.score)))
 
     @property
     def total(self) -> float:
@@ -120,7 +126,6 @@ def scene_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Scene:
         tuple(groups),
         start,
         tuple(maps),
-        stacked.T @ stacked,
         stacked.T @ residual,
         np.array(visible),
         residual,
@@ -158,6 +163,8 @@ def _reduced(raw: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray,
 
     The raw columns are first made orthonormal, so that the singular values of what is left are shares.
     """
+    if raw.shape[1] == 1:
+        return _single(raw, left)
     norm = np.linalg.norm(raw, axis=0)
     norm[norm == 0.0] = 1.0
     square, vectors = np.linalg.eigh((raw / norm).T @ (raw / norm))
@@ -171,3 +178,12 @@ def _reduced(raw: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray,
     mapping = turn @ (axes[:, visible] / np.sqrt(share2[visible]))
     share = np.sum((left / norm) ** 2) / max(float(np.sum((raw / norm) ** 2)), 1e-300)
     return left @ mapping, mapping, float(np.sqrt(share))
+
+
+def _single(raw: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """The same for one column."""
+    whole, seen = float(np.linalg.norm(raw)), float(np.linalg.norm(left))
+    share = seen / whole if whole > 0.0 else 0.0
+    if share <= LEAST_VISIBLE:
+        return np.zeros((len(raw), 0)), np.zeros((1, 0)), share
+    return left / seen, np.array([[1.0 / seen]]), share

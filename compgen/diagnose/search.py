@@ -79,10 +79,11 @@ def beside(scene: Scene, members: Sequence[int]) -> Beside:
     index = scene.coordinates(members)
     if not len(index):
         return Beside(np.zeros((0, len(scene.score))), scene.score, 0.0)
-    square, vectors = np.linalg.eigh(scene.gram[np.ix_(index, index)])
+    rows = scene.rows(members)
+    square, vectors = np.linalg.eigh(rows[:, index])
     kept = square > LEAST_SQUARE
     turn = vectors[:, kept] / np.sqrt(square[kept])
-    cross = turn.T @ scene.gram[index]
+    cross = turn.T @ rows
     own = turn.T @ scene.score[index]
     return Beside(cross, scene.score - own @ cross, float(own @ own))
 
