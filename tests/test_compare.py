@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -483,3 +484,14 @@ def test_identified_lengths_compare_and_other_targets_are_refused(
     capsys.readouterr()
     assert call("compare", name, before, cut, "--out", tmp_path / "no") == 2
     assert "--align model" in capsys.readouterr().err
+
+
+def test_foreign_files_are_evaluated_as_they_are(machine, tmp_path):
+    """The ecmc file of the import tests holds the worked example of ISO 230-2 along X."""
+    source = Path(__file__).parent / "golden" / "imports" / "ecmc_ISO230.dat"
+    assert call("import", source, "--axis", "X", "--out", tmp_path / "imported") == 0
+    found = next((tmp_path / "imported").glob("*.axis.csv"))
+    assert call("accuracy", machine.source, found, "--out", tmp_path / "out") == 0
+    figures = json.loads((tmp_path / "out" / "accuracy.json").read_text())["figures"]["X"]
+    worked = {"B": 4.0, "M": 8.0, "R": 13.0, "E": 12.0, "A": 19.0, "VDI P": 23.0}
+    assert {key: figures[key]["value"] for key in worked} == pytest.approx(worked, abs=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from compgen.core.axis_runs import AxisRuns
 from compgen.core.csvio import FloatArray, read_csv
 from compgen.core.deviations import Deviations
 from compgen.core.error_table import ERROR_COLUMNS, ErrorTable
-from compgen.core.files import read_bytes, read_text, sha256_of
+from compgen.core.files import read_bytes, sha256_of
 from compgen.core.lengths import POSITION_COLUMNS, Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
@@ -37,8 +38,13 @@ from compgen.core.points import Points
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify import Identification, IdentifyOptions, identify_measurement, joint_covariance, read_measurement
 from compgen.identify.covariance import Covariance, read_covariance
+from compgen.identify.measurement import Measurement
 from compgen.verify import ReadTables
 
+#: Bytes that tell what a file is.
+_LOOKED_AT = 1_000_000
+#: Reads the files of one measurement, with the constants of a six-DOF instrument.
+Reader = Callable[[Sequence[str | Path], Path | None], Measurement | ErrorTable]
 PREDICTED_COLUMNS = ("ex_um", "ey_um", "ez_um")
 
 
@@ -78,7 +84,13 @@ class Side:
         return measured_field(self.machine, self.deviations, self.u_um)
 
 
-def read_side(machine: Machine, path: str | Path, instrument: Path | None = None, u_um: float | None = None) -> Side:
+def read_side(
+    machine: Machine,
+    path: str | Path,
+    instrument: Path | None = None,
+    u_um: float | None = None,
+    reader: Reader = read_measurement,
+) -> Side:
     """Read an error file, a measurement, or predicted errors at points (the output of ``compgen predict``).
 
     Parameters
@@ -87,9 +99,10 @@ def read_side(machine: Machine, path: str | Path, instrument: Path | None = None
     path : the file; its columns tell what it is.
     instrument : constants of a six-DOF instrument, for ``*.sixdof.csv``.
     u_um : standard uncertainty of measured deviations, um; default the file's own.
+    reader : of measurements; that of :mod:`compgen.imports` takes foreign files as well.
     """
     source = Path(path)
-    text = read_text(source)
+    text = read_bytes(source, _LOOKED_AT).decode("utf-8-sig", errors="replace")  # to tell the kind; readers are strict
     header = _header(text)
     if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
         errors = read_error_file(source)
@@ -97,7 +110,9 @@ def read_side(machine: Machine, path: str | Path, instrument: Path | None = None
     if set(PREDICTED_COLUMNS) <= header:
         return Side(machine, source, "predicted errors at points", predicted=_read_predicted(machine, source))
     holds_sixdof = "y_qd1_mm" in header
-    measurement = read_measurement([source], instrument if holds_sixdof else None)
+    measurement = reader([source], instrument if holds_sixdof else None)
+    if isinstance(measurement, ErrorTable):
+        return Side(machine, source, "errors", source=error_source(machine, measurement))
     if isinstance(measurement, AxisRuns):
         return Side(machine, source, "axis runs", runs=axis_statistics(measurement))
     if isinstance(measurement, Deviations):

@@ -26,6 +26,7 @@ from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.errors import InputError
+from compgen.imports import open_measurement
 from compgen.pipeline import provenance_of, write_all
 from compgen.report.accuracy_text import accuracy_table, comparison_table
 from compgen.verify import read_tables
@@ -140,7 +141,7 @@ def accuracy_command(
     placed = _alignment(alignment, rigid=remove_rigid_motion)
     with progress(quiet=as_json) as show:
         show("reading and evaluating")
-        side = read_side(machine, file, instrument, u_deviation_um)
+        side = read_side(machine, file, instrument, u_deviation_um, open_measurement)
         if side.runs is not None:
             found = accuracy_of_runs(side.runs, int(edition), budgets)
         else:
@@ -224,7 +225,7 @@ def compare_command(
     options = CompareOptions(align, placed, line, int(edition), budgets)
     with progress(quiet=as_json) as show:
         show("reading BEFORE and AFTER")
-        sides = [read_side(machine, path, instrument, u_deviation_um) for path in (before, after)]
+        sides = [read_side(machine, path, instrument, u_deviation_um, open_measurement) for path in (before, after)]
         show("comparing")
         found = _compared(machine, sides[0], sides[1], options, predicted, tables, controller)
     accepted = _accepted(found, expect)
