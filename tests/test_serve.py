@@ -242,7 +242,7 @@ def test_no_text_becomes_markup(site, path):
     tags.feed(answer.text)
     assert not tags.tags & {"script", "img", "iframe", "object", "embed", "base"}
     assert tags.dangerous == []
-    assert "{{7*7}}" in answer.text or "49" not in re.sub(r"<[^>]+>", "", answer.text) or factory.EVIL not in path
+    assert ("{{7*7}}" in answer.text) == (path.startswith(("/machines/4", "/?q=")) or path in ("/", "/audit"))
 
 
 def test_hostile_names_of_files_reach_no_header_and_no_path(site):

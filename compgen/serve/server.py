@@ -39,7 +39,7 @@ def run(settings: Settings) -> None:
     """Serve until SIGTERM or SIGINT; requests that are being answered are finished."""
     server = make_server(settings)
     signal.signal(signal.SIGTERM, _stop)
-    logs.info("serving", address=f"http://{settings.host}:{settings.port}/", decide=settings.decide)
+    logs.info("serving", address=f"http://{server.effective_host}:{server.effective_port}/", decide=settings.decide)
     try:
         server.run()
     finally:

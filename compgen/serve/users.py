@@ -8,11 +8,13 @@ from __future__ import annotations
 import json
 import os
 import re
+import secrets
 import tempfile
 import threading
 import unicodedata
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 from argon2 import PasswordHasher
@@ -36,7 +38,6 @@ class Users:
         self.path = path
         self._hasher = PasswordHasher()  # Argon2id with the parameters of RFC 9106, section 4, second choice
         self._slots = threading.BoundedSemaphore(AT_ONCE)
-        self._nobody = self._hasher.hash("a password that nobody has")
 
     def names(self) -> list[str]:
         """Return the names of all users."""
@@ -54,7 +55,7 @@ class Users:
             return False
         with self._slots:
             try:
-                right = self._hasher.verify(found or self._nobody, _normal(password))
+                right = self._hasher.verify(found or _nobody(), _normal(password))
             except (Argon2Error, InvalidHashError):
                 return False
         return right and found is not None
@@ -113,6 +114,12 @@ class Users:
             with suppress(OSError):
                 os.unlink(name)
             raise InputError(f"cannot be written: {error.strerror or error}", file=self.path) from error
+
+
+@cache
+def _nobody() -> str:
+    """Return a hash that is compared with where there is no user."""
+    return PasswordHasher().hash(secrets.token_urlsafe())
 
 
 def check_name(name: str) -> None:
