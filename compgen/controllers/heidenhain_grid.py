@@ -39,7 +39,7 @@ def spacing_mm(exponent: int) -> Decimal:
     >>> spacing_mm(16)
     Decimal('6.5536')
     """
-    return SPACING_UNIT_MM * 2**exponent
+    return SPACING_UNIT_MM * Decimal(2) ** exponent
 
 
 def widest_exponent(wanted_mm: float) -> int:

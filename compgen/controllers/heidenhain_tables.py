@@ -138,7 +138,7 @@ def _active(settings: HeidenhainSettings, table: TextTable, present: set[str]) -
     for row in table.rows:
         mark = row.cells.get(ACTIVE)
         if mark not in (None, "*"):
-            raise table.file.fail(f"column {ACTIVE} holds {mark[:20]!r}; '*' or nothing is due", row.line)  # type: ignore[index]
+            raise table.file.fail(f"column {ACTIVE} holds {str(mark)[:20]!r}; '*' or nothing is due", row.line)
         named = {}
         for column, cell in row.cells.items():
             if column not in (NUMBER_COLUMN, ACTIVE):

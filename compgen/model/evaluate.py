@@ -80,7 +80,7 @@ def volumetric_error_at(
     tool = tool_of(machine, tool_mm)
     each = None if tool.ndim == 1 else np.broadcast_to(tool, position.shape)
     tables = field_tables(machine, errors, tool if each is None else None)
-    if kernels.ready(len(position) >= _POINTS_FOR_KERNELS):
+    if kernels.ready(kernels.repeated(len(position)) or len(position) >= _POINTS_FOR_KERNELS):
         kernels.field_at(tables, position, each, result)
         return result
     for part in blocks(len(position)):
@@ -156,7 +156,7 @@ def volumetric_error_on_grid(
     if result.size == 0:
         return result
     at_levels = grid_tables(machine, errors, tool, levels)
-    if kernels.ready(result.size >= 3 * _GRID_FOR_KERNELS):
+    if kernels.ready(kernels.repeated(result.size // 3) or result.size >= 3 * _GRID_FOR_KERNELS):
         kernels.field_on_grid(at_levels, levels, result)
     else:
         _grid_by_rank(at_levels, levels, result)

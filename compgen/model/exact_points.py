@@ -45,7 +45,7 @@ def exact_error_at(
     tables, order = motion_tables(errors), passing_order(machine)
     squareness = np.array([errors.squareness.get(name, (0.0, 0.0))[0] for name in _SQUARENESS])
     tilt = travel_directions(machine, squareness)[0] - np.eye(3)
-    if kernels.ready(len(position) >= _POINTS_FOR_KERNELS):
+    if kernels.ready(kernels.repeated(len(position)) or len(position) >= _POINTS_FOR_KERNELS):
         kernels.exact_at(tables, order, tilt, position, tool, result)
         return result
     for part in blocks(len(position)):

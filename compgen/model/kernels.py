@@ -16,6 +16,9 @@ from compgen.core.csvio import FloatArray
 from compgen.model.tables import COORDINATES, AxisTable, AxisTables
 
 _COMPILED = "compgen.model.compiled"
+#: From the second evaluation of so many points or more in a process on, the kernels are loaded: more will follow.
+_LARGE = 500_000
+_large_calls: list[int] = []
 _ROW = 8  # numbers per group and interval
 
 
@@ -27,6 +30,13 @@ def ready(load: bool = False) -> bool:
         except ImportError:
             return False
     return _COMPILED in sys.modules
+
+
+def repeated(points: int) -> bool:
+    """Whether this is at least the second evaluation of many points in this process; each call counts."""
+    if points >= _LARGE and len(_large_calls) < 2:
+        _large_calls.append(points)
+    return points >= _LARGE and len(_large_calls) > 1
 
 
 def _axis(table: AxisTable, groups: tuple[int, ...]) -> tuple[Any, ...]:
