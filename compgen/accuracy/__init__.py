@@ -6,8 +6,9 @@ from compgen.accuracy.evaluate import Accuracy, accuracy_of_errors, accuracy_of_
 from compgen.accuracy.field import Field, aligned, volume_figures
 from compgen.accuracy.figure import ComparedFigure, Figure
 from compgen.accuracy.iso230_2 import PositioningTest, positioning_test
+from compgen.accuracy.match import compare_prediction, compare_sides, with_prediction
 from compgen.accuracy.runs import RunStatistics, axis_statistics, run_statistics
-from compgen.accuracy.sides import Side, compare_prediction, compare_sides, read_side, with_prediction
+from compgen.accuracy.sides import Side, read_side
 from compgen.accuracy.source import ErrorSource, error_source
 from compgen.accuracy.straightness import straightness
 from compgen.accuracy.vdi3441 import vdi_3441

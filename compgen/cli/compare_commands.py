@@ -18,8 +18,9 @@ from compgen.accuracy.compare import CompareOptions, Comparison
 from compgen.accuracy.evaluate import accuracy_of_errors, accuracy_of_runs
 from compgen.accuracy.field import Alignment
 from compgen.accuracy.iso230_2 import EDITIONS, LATEST
+from compgen.accuracy.match import compare_prediction, compare_sides, with_prediction
 from compgen.accuracy.pairing import ALIGN
-from compgen.accuracy.sides import Side, compare_prediction, compare_sides, read_side, with_prediction
+from compgen.accuracy.sides import Side, read_side
 from compgen.accuracy.straightness import LINES
 from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.core.files import OutputFolder
