@@ -156,7 +156,9 @@ def _with_notify(job: Job, command: str | None) -> Job:
 @click.option(
     "--poll-s", default=2.0, show_default=True, type=click.FloatRange(0.05, 3600), help="Look at the job file, s."
 )
-@click.option("--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus metrics on 127.0.0.1 at this port.")
+@click.option(
+    "--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus metrics on 127.0.0.1 at this port."
+)
 def watch_command(job: Job, poll_s: float, metrics_port: int | None) -> int:
     """Keep running: every machine by its schedule (without one every 5 minutes), until SIGTERM or Ctrl-C.
 
@@ -234,15 +236,23 @@ def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None
 @recal.command("history")
 @click.argument("machine", required=False)
 @job_option
+@click.option("--drift", is_flag=True, help="Show how MACHINE drifts instead: changes, trends, forecasts, steps.")
+@click.option("--report", default=None, metavar="FILE", type=_PATH, help="Write the drift as a page, with pictures.")
 @json_option
-def history_command(machine: str | None, job: Job, as_json: bool) -> int:
+def history_command(machine: str | None, job: Job, drift: bool, report: Path | None, as_json: bool) -> int:
     """Show everything that happened to MACHINE (default all): measurements, failures, decisions with who and why.
 
     \b
     Example:
       compgen recal history mill-1 --json
+      compgen recal history mill-1 --drift --report mill-1.html
     """
     from compgen.recal.overview import history
+
+    if drift or report is not None:
+        from compgen.cli.recal_drift_commands import show_drift
+
+        return int(opened(job, lambda store: show_drift(store, job, machine, report, as_json=as_json)))
 
     if machine is not None:
         job.machine(machine)

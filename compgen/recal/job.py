@@ -14,6 +14,7 @@ from compgen.controllers import CONTROLLERS
 from compgen.core import tomlio
 from compgen.core.files import read_bytes, sha256_of
 from compgen.core.machine import load_machine
+from compgen.core.names import ERROR_NAMES, MM_PER_UM, error_named
 from compgen.core.text import nearest
 from compgen.core.tomlio import Section
 from compgen.errors import InputError
@@ -54,7 +55,8 @@ class MachineJob:
     """How one machine is recalibrated; paths are absolute.
 
     ``measured_with`` says what was active while the machine was measured: the tables that were active then ("active")
-    or none ("bare"); a measurement file may say otherwise for itself.
+    or none ("bare"); a measurement file may say otherwise for itself. ``tolerances`` are those of the drift, mm or rad,
+    by error or "volume".
     """
 
     name: str
@@ -73,6 +75,7 @@ class MachineJob:
     settle_s: float = 0.0
     policy: Policy = Policy()
     identify: Mapping[str, Any] = field(default_factory=dict)
+    tolerances: Mapping[str, float] = field(default_factory=dict)
 
     def settings_sha256(self) -> str:
         """Return the SHA-256 of everything but the measurement that a result depends on."""
@@ -203,6 +206,7 @@ def _options(keys: _Keys, folder: Path, name: str) -> dict[str, Any]:
         "settle_s": keys.take("settle_s", tomlio.not_negative, 0.0),
         "policy": _policy(keys.section("policy")),
         "identify": _identify(keys.section("identify")),
+        "tolerances": _tolerances(keys.section("tolerances")),
     }
 
 
@@ -238,6 +242,14 @@ def _identify(keys: _Keys) -> dict[str, Any]:
     found["temperature"] = keys.take("temperature", tomlio.flag, True)
     keys.finish()
     return {name: value for name, value in found.items() if value is not None}
+
+
+def _tolerances(keys: _Keys) -> dict[str, float]:
+    units = {f"{name}_{error_named(name).unit}": (name, error_named(name).si_per_unit) for name in ERROR_NAMES}
+    units["volume_um"] = ("volume", MM_PER_UM)
+    given = {units[key][0]: (keys.take(key, tomlio.positive, None), units[key][1]) for key in units}
+    keys.finish()
+    return {name: size * unit for name, (size, unit) in given.items() if size is not None}
 
 
 def _confidence(value: Any) -> float:
