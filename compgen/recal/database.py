@@ -39,7 +39,7 @@ def engine_of(url: str) -> sa.Engine:
     if kind != "sqlite" or not parsed.database or parsed.database == ":memory:":
         raise InputError(f"{shown(url)} is not a store; give sqlite:///FILE or postgresql://HOST/NAME")
     Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
-    engine = sa.create_engine(parsed, connect_args={"timeout": BUSY_S}, poolclass=sa.pool.NullPool)
+    engine = sa.create_engine(parsed, connect_args={"timeout": BUSY_S}, poolclass=sa.pool.QueuePool, pool_size=2)
     event.listen(engine, "connect", _configure_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine

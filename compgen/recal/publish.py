@@ -33,15 +33,20 @@ KEPT = 3
 
 
 def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord | None:
-    """Make the folder what the store says and return the active tables; InputError if it cannot be written."""
+    """Make the folder what the store says and return the active tables; InputError if it cannot be written.
+
+    Files of the active and the proposed versions that are missing or altered are put back; those of a retired version
+    when it becomes active again.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder):
             tables = store.tables(machine)
             _remove_leftovers(folder)
             for table in tables:
-                if table.state in ("active", "retired"):
-                    _complete(store, machine, table, folder / version_name(table))
+                wanted = folder / version_name(table)
+                if table.state == "active" or (table.state == "retired" and not wanted.exists()):
+                    _complete(store, machine, table, wanted)
             active = next((table for table in tables if table.state == "active"), None)
             _point(folder, active)
             _propose(store, machine, tables, folder / PROPOSED)
