@@ -6,7 +6,7 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -93,6 +93,12 @@ class Job:
     path: Path
     store: str
     machines: Mapping[str, MachineJob]
+
+    def with_notify(self, command: tuple[str, ...]) -> Job:
+        """Return the job with this notification command for all machines; an empty one changes nothing."""
+        if not command:
+            return self
+        return replace(self, machines={name: replace(item, notify=command) for name, item in self.machines.items()})
 
     def machine(self, name: str) -> MachineJob:
         """Return one machine; InputError names the nearest if there is none of that name."""
