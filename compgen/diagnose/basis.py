@@ -19,6 +19,8 @@ from compgen.model.observability import modelled_errors
 
 #: Degree of the curves, if there are enough levels.
 DEGREE = 7
+#: A position this near a node is at it, mm.
+SAME_MM = 1e-3
 #: Nodes beyond this are not tried as a richer basis.
 MOST_NODES = 40
 
@@ -119,11 +121,18 @@ def first_basis(machine: Machine, position_mm: FloatArray, readings: int, poses:
     errors = base_errors(machine)
     curves = sum(name not in SQUARENESS_NAMES for name in errors)
     most = max(2, int(min(readings, 3 * poses) / 4 / max(curves, 1)))
-    degree = []
+    degree, nodal = [], []
     for axis in range(3):
-        levels = len(np.unique(np.round(position_mm[:, axis], 3)))
-        degree.append(max(1, min(DEGREE, levels - 1, most)))
-    return CurveBasis(machine, errors, (degree[0], degree[1], degree[2]))
+        levels = np.unique(np.round(position_mm[:, axis], 3))
+        degree.append(max(1, min(DEGREE, len(levels) - 1, most)))
+        nodal.append(len(levels) <= min(most, MOST_NODES) and _at_nodes(machine, axis, levels))
+    return CurveBasis(machine, errors, (degree[0], degree[1], degree[2]), (nodal[0], nodal[1], nodal[2]))
+
+
+def _at_nodes(machine: Machine, axis: int, levels_mm: FloatArray) -> bool:
+    """Whether an axis was measured at nodes of the machine file only: then its curves are free at every level."""
+    nodes = machine.axes[axis].nodes_mm
+    return len(levels_mm) > 2 and bool(np.all(np.abs(levels_mm[:, None] - nodes).min(axis=1) < SAME_MM))
 
 
 def richer(basis: CurveBasis, axis: int) -> CurveBasis | None:
