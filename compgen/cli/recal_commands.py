@@ -77,6 +77,15 @@ def _job_options(command: Any) -> Any:
     return file(logged)
 
 
+notify_option = click.option(
+    "--notify",
+    "command",
+    default=None,
+    metavar="COMMAND",
+    help="Command that gets one JSON object on stdin for every decision and failure; default: that of the job file.",
+)
+
+
 def opened(job: Job, use: Callable[[Store], Any]) -> Any:
     """Do something with the store of a job and close it."""
     from compgen.recal.store import open_store
@@ -110,7 +119,7 @@ def _actor(name: str | None) -> str:
 @recal.command("run")
 @click.argument("machines", nargs=-1)
 @job_option
-@click.option("--notify", "command", default=None, metavar="COMMAND", help="Command that gets JSON on stdin, see docs.")
+@notify_option
 @json_option
 def run_command(machines: tuple[str, ...], job: Job, command: str | None, as_json: bool) -> int:
     """Look once into the inboxes of MACHINES (default all), process what is new, publish the tables.
@@ -123,7 +132,7 @@ def run_command(machines: tuple[str, ...], job: Job, command: str | None, as_jso
     """
     from compgen.recal.runner import run_jobs
 
-    result = run_jobs(_with_notify(job, command), machines)
+    result = run_jobs(job.with_notify(_words(command)), machines)
     if as_json:
         print_json(result.summary())
         return result.exit_code
@@ -137,18 +146,13 @@ def run_command(machines: tuple[str, ...], job: Job, command: str | None, as_jso
     return result.exit_code
 
 
-def _with_notify(job: Job, command: str | None) -> Job:
-    from dataclasses import replace
-
+def _words(command: str | None) -> tuple[str, ...]:
     from compgen.recal.job import command_words
 
-    if command is None:
-        return job
     try:
-        words = command_words(command)
+        return () if command is None else command_words(command)
     except ValueError as error:
         raise InputError(str(error), field="--notify") from error
-    return replace(job, machines={name: replace(item, notify=words) for name, item in job.machines.items()})
 
 
 @recal.command("watch")
@@ -159,7 +163,8 @@ def _with_notify(job: Job, command: str | None) -> Job:
 @click.option(
     "--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus metrics on 127.0.0.1 at this port."
 )
-def watch_command(job: Job, poll_s: float, metrics_port: int | None) -> int:
+@notify_option
+def watch_command(job: Job, poll_s: float, metrics_port: int | None, command: str | None) -> int:
     """Keep running: every machine by its schedule (without one every 5 minutes), until SIGTERM or Ctrl-C.
 
     Edits of the job file are picked up; a wrong one is reported and the one before stays. On a signal the measurement
@@ -171,8 +176,9 @@ def watch_command(job: Job, poll_s: float, metrics_port: int | None) -> int:
     """
     from compgen.recal.watch import Watch
 
+    words = _words(command)
     if metrics_port is None:
-        Watch(job.path, poll_s=poll_s).run()
+        Watch(job.path, poll_s=poll_s, notify=words).run()
         return 0
     from compgen.recal.store import open_store
     from compgen.serve.metrics import WatchMetrics, start_metrics
@@ -181,7 +187,7 @@ def watch_command(job: Job, poll_s: float, metrics_port: int | None) -> int:
     metrics = WatchMetrics(store)
     _, stop = start_metrics(metrics.text, metrics_port)
     try:
-        Watch(job.path, poll_s=poll_s, on_outcome=metrics.count).run()
+        Watch(job.path, poll_s=poll_s, notify=words, on_outcome=metrics.count).run()
     finally:
         stop()
         store.close()

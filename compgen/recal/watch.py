@@ -51,7 +51,10 @@ def _listed(numbers: tuple[int, ...]) -> str:
 
 
 class Watch:
-    """Keeps a job running; ``on_outcome`` is told of every pass over a machine, ``threads`` passes run at once."""
+    """Keeps a job running; ``on_outcome`` is told of every pass over a machine, ``threads`` passes run at once.
+
+    ``notify`` is a command in place of those of the job file.
+    """
 
     def __init__(
         self,
@@ -61,8 +64,10 @@ class Watch:
         threads: int = 1,
         on_outcome: Callable[[MachineOutcome], None] = lambda _: None,
         poll_s: float = POLL_S,
+        notify: tuple[str, ...] = (),
     ) -> None:
         self.path, self.work, self.on_outcome, self.poll_s = path, work, on_outcome, poll_s
+        self.notify = notify
         self.stopped = threading.Event()
         self.job: Job | None = None
         self._content = b""
@@ -93,7 +98,7 @@ class Watch:
 
     def _load(self) -> None:
         content = read_bytes(self.path)
-        job = job_of_text(content.decode("utf-8-sig", "replace"), self.path)
+        job = job_of_text(content.decode("utf-8-sig", "replace"), self.path).with_notify(self.notify)
         self._schedule(job)
         self.job, self._content = job, content
 
