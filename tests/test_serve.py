@@ -6,6 +6,7 @@ import json
 import re
 import sys
 import tempfile
+from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from compgen.recal import decisions
 from compgen.recal.store import open_store
 from compgen.serve import limits, sessions
 from compgen.serve.app import make_app
+from compgen.serve.fleet import fleet
 from compgen.serve.settings import Settings, check_settings, default_users
 from compgen.serve.users import Users
 
@@ -123,6 +125,26 @@ def test_the_fleet_shows_every_machine_with_its_status(site):
         assert f">{status}</span>" in text
     assert 'href="/machines/1/tables/3"' in text
     assert "5 machines" in re.sub(r"<[^>]+>", "", text)
+
+
+def test_the_summary_of_the_database_is_that_of_the_decisions_one_by_one(site):
+    """The overview sums up in the database; the states of the store follow each decision."""
+    evil, mill = site.store.machine(factory.EVIL[:150]), site.store.machine("mill-1")
+    decisions.rollback(site.store, evil, "meyer", "none", to=0)
+    decisions.approve(site.store, mill, 3, "meyer")
+    decisions.rollback(site.store, mill, "meyer", "back", to=1)
+    found = fleet(site.store)
+    tables = site.store.tables()
+    assert {state: n for state, n in found.states.items() if n} == Counter(table.state for table in tables)
+    for row in found.rows:
+        own = [table for table in tables if table.machine_id == row.machine.id]
+        assert row.active == next((table.version for table in own if table.state == "active"), None)
+        assert row.waiting == [table.version for table in own[::-1] if table.state in ("pending", "held")]
+        assert row.newest == (own[-1].state if own else None)
+        times = [m.measured_at for m in site.store.measurements(row.machine)]
+        assert (row.measured_at, row.measurements) == (max(times), len(times))
+        made = [d for d in site.store.decisions(row.machine) if d.kind in ("approve", "rollback")]
+        assert row.active_since == (made[-1].at if made and row.active else None)
 
 
 def test_the_fleet_is_searched_by_name_and_by_status(site):

@@ -12,11 +12,14 @@ import sqlalchemy as sa
 
 from compgen.recal import schema
 from compgen.recal.records import DecisionRecord, MachineRecord, TableState
-from compgen.recal.states import OPEN, active_id, state_of
+from compgen.recal.results import AUTOMATIC
+from compgen.recal.states import AFTER, OPEN
 from compgen.recal.store import Store
 
 #: Machines on one page.
 PAGE = 100
+#: Decisions on one page of the audit trail.
+AUDIT = 200
 #: What is wrong with a machine or waits, the most urgent first, and how it is called.
 STATUSES = {
     "failed": "failed",
@@ -30,92 +33,133 @@ STATUSES = {
 
 @dataclass(frozen=True)
 class FleetRow:
-    """One machine: its active version and since when, open versions by state, newest measurement, last failure."""
+    """One machine, as far as the overview shows it.
+
+    ``waiting`` are the versions that wait for a person, newest first, ``pending`` whether one of them is not held back;
+    ``newest`` is the state of the newest version; ``failure`` says why the last attempt failed, if it did.
+    """
 
     machine: MachineRecord
     active: int | None
     active_since: datetime | None
-    states: Mapping[int, TableState]
+    waiting: Sequence[int]
+    pending: bool
+    newest: TableState | None
     measured_at: datetime | None
     measurements: int
     failure: str
-
-    @property
-    def waiting(self) -> list[int]:
-        """Versions that wait for a person, the newest first."""
-        return sorted((version for version, state in self.states.items() if state in OPEN), reverse=True)
 
     @property
     def status(self) -> str:
         """The most urgent of :data:`STATUSES`."""
         if self.failure:
             return "failed"
-        newest = self.states.get(max(self.states)) if self.states else "new"
-        if newest in ("held", "refused"):
-            return newest
-        if "pending" in self.states.values():
+        if self.newest in ("held", "refused"):
+            return str(self.newest)
+        if self.pending:
             return "pending"
         return "ok" if self.active is not None else "new"
 
 
-def fleet(store: Store) -> list[FleetRow]:
-    """Return all machines by name, in one transaction."""
-    found = store.read(_everything)
-    decided: dict[int, list[DecisionRecord]] = {}
-    for row in found["decisions"]:
-        decided.setdefault(row.machine_id, []).append(DecisionRecord(*row))
-    tables: dict[int, dict[int, int]] = {}
-    for row in found["tables"]:
-        tables.setdefault(row.machine_id, {})[row.id] = row.version
-    measured = {row.machine_id: (row.last, row.count) for row in found["measurements"]}
-    failures = {row.machine_id: row.message for row in found["attempts"] if row.outcome == "failed"}
-    rows = []
-    for row in found["machines"]:
-        machine = MachineRecord(*row)
-        last, count = measured.get(machine.id, (None, 0))
-        own, versions = decided.get(machine.id, []), tables.get(machine.id, {})
-        rows.append(_row(machine, own, versions, (last, count), failures.get(machine.id, "")))
-    return rows
+@dataclass(frozen=True)
+class Fleet:
+    """All machines by name, and how many sets of tables are in each state."""
+
+    rows: Sequence[FleetRow]
+    states: Mapping[TableState, int]
+
+
+def fleet(store: Store) -> Fleet:
+    """Return the fleet, in one transaction; the database sums up, so that few rows come per machine."""
+    found = store.read(lambda connection: {name: connection.execute(q).all() for name, q in _queries().items()})
+    active = {row.machine_id: row for row in found["active"]}
+    newest = {row.machine_id: AFTER[row.kind] for row in found["newest"]}
+    measured = {row.machine_id: (row.last, row.number) for row in found["measurements"]}
+    failures = {row.machine_id: row.message for row in found["failures"]}
+    waiting: dict[int, list[Any]] = {}
+    for row in found["open"]:
+        waiting.setdefault(row.machine_id, []).append(row)
+    rows = [
+        _row(MachineRecord(*row), active.get(row.id), waiting.get(row.id, []), newest.get(row.id),
+             measured.get(row.id, (None, 0)), failures.get(row.id, ""))
+        for row in found["machines"]
+    ]  # fmt: skip
+    states: Counter[TableState] = Counter()
+    for row in found["kinds"]:
+        states[AFTER[row.kind]] += row.number
+    now = sum(row.active is not None for row in rows)
+    states["retired"], states["active"] = states["active"] - now, now
+    return Fleet(rows, states)
 
 
 def _row(
     machine: MachineRecord,
-    decisions: Sequence[DecisionRecord],
-    versions: Mapping[int, int],
+    active: Any,
+    waiting: Sequence[Any],
+    newest: TableState | None,
     measured: tuple[datetime | None, int],
     failure: str,
 ) -> FleetRow:
-    by_table: dict[int | None, list[DecisionRecord]] = {}
-    for decision in decisions:
-        by_table.setdefault(decision.table_id, []).append(decision)
-    active = active_id(decisions)
-    states: dict[int, TableState] = {}
-    for table_id, version in versions.items():
-        state = state_of(table_id, by_table.get(table_id, []))
-        states[version] = "retired" if state == "active" and table_id != active else state
-    since = next((d.at for d in reversed(decisions) if d.kind in ("approve", "rollback")), None)
-    current = None if active is None else versions.get(active)
-    return FleetRow(machine, current, since if current is not None else None, states, *measured, failure)
+    version = None if active is None else active.version
+    since = None if version is None else active.at
+    if newest == "active" and (active is None or active.newest != version):
+        newest = "retired"
+    versions = sorted((row.version for row in waiting), reverse=True)
+    pending = any(AFTER[row.kind] == "pending" for row in waiting)
+    return FleetRow(machine, version, since, versions, pending, newest, *measured, failure)
 
 
-def _everything(connection: sa.Connection) -> dict[str, Sequence[Any]]:
-    machines, tables, decisions = schema.machines, schema.tables, schema.decisions
-    measured, attempts = schema.measurements, schema.attempts
+def _queries() -> dict[str, sa.Select[Any]]:
+    machines, measured, attempts = schema.machines, schema.measurements, schema.attempts
     last = sa.select(sa.func.max(attempts.c.id)).group_by(attempts.c.machine_id)
-    queries: dict[str, sa.Select[Any]] = {
+    time = sa.func.max(measured.c.measured_at, type_=schema.UtcTime()).label("last")
+    state = _last_decisions().subquery()
+    top = sa.select(schema.tables.c.machine_id, sa.func.max(schema.tables.c.version).label("version"))
+    newest = top.group_by(schema.tables.c.machine_id).subquery()
+    is_newest = sa.and_(newest.c.machine_id == state.c.machine_id, newest.c.version == state.c.version)
+    return {
         "machines": sa.select(machines).order_by(machines.c.name),
-        "tables": sa.select(tables.c.id, tables.c.machine_id, tables.c.version),
-        "decisions": sa.select(decisions).order_by(decisions.c.machine_id, decisions.c.sequence),
-        "measurements": sa.select(
-            measured.c.machine_id,
-            sa.func.max(measured.c.measured_at, type_=schema.UtcTime()).label("last"),
-            sa.func.count().label("count"),
-        ).group_by(measured.c.machine_id),
-        "attempts": sa.select(attempts.c.machine_id, attempts.c.outcome, attempts.c.message).where(
-            attempts.c.id.in_(last)
+        "active": _active(newest),
+        "open": sa.select(state).where(state.c.kind.in_([kind for kind, after in AFTER.items() if after in OPEN])),
+        "newest": sa.select(state).join(newest, is_newest),
+        "kinds": sa.select(state.c.kind, sa.func.count().label("number")).group_by(state.c.kind),
+        "measurements": sa.select(measured.c.machine_id, time, sa.func.count().label("number")).group_by(
+            measured.c.machine_id
+        ),
+        "failures": sa.select(attempts.c.machine_id, attempts.c.message).where(
+            attempts.c.id.in_(last), attempts.c.outcome == "failed"
         ),
     }
-    return {name: connection.execute(query).all() for name, query in queries.items()}
+
+
+def _last_decisions() -> sa.Select[Any]:
+    """Machine, version and kind of the last decision about each set of tables."""
+    tables, decisions = schema.tables, schema.decisions
+    last = (
+        sa.select(decisions.c.machine_id, sa.func.max(decisions.c.sequence).label("sequence"))
+        .where(decisions.c.table_id.is_not(None))
+        .group_by(decisions.c.machine_id, decisions.c.table_id)
+        .subquery()
+    )
+    same = sa.and_(decisions.c.machine_id == last.c.machine_id, decisions.c.sequence == last.c.sequence)
+    query = sa.select(tables.c.machine_id, tables.c.version, decisions.c.kind)
+    return query.select_from(last).join(decisions, same).join(tables, tables.c.id == decisions.c.table_id)
+
+
+def _active(newest: sa.Subquery) -> sa.Select[Any]:
+    """Machine, active version (null if a rollback left none), since when, and the newest version."""
+    tables, decisions = schema.tables, schema.decisions
+    kinds = [kind for kind, after in AFTER.items() if after == "active"]
+    last = (
+        sa.select(decisions.c.machine_id, sa.func.max(decisions.c.sequence).label("sequence"))
+        .where(decisions.c.kind.in_(kinds))
+        .group_by(decisions.c.machine_id)
+        .subquery()
+    )
+    same = sa.and_(decisions.c.machine_id == last.c.machine_id, decisions.c.sequence == last.c.sequence)
+    query = sa.select(decisions.c.machine_id, tables.c.version, decisions.c.at, newest.c.version.label("newest"))
+    query = query.select_from(last).join(decisions, same).outerjoin(tables, tables.c.id == decisions.c.table_id)
+    return query.outerjoin(newest, newest.c.machine_id == decisions.c.machine_id)
 
 
 @dataclass(frozen=True)
@@ -143,3 +187,27 @@ def machine_by_id(store: Store, machine_id: int) -> MachineRecord | None:
     query = sa.select(schema.machines).where(schema.machines.c.id == machine_id)
     row = store.read(lambda connection: connection.execute(query).first())
     return None if row is None else MachineRecord(*row)
+
+
+@dataclass(frozen=True)
+class AuditPage:
+    """Decisions of one page, the newest first, each with machine and version; which page of how many it is."""
+
+    rows: Sequence[tuple[DecisionRecord, str, int | None]]
+    page: int
+    pages: int
+
+
+def audit_page(store: Store, page: int, *, people: bool) -> AuditPage:
+    """Return one page of the audit trail, with ``people`` only what persons decided."""
+    decisions, tables, machines = schema.decisions, schema.tables, schema.machines
+    who = decisions.c.actor != AUTOMATIC if people else sa.true()
+    count = store.read(lambda c: c.execute(sa.select(sa.func.count()).select_from(decisions).where(who)).scalar_one())
+    pages = max(1, -(-count // AUDIT))
+    page = min(max(page, 1), pages)
+    query = sa.select(decisions, machines.c.name.label("machine"), tables.c.version)
+    query = query.join(machines, machines.c.id == decisions.c.machine_id)
+    query = query.outerjoin(tables, tables.c.id == decisions.c.table_id).where(who)
+    query = query.order_by(decisions.c.at.desc(), decisions.c.id.desc()).limit(AUDIT).offset((page - 1) * AUDIT)
+    rows = store.read(lambda connection: connection.execute(query).all())
+    return AuditPage([(DecisionRecord(*row[:-2]), row.machine, row.version) for row in rows], page, pages)

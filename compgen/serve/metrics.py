@@ -38,22 +38,22 @@ class FleetCollector(Collector):
         """Return the gauges of the fleet."""
         up = GaugeMetricFamily("compgen_store_up", "Whether the store could be read.")
         try:
-            rows = fleet(self._store)
+            found = fleet(self._store)
         except CompgenError:
             up.add_metric([], 0.0)
             yield up
             return
         up.add_metric([], 1.0)
         yield up
+        rows = found.rows
         counts = Tally(row.status for row in rows)
         machines = GaugeMetricFamily("compgen_machines", "Machines by status.", labels=["status"])
         for status in STATUSES:
             machines.add_metric([status], counts[status])
         yield machines
-        states = Tally(state for row in rows for state in row.states.values())
         tables = GaugeMetricFamily("compgen_tables", "Sets of tables by state.", labels=["state"])
         for state in STATES:
-            tables.add_metric([state], states[state])
+            tables.add_metric([state], found.states.get(state, 0))
         yield tables
         measured = GaugeMetricFamily(
             "compgen_last_measurement_timestamp_seconds", "When the newest measurement was made.", labels=["machine"]

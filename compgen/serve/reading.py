@@ -11,7 +11,7 @@ from flask import Blueprint, Response, abort, current_app, render_template, requ
 from compgen.errors import CompgenError
 from compgen.recal.records import MachineRecord
 from compgen.resources import data_folder
-from compgen.serve.fleet import STATUSES, fleet, fleet_page, machine_by_id
+from compgen.serve.fleet import STATUSES, audit_page, fleet, fleet_page, machine_by_id
 from compgen.serve.history import history
 from compgen.serve.metrics import CONTENT_TYPE
 from compgen.serve.proposal import find_table, proposal
@@ -20,8 +20,6 @@ from compgen.serve.sessions import same
 
 pages = Blueprint("reading", __name__)
 NUMBER = "int(max=2147483647)"
-#: Decisions on one page of the audit trail.
-AUDIT = 200
 
 
 def own() -> Service:
@@ -51,7 +49,7 @@ def overview() -> str:
     """Show the fleet."""
     words, status = request.args.get("q", "")[:100], request.args.get("status", "")
     status = status if status in STATUSES else ""
-    page = fleet_page(fleet(own().store), words, status, _page_number())
+    page = fleet_page(fleet(own().store).rows, words, status, _page_number())
     return render_template("fleet.html", page=page, words=words, status=status)
 
 
@@ -90,21 +88,9 @@ def download(machine_id: int, version: int, position: int) -> Response:
 @pages.get("/audit")
 def audit() -> str:
     """Show who decided what, when and why, the newest first."""
-    store, number = own().store, _page_number()
-    decisions = sorted(store.decisions(), key=lambda item: (item.at, item.id), reverse=True)
-    if request.args.get("who") == "people":
-        decisions = [item for item in decisions if item.actor != "automatic"]
-    pages_there = max(1, -(-len(decisions) // AUDIT))
-    number = min(max(number, 1), pages_there)
-    return render_template(
-        "audit.html",
-        decisions=decisions[(number - 1) * AUDIT : number * AUDIT],
-        number=number,
-        pages=pages_there,
-        people=request.args.get("who") == "people",
-        names={item.id: item.name for item in store.machines()},
-        versions={item.id: item.version for item in store.tables(figures=False)},
-    )
+    people = request.args.get("who") == "people"
+    page = audit_page(own().store, _page_number(), people=people)
+    return render_template("audit.html", page=page, people=people)
 
 
 @pages.get("/metrics")
