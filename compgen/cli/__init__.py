@@ -16,6 +16,7 @@ from compgen.cli import (
     options_commands,
     plan_commands,
     recal_commands,
+    recal_drift_commands,
     report_commands,
     run_commands,
     safety_commands,
@@ -57,6 +58,7 @@ MODULES = (
     options_commands,
     safety_commands,
     recal_commands,
+    recal_drift_commands,
     serve_commands,
     listing_commands,
 )

@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compgen.cli.common import print_json, stdout
+import click
+
+from compgen.cli.common import json_option, print_json, stdout
+from compgen.cli.recal_commands import job_option, opened, recal
 from compgen.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,3 +52,65 @@ def _write(path: Path, drift: Drift) -> Path:
     from compgen.recal.history_report import write_history_report
 
     return write_history_report(path, drift)
+
+
+@recal.command("recheck")
+@click.argument("machine")
+@click.option("--stations", required=True, metavar="FILE", help="Stations file of compgen plan or identify.")
+@click.option("--error", required=True, metavar="NAME", help="Error whose change is to be seen, e.g. EC0Y.")
+@click.option("--change", required=True, type=float, metavar="SIZE", help="Its size, um or urad.")
+@click.option("--power", default=0.9, show_default=True, type=float, help="Probability of seeing it.")
+@click.option("--confidence", default=0.95, show_default=True, type=float, help="1 - probability of a false alarm.")
+@click.option("--points", default=None, metavar="FILE", type=click.Path(path_type=Path), help="Write a points file.")
+@job_option
+@json_option
+def recheck_command(
+    machine: str,
+    stations: str,
+    error: str,
+    change: float,
+    power: float,
+    confidence: float,
+    points: Path | None,
+    job: Job,
+    as_json: bool,
+) -> int:
+    """Find the fewest points at which tracers would see a change of one error of MACHINE since its last calibration.
+
+    \b
+    Example:
+      compgen recal recheck mill-1 --stations stations.csv --error EC0Y --change 10 --points recheck.points.csv
+    """
+    from compgen.core.names import ERROR_NAMES, error_named
+    from compgen.core.text import nearest
+    from compgen.plan import read_stations
+    from compgen.recal.drift_data import calibrations_of
+    from compgen.recal.recheck import Wanted, shortest_recheck, write_recheck_points
+
+    if error not in ERROR_NAMES:
+        raise InputError(f"{error!r} is not an error; {nearest(error, ERROR_NAMES)}", field="--error")
+    name = error_named(error)
+    wanted = Wanted(error, change * name.si_per_unit, power, confidence)
+    job.machine(machine)
+    history, _, model = opened(job, lambda store: calibrations_of(store, store.machine(machine)))
+    found = shortest_recheck(model, read_stations(stations), wanted, history[-1].covariance)
+    paths = [] if points is None else [str(write_recheck_points(points, found))]
+    if as_json:
+        print_json({"accepted": True, "paths": paths, **found.summary()})
+        return 0
+    u, smallest = found.u / name.si_per_unit, found.smallest / name.si_per_unit
+    stdout.print(
+        f"{len(found.position_mm)} points, {found.readings} readings: {error} to {u:.2f} {name.unit} (standard "
+        f"uncertainty); {change:g} {name.unit} is seen with power {found.power:.2f}, {smallest:.2f} {name.unit} with "
+        f"{power:g}",
+        soft_wrap=True,
+    )
+    for place in found.position_mm.tolist():
+        stdout.print("  " + ", ".join(f"{letter} {value:g} mm" for letter, value in zip("XYZ", place, strict=True)))
+    for path in paths:
+        stdout.print(path, soft_wrap=True, markup=False)
+    return 0
+
+
+#: Its commands belong to the group ``recal``.
+COMMANDS: tuple[click.Command, ...] = ()
