@@ -84,7 +84,7 @@ def least_norm(design: FloatArray, target: FloatArray) -> FloatArray:
     scale = np.linalg.norm(design, axis=0)
     scale[scale == 0.0] = 1.0
     q, r = np.linalg.qr(design / scale)
-    u, singular, vt = np.linalg.svd(r)
+    u, singular, vt = np.linalg.svd(r, full_matrices=False)
     kept = singular > LEAST_SINGULAR * singular[0]
     return np.asarray((vt[kept].T @ ((u[:, kept].T @ (q.T @ target)) / singular[kept])) / scale)
 

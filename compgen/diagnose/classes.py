@@ -13,7 +13,7 @@ from compgen.core.names import MM_PER_UM
 from compgen.diagnose.analysis import Analysis
 from compgen.diagnose.base import least_norm
 from compgen.diagnose.evidence import leftover
-from compgen.diagnose.layout import IntArray
+from compgen.diagnose.layout import IntArray, Layout
 from compgen.diagnose.result import Classed
 
 #: A reading further than so many standard deviations from its neighbours in time is gross; readings of 4600 without
@@ -23,6 +23,8 @@ GROSS = 6.5
 MOST_GROSS = 0.03
 #: Neighbours in time whose median a reading is compared with, itself among them.
 NEIGHBOURS = 5
+#: A gross reading moves the fit, and by it others: the largest are taken out first, and the fit is repeated.
+ROUNDS = 8
 #: Deviate of the slope of the variance against time that counts as a trend.
 TREND_Z = 6.0
 #: Share of readings that must lie on a grid of the step, and the least step over the noise.
@@ -37,13 +39,24 @@ def classes_of(analysis: Analysis, removed: int = 0) -> list[Classed]:
 
 def gross_readings(analysis: Analysis) -> IntArray:
     """Rows of readings that lie far from their neighbours when all that was found is taken off; none if they are many."""
-    from scipy.ndimage import median_filter  # imported here: slow to load
-
     fit, scene = analysis.fit, analysis.scene
     added = [scene.groups[g].columns @ scene.maps[g] for g in analysis.chosen.members]
     design = np.hstack([fit.jacobian, *added])
-    left = (fit.residual_mm - design @ least_norm(design, fit.residual_mm)) / analysis.noise.scale
-    layout = fit.observed.layout
+    kept = np.ones(len(design), dtype=bool)
+    for _ in range(ROUNDS):
+        left = fit.residual_mm - design @ least_norm(design[kept], fit.residual_mm[kept])
+        size = _apart(fit.observed.layout, left / analysis.noise.scale) * kept
+        if size.max() <= GROSS:
+            break
+        kept &= size < max(GROSS, 0.5 * float(size.max()))
+    found = np.flatnonzero(~kept)
+    return found if len(found) <= MOST_GROSS * len(design) else np.zeros(0, dtype=np.int64)
+
+
+def _apart(layout: Layout, left: FloatArray) -> FloatArray:
+    """Distance from the median of the neighbours in time at the same channel, in standard deviations, (n,)."""
+    from scipy.ndimage import median_filter  # imported here: slow to load
+
     apart = np.zeros_like(left)
     for channel in np.unique(layout.channel):
         rows = np.flatnonzero(layout.channel == channel)
@@ -51,9 +64,8 @@ def gross_readings(analysis: Analysis) -> IntArray:
         apart[rows] = left[rows] - median_filter(left[rows], NEIGHBOURS, mode="nearest")
     moved = np.abs(apart[apart != 0.0])
     if len(moved) < NEIGHBOURS * NEIGHBOURS:
-        return np.zeros(0, dtype=np.int64)
-    found = np.flatnonzero(np.abs(apart) > GROSS * 1.4826 * float(np.median(moved)))
-    return found if len(found) <= MOST_GROSS * len(left) else np.zeros(0, dtype=np.int64)
+        return np.zeros(len(left))
+    return np.asarray(np.abs(apart) / (1.4826 * float(np.median(moved))))
 
 
 def _outliers(removed: int) -> list[Classed]:

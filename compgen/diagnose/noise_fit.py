@@ -16,6 +16,8 @@ from compgen.diagnose.noise import Noise, Variances, fit_reml, packed, reml_prob
 LEAST_DIFFERENCES = 60
 #: Slope over its uncertainty above which the noise depends on range.
 RANGE_Z = 3.5
+#: Squares beyond so many times the variance are gross errors and count as this.
+FAR_OUT = 16.0
 #: Variance of single runs, as a share of the white one, below which it is not tested.
 LEAST_RUN_SHARE = 0.04
 
@@ -117,6 +119,7 @@ def range_scale(fit: BaseFit) -> FloatArray:
 
 def _scale_from(power: FloatArray, against: FloatArray, square: FloatArray) -> FloatArray:
     design = np.column_stack([np.ones(len(against)), against])
+    power = np.minimum(power, FAR_OUT * float(np.median(power)) / 0.455)  # 0.455: median of a squared normal deviate
     weight = np.ones(len(power))
     for _ in range(4):  # the variance of a squared normal deviate is twice the square of its mean
         coefficients = np.linalg.lstsq(design * weight[:, None], power * weight, rcond=None)[0]

@@ -99,7 +99,7 @@ def orthonormal(columns: FloatArray, least: float = 1e-9) -> FloatArray:
     norm = np.linalg.norm(columns, axis=0)
     kept = norm > 0
     q, r = np.linalg.qr(columns[:, kept] / norm[kept])
-    u, singular, _ = np.linalg.svd(r)
+    u, singular, _ = np.linalg.svd(r, full_matrices=False)
     return np.asarray(q @ u[:, singular > least * singular[0]])
 
 

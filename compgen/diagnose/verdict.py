@@ -19,8 +19,10 @@ Word = Literal["named", "none", "unknown", "not_decidable"]
 
 #: Names of which less than this is left beside the base model are never confirmed.
 LEAST_VISIBLE = 0.05
-#: A name is not confirmed if its chi-square is below this share of that of the generic members.
-LEAST_SHARE = 0.05
+#: A name is not confirmed if its chi-square is below this share of that of all members without a (firm) name.
+LEAST_SHARE = 0.1
+#: p-value of the homogeneity below which a name is not confirmed beside something that has no name.
+HOMOGENEITY_BESIDE_P = 0.01
 #: A further name whose chi-square is below this share of the largest one is listed as a possible secondary one.
 SECONDARY_SHARE = 0.005
 #: A generic group in the covariates of a name, with less than this share of its chi-square, is its inexact shape.
@@ -162,11 +164,12 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     name, chi2, p = scene.groups[group].name, evidence.chi2[group], evidence.homogeneity_p[group]
     visible = float(scene.visible[group])
     reasons = []
-    if p < HOMOGENEITY_P and not inexact:
+    if p < (HOMOGENEITY_BESIDE_P if generic else HOMOGENEITY_P) and not inexact:
         reasons.append(f"does not behave like it everywhere (p = {p:.1e})")
     if evidence.misfits and chi2 < evidence.excess:
         reasons.append("explains less than what remains unexplained")
-    if generic and chi2 < LEAST_SHARE * sum(evidence.chi2[g] for g in generic):
+    failed = [g for g, own in evidence.homogeneity_p.items() if g != group and own < HOMOGENEITY_P]
+    if generic and chi2 < LEAST_SHARE * sum(evidence.chi2[g] for g in (*generic, *failed)):
         reasons.append("small beside what has no name")
     if name in NEVER_CONFIRMED or visible < LEAST_VISIBLE:
         reasons.append(f"the plan shows {100 * visible:.1f} % of it only: any misfit could be reshaped into it")
