@@ -8,7 +8,22 @@ from compgen.recal.records import NewMeasurement, NewResult, TableFile
 from compgen.recal.store import open_store
 
 EVIL = "<script>document.title='broken'</script>\"'><img src=x onerror=alert(1)>{{7*7}}"
-MACHINE_TOML = b'name = "mill"\n'
+MACHINE_TOML = b"""\
+name = "mill"
+chain = "WFYXZT"
+tool_offset_mm = [0.0, 0.0, -80.0]
+reference_point_mm = [0.0, 0.0, 0.0]
+errors = ["EXX", "EC0Y"]
+[axes.X]
+range_mm = [0.0, 500.0]
+nodes = 6
+[axes.Y]
+range_mm = [0.0, 400.0]
+nodes = 5
+[axes.Z]
+range_mm = [-300.0, 0.0]
+nodes = 4
+"""
 BEGIN = datetime(2026, 1, 10, 8, 0, tzinfo=UTC)
 
 

@@ -43,6 +43,7 @@ STYLE = Path(__file__).resolve().parents[1] / "templates" / "_serve" / "style.cs
 PAGES = (
     "/",
     "/machines/1",
+    "/machines/1/drift",
     "/machines/1/tables/3",
     "/machines/4",
     "/machines/4/tables/2",
@@ -163,6 +164,18 @@ def test_the_drift_of_a_machine_is_that_of_its_errors(site):
     assert re.findall(r">([^<]+)</td>", row) == ["largest minus smallest", "8.00", "–", "+1.00", "+2.00", "µm"]
     assert "Chart: EC0Y" in text
     assert "Chart: Temperatures" in text
+
+
+def test_the_judged_drift_of_a_machine_is_shown_or_why_there_is_none(site):
+    """EC0Y is the one squareness error, so nothing but the gauge could hide its change: 3 and 6 urad, 2 * 0.8 * sqrt(2)."""
+    text = site.get("/machines/1/drift").text
+    row = re.search(r'<th scope="row">EC0Y</th>(.*?)</tr>', text)[1]
+    cells = re.findall(r">([^<]+)</td>", row)
+    assert (cells[0], cells[1], cells[3], cells[4], cells[6]) == ("+3.00", "2.26", "+6.00", "2.26", "µrad")
+    assert 0.0 < float(cells[2]) < 0.05
+    assert float(cells[5]) < float(cells[2])
+    assert site.get("/machines/1/drift").text == text
+    assert "measure it first" in site.get("/machines/5/drift").text
 
 
 def test_before_and_after_of_a_table_are_the_figures_of_the_store(site):
@@ -598,7 +611,7 @@ def test_a_login_leads_back_to_where_it_was_asked_for(site):
 
 def test_a_private_dashboard_shows_nothing_without_login(tmp_path):
     site = Site(tmp_path, private=True, metrics_token="0123456789abcdef")
-    for path in (*PAGES[:6], "/machines/1/tables/1/files/1", "/nowhere"):
+    for path in (*PAGES[:7], "/machines/1/tables/1/files/1", "/nowhere"):
         answer = site.get(path)
         assert answer.headers["Location"] == "/login"
         assert "mill" not in answer.text

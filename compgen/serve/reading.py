@@ -8,9 +8,10 @@ from urllib.parse import urlencode
 
 from flask import Blueprint, Response, abort, current_app, render_template, request
 
-from compgen.errors import CompgenError
+from compgen.errors import CompgenError, InputError
 from compgen.recal.records import MachineRecord
 from compgen.resources import data_folder
+from compgen.serve.drift_view import change_rows
 from compgen.serve.fleet import STATUSES, audit_page, fleet, fleet_page, machine_by_id
 from compgen.serve.history import history
 from compgen.serve.metrics import CONTENT_TYPE
@@ -58,6 +59,17 @@ def machine(machine_id: int) -> str:
     """Show one machine's history."""
     service = own()
     return render_template("machine.html", h=history(service.store, service.errors_of, the_machine(machine_id)))
+
+
+@pages.get(f"/machines/<{NUMBER}:machine_id>/drift")
+def drift(machine_id: int) -> str:
+    """Show which errors changed, which drift, and when they leave their tolerance."""
+    found = the_machine(machine_id)
+    try:
+        known = own().drift_of(found)
+    except InputError as error:
+        return render_template("drift.html", machine=found, problem=str(error))
+    return render_template("drift.html", machine=found, problem="", drift=known, rows=change_rows(known))
 
 
 @pages.get(f"/machines/<{NUMBER}:machine_id>/tables/<{NUMBER}:version>")

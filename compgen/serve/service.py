@@ -11,6 +11,7 @@ from compgen.recal import actions, decisions
 from compgen.recal.job import read_job
 from compgen.recal.records import DecisionRecord, MachineRecord
 from compgen.recal.store import Store
+from compgen.serve.drift_view import DriftCache
 from compgen.serve.history import ErrorCache
 from compgen.serve.limits import LoginLimit
 from compgen.serve.metrics import ServeMetrics
@@ -34,6 +35,7 @@ class Service:
     limit: LoginLimit
     metrics: ServeMetrics
     errors_of: ErrorCache
+    drift_of: DriftCache
 
 
 def make_service(settings: Settings, store: Store, clock: Callable[[], float] = time.monotonic) -> Service:
@@ -41,7 +43,8 @@ def make_service(settings: Settings, store: Store, clock: Callable[[], float] = 
     sessions = Sessions(clock)
     users = Users(settings.users) if settings.login and settings.users is not None else None
     metrics = ServeMetrics(store, lambda: len(sessions))
-    return Service(settings, store, users, sessions, LoginTokens(), LoginLimit(clock), metrics, ErrorCache(store))
+    shared = (sessions, LoginTokens(), LoginLimit(clock), metrics, ErrorCache(store), DriftCache(store))
+    return Service(settings, store, users, *shared)
 
 
 def approve(
