@@ -137,7 +137,7 @@ RIGHT: dict[str, tuple[tuple[str, ...], str, str]] = {
     "mixed": (("both",), "85", "95"),
     "alias": (("set",), "100", "100"),
     "invisible": (("listed",), "100", "100"),
-    "mismatch": (("exact",), "90", "97"),
+    "mismatch": (("exact", "exact, but flagged"), "90", "97"),
     "gross": (("found",), "100", "100"),
 }
 
