@@ -194,7 +194,8 @@ def test_held_tables_need_the_box_and_a_reason_before_the_browser_even_sends(pag
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/machines/1", "/machines/1/tables/3", "/machines/4", "/machines/4/tables/2", "/audit"]
+    "path",
+    ["/", "/machines/1", "/machines/1/drift", "/machines/1/tables/3", "/machines/4", "/machines/4/tables/2", "/audit"],
 )
 def test_no_page_complains_runs_a_text_or_asks_others(page, site, browser, path):
     page.login()
