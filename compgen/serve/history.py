@@ -147,7 +147,7 @@ def _temperatures(measurements: Sequence[MeasurementRecord]) -> Chart | None:
     return chart("Temperatures while measuring, \N{DEGREE SIGN}C", series, time_ticks(times))
 
 
-def time_ticks(times: Sequence[datetime], most: int = 6) -> list[tuple[float, str]]:
+def time_ticks(times: Sequence[datetime], most: int = 4) -> list[tuple[float, str]]:
     """Return days, evenly over the time, as (seconds, text); times of less than a day show the minute."""
     if not times:
         return []
