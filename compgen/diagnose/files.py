@@ -14,13 +14,18 @@ from compgen.diagnose.result import Diagnosis
 def diagnosis_files(found: Diagnosis) -> dict[str, str]:
     """Return the content of every file by its name."""
     files = {
-        "diagnosis.json": json.dumps(_strict(found.to_dict()), indent=2, allow_nan=False) + "\n",
+        "diagnosis.json": json_text(found.to_dict()),
         "diagnosis.md": summary(found),
         "index.html": page_of(found),
     }
     if found.verdict.named and found.machine.source is not None:
         files["extended.toml"] = found.extended()
     return files
+
+
+def json_text(data: Mapping[str, Any]) -> str:
+    """Return JSON text with null for numbers that are not known."""
+    return json.dumps(_strict(data), indent=2, allow_nan=False) + "\n"
 
 
 def _strict(value: Any) -> Any:

@@ -9,6 +9,7 @@ from compgen.core.axis_runs import AxisRuns, holds_axis_runs, read_axis_runs
 from compgen.core.deviations import Deviations, holds_deviations, read_deviations
 from compgen.core.lengths import Lengths, read_lengths
 from compgen.errors import InputError
+from compgen.sixdof.readings import holds_sixdof
 
 Measurement = Lengths | Deviations | AxisRuns
 
@@ -27,6 +28,9 @@ def read_diagnosed(paths: Sequence[str | Path]) -> Measurement:
 
 
 def _kind(path: str | Path) -> str:
+    if holds_sixdof(path):
+        message = "holds six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
+        raise InputError(message, file=path)
     if holds_axis_runs(path):
         return "axis runs"
     return "deviations" if holds_deviations(path) else "lengths"
