@@ -494,10 +494,10 @@ GARBAGE = [b"\n" * 10_000_000, b"A" * 100_000_000, b"0 " * 5_000_000, b"NR\n" * 
 @pytest.mark.parametrize("garbage", GARBAGE, ids=["lines", "one line", "numbers", "headers"])
 def test_garbage_is_refused_within_a_second(tmp_path, garbage):
     machine, text = machine_of(tmp_path), garbage.decode("ascii")
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(InputError) as caught:
         parse(machine, text)
-    assert time.perf_counter() - start < 1.0
+    assert time.process_time() - start < 1.0
     assert caught.value.line is not None
 
 

@@ -260,10 +260,10 @@ def test_a_sheet_that_was_cut_is_refused_wherever_it_was_cut(tmp_path):
 @pytest.mark.parametrize("garbage", ["\n" * 10_000_000, "A" * 100_000_000, "#4101,1,a\n" * 90_000, "#" * 900_000])
 def test_garbage_is_refused_within_a_second(tmp_path, garbage):
     machine = machine_of(tmp_path)
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(InputError) as caught:
         parse(machine, garbage)
-    assert time.perf_counter() - start < 1.0
+    assert time.process_time() - start < 1.0
     assert caught.value.line is not None
 
 

@@ -167,10 +167,10 @@ def test_malformed_text_is_refused(text, words):
 
 @pytest.mark.parametrize("text", ["\xff" * 30_000_000, "1,2\n" * 10_000_000, "[" * 25_000_000])
 def test_huge_garbage_is_refused_within_a_second(text):
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(InputError):
         parsed({"a.txt": text})
-    assert time.perf_counter() - start < 1.0
+    assert time.process_time() - start < 1.0
 
 
 @settings(max_examples=60, deadline=None)

@@ -269,10 +269,10 @@ def test_an_exported_file_that_is_cut_is_refused(make_errors):
     "text", ["\xff" * 30_000_000, "1\n" * 20_000_000, "#1\nDEFINE COMP 99999,1\n" + "7 " * 10_000_000]
 )
 def test_huge_garbage_is_refused_within_a_second(text):
-    start = time.perf_counter()
+    start = time.process_time()
     with pytest.raises(InputError):
         parsed(text)
-    assert time.perf_counter() - start < 1.0
+    assert time.process_time() - start < 1.0
 
 
 @settings(max_examples=60, deadline=None)
