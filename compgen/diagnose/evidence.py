@@ -40,6 +40,7 @@ class Evidence:
     directed : generic groups that are left over, best first.
     run_ratio : likelihood ratio of what changes from run to run.
     homogeneity_p : p-value of every named member, by its group.
+    uneven : chi-square that the unevenness of every named member explains, by its group.
     chi2 : drop-one chi-square of every member, by its group.
     excess : residual sum of squares beyond its expectation.
     """
@@ -48,6 +49,7 @@ class Evidence:
     directed: tuple[Remaining, ...]
     run_ratio: float
     homogeneity_p: dict[int, float]
+    uneven: dict[int, float]
     chi2: dict[int, float]
     excess: float
 
@@ -68,11 +70,13 @@ def evidence_of(scene: Scene, chosen: Chosen, noise: Noise, ratio: float, layout
     left = scene.total - chosen.chi2
     named = [g for g in chosen.members if scene.groups[g].tier == "named"]
     chi2 = {g: gain_of(scene, [m for m in chosen.members if m != g], g) for g in chosen.members}
+    even = {g: homogeneity(scene, chosen, g, layout) for g in named}
     return Evidence(
         _lack_of_fit(left, scene.freedom - size, noise),
         _directed(scene, chosen),
         ratio,
-        {g: homogeneity(scene, chosen, g, layout) for g in named},
+        {g: p for g, (p, _) in even.items()},
+        {g: gained for g, (_, gained) in even.items()},
         chi2,
         left - (scene.freedom - size),
     )
@@ -137,8 +141,8 @@ def leftover(scene: Scene, chosen: Chosen) -> FloatArray:
     return np.asarray(left * np.sqrt(scene.count / max(scene.count - used, 1)))
 
 
-def homogeneity(scene: Scene, chosen: Chosen, member: int, layout: Layout) -> float:
-    """p-value of the test that an effect has the same size everywhere.
+def homogeneity(scene: Scene, chosen: Chosen, member: int, layout: Layout) -> tuple[float, float]:
+    """p-value of the test that an effect has the same size everywhere, and the chi-square of its unevenness.
 
     Its contribution is multiplied by stations, quarters of the time, load, directions and position; a true effect
     leaves nothing for these products to explain, a wrong name that takes up part of something else does.
@@ -167,10 +171,10 @@ def homogeneity(scene: Scene, chosen: Chosen, member: int, layout: Layout) -> fl
     raw = np.linalg.norm(scene.whiten(columns), axis=0)
     kept = norm > 0.02 * np.maximum(raw, 1e-300)
     if not kept.any():
-        return 1.0
+        return 1.0, 0.0
     extra = orthonormal(white[:, kept], least=1e-4)
     gained = float(np.sum((extra.T @ residual) ** 2))
     k = extra.shape[1]
     freedom = max(scene.freedom - basis.shape[1] - k, 1)
     left = float(residual @ residual) - gained
-    return float(f_distribution.sf(gained / k / max(left / freedom, 1e-300), k, freedom))
+    return float(f_distribution.sf(gained / k / max(left / freedom, 1e-300), k, freedom)), gained

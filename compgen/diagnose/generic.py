@@ -137,7 +137,6 @@ def _load_terms(c: Covariates) -> Iterator[Term]:
 
 def _slow_terms(c: Covariates) -> Iterator[Term]:
     yield "time", ("time",), legendre(c.time, 4)[:, 1:], True, True
-    yield "waves in time", ("time",), legendre(c.time, 24)[:, 5:], True, False
     for a, letter in enumerate("xyz"):
         columns = _times(legendre(c.time, 2)[:, 1:], legendre(c.s[:, a], 2)[:, 1:])
         yield f"time with {letter}", ("time", letter), columns, True, True

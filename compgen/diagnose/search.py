@@ -178,7 +178,7 @@ def search(scene: Scene, rules: Rules, start: Sequence[int] = ()) -> Chosen:
         if beam[0].criterion >= best.criterion - 1e-6:
             break
         best = min(beam, key=lambda item: item.criterion)
-    return prune(scene, rules, _improved(scene, rules, best))
+    return with_names(scene, rules, prune(scene, rules, _improved(scene, rules, best)))
 
 
 def _improved(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:
@@ -194,6 +194,40 @@ def _improved(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:
             return chosen
         chosen = better
     return chosen
+
+
+#: A name that explains this share of what a generic group in its covariates explains takes its place.
+SAME_LAW = 0.93
+
+
+def with_names(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:
+    """Put names in place of generic groups that hold the same law with more freedom: a shape that is not quite exact."""
+    for generic in [g for g in chosen.members if scene.groups[g].tier == "generic"]:
+        rest = [g for g in chosen.members if g != generic]
+        own = plain_covariates(scene.groups[generic].covariates) - {"x", "y", "z"}
+        related = [
+            g
+            for g in _allowed(scene, rules, rest)
+            if scene.groups[g].tier == "named" and own and own <= plain_covariates(scene.groups[g].covariates)
+        ]
+        if not related:
+            continue
+        gained = gains(scene, beside(scene, rest), related)
+        best = int(np.argmax(gained))
+        if gained[best] > SAME_LAW * gain_of(scene, rest, generic):
+            chosen = evaluate(scene, rules, [*rest, related[best]])
+    return chosen
+
+
+def plain_covariates(names: tuple[str, ...]) -> set[str]:
+    """Covariates of a card or of a generic term in one spelling: ``x``, ``approach_x``, ``temperature``, ``time``."""
+    found = set()
+    for name in names:
+        word = (
+            name.removesuffix("_mm_min").removesuffix("_mm").removesuffix("_s").removesuffix("_c").removesuffix("_kg")
+        )
+        found.add("temperature" if word.startswith("temp") else word)
+    return found
 
 
 def prune(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:

@@ -11,7 +11,7 @@ from compgen.core.names import SQUARENESS_NAMES
 from compgen.diagnose.analysis import Analysis
 from compgen.diagnose.evidence import HOMOGENEITY_P, contribution
 from compgen.diagnose.groups import Group
-from compgen.diagnose.search import Alternative, alternatives
+from compgen.diagnose.search import Alternative, alternatives, plain_covariates
 from compgen.effects import catalogue
 
 Grade = Literal["confirmed", "beside_unknown", "tentative"]
@@ -23,6 +23,8 @@ LEAST_VISIBLE = 0.05
 LEAST_SHARE = 0.1
 #: p-value of the homogeneity below which a name is not confirmed beside something that has no name.
 HOMOGENEITY_BESIDE_P = 0.01
+#: Unevenness that explains less than this share of the chi-square of a name is its inexact shape, not another effect.
+SLIGHTLY_UNEVEN = 0.03
 #: A further name whose chi-square is below this share of the largest one is listed as a possible secondary one.
 SECONDARY_SHARE = 0.005
 #: A generic group in the covariates of a name, with less than this share of its chi-square, is its inexact shape.
@@ -84,11 +86,12 @@ def verdict_of(analysis: Analysis) -> Verdict:
     names.sort(key=lambda g: -evidence.chi2[g])
     shapes = {g: owner for g in generic if (owner := _owner(analysis, g, names)) is not None}
     leftover = [g for g in generic if g not in shapes]
-    graded = [_graded(analysis, g, leftover, g in shapes.values()) for g in names]
+    owners = {*shapes.values(), *(_owner(analysis, d.group, names, d.evidence) for d in analysis.evidence.directed)}
+    graded = [_graded(analysis, g, leftover, g in owners) for g in names]
     largest = max((item.chi2 for item in graded), default=0.0)
     secondary = [item for item in graded if item.chi2 < SECONDARY_SHARE * largest]
     graded = [item for item in graded if item not in secondary]
-    unknown = _unknown(analysis, leftover, jumps, bool(shapes))
+    unknown = _unknown(analysis, leftover, jumps, names)
     firm = [item for item in graded if item.grade != "tentative"]
     repeats = analysis.noise.source != "assumed"
     if not repeats:
@@ -137,24 +140,14 @@ def _common_jumps(analysis: Analysis, names: list[int]) -> list[int]:
     return together
 
 
-def plain_covariates(names: tuple[str, ...]) -> set[str]:
-    """Covariates of a card or of a generic term in one spelling: ``x``, ``approach_x``, ``temperature``, ``time``."""
-    found = set()
-    for name in names:
-        word = (
-            name.removesuffix("_mm").removesuffix("_s").removesuffix("_c").removesuffix("_kg").removesuffix("_mm_min")
-        )
-        found.add("temperature" if word.startswith("temp") else word)
-    return found
-
-
-def _owner(analysis: Analysis, generic: int, names: list[int]) -> int | None:
-    """The named member whose inexact shape a generic member is, if there is one."""
+def _owner(analysis: Analysis, generic: int, names: list[int], gain: float | None = None) -> int | None:
+    """The named member whose inexact shape a generic group is, if there is one; ``gain`` if it is no member."""
     scene, evidence = analysis.scene, analysis.evidence
+    gain = evidence.chi2[generic] if gain is None else gain
     own = plain_covariates(scene.groups[generic].covariates) - {"x", "y", "z"}
     for g in names:
         covariates = plain_covariates(scene.groups[g].covariates)
-        if own and own <= covariates and evidence.chi2[generic] < SHAPE_SHARE * evidence.chi2[g]:
+        if own and own <= covariates and gain < SHAPE_SHARE * evidence.chi2[g]:
             return g
     return None
 
@@ -164,6 +157,7 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     name, chi2, p = scene.groups[group].name, evidence.chi2[group], evidence.homogeneity_p[group]
     visible = float(scene.visible[group])
     reasons = []
+    inexact = inexact or (p < HOMOGENEITY_P and evidence.uneven[group] < SLIGHTLY_UNEVEN * chi2)
     if p < (HOMOGENEITY_BESIDE_P if generic else HOMOGENEITY_P) and not inexact:
         reasons.append(f"does not behave like it everywhere (p = {p:.1e})")
     if evidence.misfits and chi2 < evidence.excess:
@@ -200,14 +194,20 @@ def _beyond_plausible(analysis: Analysis, group: int) -> str:
     return ""
 
 
-def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], shaped: bool) -> list[Unknown]:
+def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: list[int]) -> list[Unknown]:
     scene, evidence = analysis.scene, analysis.evidence
+    strongest = max((evidence.chi2[g] for g in names), default=0.0)
+    directed = [d for d in evidence.directed if _owner(analysis, d.group, names, d.evidence) is None]
+    shaped = len(directed) < len(evidence.directed) or len(generic) < sum(
+        scene.groups[g].tier == "generic" for g in analysis.chosen.members
+    )
+    shaped = shaped and not directed and evidence.excess < SHAPE_SHARE * strongest
     found = [_of_group(analysis, g) for g in sorted(generic, key=lambda g: -evidence.chi2[g])]
     if jumps:
         at = scene.groups[jumps[0]].position
         found.append(Unknown(("time",), "length", float("nan"), f"common jump of several stations at {at:g} s"))
-    if not found and evidence.directed and not shaped:
-        for item in evidence.directed[:3]:
+    if not found and directed:
+        for item in directed[:3]:
             group = scene.groups[item.group]
             found.append(Unknown(group.covariates, group.direction, float("nan"), group.name, item.group))
     if not found and evidence.lack_of_fit_z > 3.0 and not shaped:
