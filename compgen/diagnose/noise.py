@@ -22,8 +22,8 @@ from compgen.diagnose.layout import Block, IntArray, Layout
 TAU = (3.0, 10.0, 40.0, 200.0, 2000.0)
 #: Lower bound of a variance, as a share of the raw one.
 LEAST_SHARE = 1e-5
-#: A repeat further away than this from all others of its cell is no use for more than this many differences.
-MOST_DIFFERENCES = 900
+#: Differences of repeats, and stops without repeats, beyond these numbers cost time and tell little more.
+MOST_DIFFERENCES, MOST_STOPS = 640, 450
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def reml_problem(
         if not matrix.shape[0]:
             continue
         if matrix.shape[0] > MOST_DIFFERENCES:
-            matrix = matrix[: int(MOST_DIFFERENCES)]
+            matrix = matrix[:MOST_DIFFERENCES]
         pattern = kernels(
             layout.time[block.stop], spacing, layout.run[block.stop], layout.in_run[block.stop], runs=runs
         )
@@ -253,7 +253,7 @@ def reml_problem(
 
 
 def _thinned(size: int) -> csr_array:
-    keep = np.arange(min(size, MOST_DIFFERENCES))
+    keep = np.arange(min(size, MOST_STOPS))
     return csr_array((np.ones(len(keep)), (keep, keep)), shape=(len(keep), size))
 
 

@@ -71,7 +71,7 @@ def _without_repeats(fit: BaseFit, fixed: Sequence[Group], sigma_mm: FloatArray 
     problem = reml_problem(
         fit.observed.layout, residual / scale, np.zeros((len(residual), 0)), repeats=False, runs=False
     )
-    variances, quadratic, criterion, _ = fit_reml(problem, steps=30)
+    variances, quadratic, criterion, _ = fit_reml(problem, steps=20)
     source = "assumed" if sigma_mm is None else "given"
     if sigma_mm is not None:
         variances = Variances(float(np.mean(sigma_mm**2)), variances.own, variances.common)
