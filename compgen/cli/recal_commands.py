@@ -1,10 +1,8 @@
-"""``compgen recal``: scheduled recalibration; what a command needs is imported when it runs."""
+"""``compgen recal``: run, watch, status, history; what a command needs is imported when it runs."""
 
 from __future__ import annotations
 
 import functools
-import getpass
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,7 +41,7 @@ def recal() -> None:
     """
 
 
-def _needed() -> None:
+def needed() -> None:
     """Say what is not installed, if anything is not."""
     import importlib.util
 
@@ -57,7 +55,7 @@ def job_option(command: Command) -> Command:
 
     @functools.wraps(command)
     def wrapper(*args: Any, job_file: Path, log: str, **options: Any) -> Any:
-        _needed()
+        needed()
         from compgen.recal import logs
         from compgen.recal.job import read_job
 
@@ -95,25 +93,6 @@ def opened(job: Job, use: Callable[[Store], Any]) -> Any:
         return use(store)
     finally:
         store.close()
-
-
-def who_option(*, reason: bool) -> Callable[[Command], Command]:
-    """Add --actor and --reason."""
-
-    def decorate(command: Command) -> Command:
-        text = "Why; kept in the history." if reason else "Why; kept in the history, due with --override."
-        why = click.option("--reason", required=reason, default=None if reason else "", metavar="TEXT", help=text)
-        who = click.option("--actor", default=None, metavar="NAME", help="Who decides; default: your login name.")
-        return who(why(command))
-
-    return decorate
-
-
-def _actor(name: str | None) -> str:
-    try:
-        return name or getpass.getuser()
-    except (KeyError, OSError) as error:
-        raise InputError("this account has no name; say who decides with --actor NAME") from error
 
 
 @recal.command("run")
@@ -226,11 +205,12 @@ def status_command(machines: tuple[str, ...], job: Job, as_json: bool) -> int:
         )
         for item in found
     ]
-    _print_table(("machine", "state", "active", "waiting", "last measured", "schedule", ""), rows)
+    print_table(("machine", "state", "active", "waiting", "last measured", "schedule", ""), rows)
     return int(bad)
 
 
-def _print_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+def print_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows of text below their headings."""
     table = Table(box=box.SIMPLE, pad_edge=False, collapse_padding=True)
     for heading in headings:
         table.add_column(heading, overflow="fold")
@@ -277,191 +257,7 @@ def history_command(machine: str | None, job: Job, drift: bool, report: Path | N
         )
         for entry in entries
     ]
-    _print_table(("at", "machine", "what", "version", "who", "why"), rows)
-    return 0
-
-
-@recal.command("approve")
-@click.argument("machine")
-@click.argument("version", type=click.IntRange(1), required=False)
-@job_option
-@click.option("--override", is_flag=True, help="Also a version that the policy holds back; --reason is due.")
-@who_option(reason=False)
-@json_option
-def approve_command(
-    machine: str, version: int | None, job: Job, override: bool, actor: str | None, reason: str, as_json: bool
-) -> int:
-    """Make VERSION of MACHINE's tables active (default: the only one that waits).
-
-    Tables that the round trip did not accept can never be approved.
-
-    \b
-    Example:
-      compgen recal approve mill-1 3 --reason "checked with the ball bar"
-    """
-    from compgen.recal.actions import approve
-
-    return _decided(job, machine, approve(job, machine, version, _actor(actor), reason, override=override), as_json)
-
-
-@recal.command("reject")
-@click.argument("machine")
-@click.argument("version", type=click.IntRange(1), required=False)
-@job_option
-@who_option(reason=True)
-@json_option
-def reject_command(machine: str, version: int | None, job: Job, actor: str | None, reason: str, as_json: bool) -> int:
-    """Refuse VERSION of MACHINE's tables (default: the only one that waits).
-
-    \b
-    Example:
-      compgen recal reject mill-1 3 --reason "a fixture was loose"
-    """
-    from compgen.recal.actions import reject
-
-    return _decided(job, machine, reject(job, machine, version, _actor(actor), reason), as_json)
-
-
-@recal.command("rollback")
-@click.argument("machine")
-@job_option
-@click.option(
-    "--to", type=click.IntRange(0), default=None, help="Version that was active; 0: no tables. Default: the one before."
-)
-@who_option(reason=True)
-@json_option
-def rollback_command(machine: str, job: Job, to: int | None, actor: str | None, reason: str, as_json: bool) -> int:
-    """Make an earlier version of MACHINE's tables active again, byte for byte.
-
-    \b
-    Example:
-      compgen recal rollback mill-1 --reason "parts out of tolerance since Monday"
-    """
-    from compgen.recal.actions import rollback
-
-    return _decided(job, machine, rollback(job, machine, _actor(actor), reason, to=to), as_json)
-
-
-def _decided(job: Job, machine: str, decision: Any, as_json: bool) -> int:
-    from compgen.recal.overview import status
-
-    now = opened(job, lambda store: status(store, job, (machine,)))[0]
-    if as_json:
-        facts = {
-            "kind": decision.kind,
-            "actor": decision.actor,
-            "reason": decision.reason,
-            "at": decision.at.isoformat(),
-        }
-        print_json({"accepted": True, "machine": machine, "active": now.active, "decision": facts})
-    else:
-        active = "no tables are active" if now.active is None else f"version {now.active} is active"
-        stdout.print(f"{machine}: {decision.kind} by {decision.actor}; {active}", soft_wrap=True)
-    return 0
-
-
-@recal.command("export-units")
-@job_option
-@click.option("--out", required=True, metavar="DIR", type=_PATH, help="Folder for the files.")
-@click.option("--program", default=None, metavar="PATH", help="The compgen command; default: the one that runs now.")
-@json_option
-def export_units_command(job: Job, out: Path, program: str | None, as_json: bool) -> int:
-    """Write systemd service and timer units and crontab lines that drive `compgen recal run` by the job's schedules.
-
-    \b
-    Example:
-      compgen recal export-units --out units/
-    """
-    from compgen.pipeline import write_all
-    from compgen.recal.units import units
-
-    paths = write_all(out, units(job, program or str(Path(sys.argv[0]).absolute())))
-    if as_json:
-        print_json({"accepted": True, "paths": [str(path) for path in paths.values()]})
-    else:
-        for path in paths.values():
-            stdout.print(str(path), soft_wrap=True)
-    return 0
-
-
-@recal.command("backup")
-@click.argument("file", type=_PATH)
-@job_option
-@json_option
-def backup_command(file: Path, job: Job, as_json: bool) -> int:
-    """Write a copy of the whole store to FILE, as it is at one moment, while others may be working with it.
-
-    \b
-    Example:
-      compgen recal backup backups/2026-06-01.sqlite
-    """
-    from compgen.recal.backup import backup
-
-    return _copied(backup(job.store, file), as_json)
-
-
-@recal.command("restore")
-@click.argument("file", type=_PATH)
-@job_option
-@json_option
-def restore_command(file: Path, job: Job, as_json: bool) -> int:
-    """Fill the store of the job, which must be empty, from the backup FILE; the next run writes the tables again.
-
-    \b
-    Example:
-      compgen recal restore backups/2026-06-01.sqlite --job recal.toml
-    """
-    from compgen.recal.backup import restore
-
-    return _copied(restore(file, job.store), as_json)
-
-
-def _copied(counts: dict[str, int], as_json: bool) -> int:
-    if as_json:
-        print_json({"accepted": True, "rows": counts})
-    else:
-        stdout.print(", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items()), soft_wrap=True)
-    return 0
-
-
-@recal.command("add")
-@click.argument("name")
-@click.option("--machine", required=True, metavar="MACHINE", help="Machine TOML, or the name of a machine.")
-@click.option("--inbox", required=True, metavar="DIR", help="Folder where measurements arrive.")
-@click.option(
-    "--controller", "controllers", required=True, multiple=True, metavar="NAME", help="May be given several times."
-)
-@click.option("--out", required=True, metavar="DIR", help="Folder for the tables of this machine.")
-@click.option(
-    "--measured-with",
-    required=True,
-    type=click.Choice(["active", "bare"]),
-    help="Whether the compensation stays on (active) or is switched off (bare) while the machine is measured.",
-)
-@click.option("--schedule", default=None, metavar="CRON", help="Cron expression of five fields, local time.")
-@click.option("--every-minutes", default=None, type=int, help="In place of --schedule: an interval in minutes.")
-@click.option("--approval", default=None, type=click.Choice(["manual", "auto"]), help="Default: manual.")
-@click.option("--instrument", default=None, metavar="FILE", help="Instrument TOML of six-DOF readings.")
-@click.option("--job", "job_file", default=JOB, show_default=True, type=_PATH, metavar="FILE", help="Job file.")
-@json_option
-def add_command(name: str, job_file: Path, as_json: bool, controllers: tuple[str, ...], **keys: Any) -> int:
-    """Add the machine NAME to the job file, which is made if it does not exist; paths are relative to it.
-
-    \b
-    Example:
-      compgen recal add mill-1 --machine mill-1.toml --inbox inbox --controller siemens-cec --out tables \\
-                    --measured-with bare --schedule "30 6 * * mon"
-    """
-    _needed()
-    from compgen.recal.edit import add_machine
-
-    added = add_machine(job_file, name, {**keys, "controllers": list(controllers)})
-    if as_json:
-        print_json({"accepted": True, "job": str(job_file), "machine": added.name})
-    else:
-        stdout.print(
-            f"{added.name}: added to {job_file}; `compgen recal run --job {job_file}` looks into {added.inbox}"
-        )
+    print_table(("at", "machine", "what", "version", "who", "why"), rows)
     return 0
 
 

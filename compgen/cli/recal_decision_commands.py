@@ -1,0 +1,118 @@
+"""``compgen recal approve``, ``reject`` and ``rollback``."""
+
+from __future__ import annotations
+
+import getpass
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from compgen.cli.common import Command, json_option, print_json, stdout
+from compgen.cli.recal_commands import job_option, opened, recal
+from compgen.errors import InputError
+
+if TYPE_CHECKING:
+    from compgen.recal.job import Job
+
+
+def who_option(*, reason: bool) -> Callable[[Command], Command]:
+    """Add --actor and --reason."""
+
+    def decorate(command: Command) -> Command:
+        text = "Why; kept in the history." if reason else "Why; kept in the history, due with --override."
+        why = click.option("--reason", required=reason, default=None if reason else "", metavar="TEXT", help=text)
+        who = click.option("--actor", default=None, metavar="NAME", help="Who decides; default: your login name.")
+        return who(why(command))
+
+    return decorate
+
+
+def _actor(name: str | None) -> str:
+    try:
+        return name or getpass.getuser()
+    except (KeyError, OSError) as error:
+        raise InputError("this account has no name; say who decides with --actor NAME") from error
+
+
+@recal.command("approve")
+@click.argument("machine")
+@click.argument("version", type=click.IntRange(1), required=False)
+@job_option
+@click.option("--override", is_flag=True, help="Also a version that the policy holds back; --reason is due.")
+@who_option(reason=False)
+@json_option
+def approve_command(
+    machine: str, version: int | None, job: Job, override: bool, actor: str | None, reason: str, as_json: bool
+) -> int:
+    """Make VERSION of MACHINE's tables active (default: the only one that waits).
+
+    Tables that the round trip did not accept can never be approved.
+
+    \b
+    Example:
+      compgen recal approve mill-1 3 --reason "checked with the ball bar"
+    """
+    from compgen.recal.actions import approve
+
+    return _decided(job, machine, approve(job, machine, version, _actor(actor), reason, override=override), as_json)
+
+
+@recal.command("reject")
+@click.argument("machine")
+@click.argument("version", type=click.IntRange(1), required=False)
+@job_option
+@who_option(reason=True)
+@json_option
+def reject_command(machine: str, version: int | None, job: Job, actor: str | None, reason: str, as_json: bool) -> int:
+    """Refuse VERSION of MACHINE's tables (default: the only one that waits).
+
+    \b
+    Example:
+      compgen recal reject mill-1 3 --reason "a fixture was loose"
+    """
+    from compgen.recal.actions import reject
+
+    return _decided(job, machine, reject(job, machine, version, _actor(actor), reason), as_json)
+
+
+@recal.command("rollback")
+@click.argument("machine")
+@job_option
+@click.option(
+    "--to", type=click.IntRange(0), default=None, help="Version that was active; 0: no tables. Default: the one before."
+)
+@who_option(reason=True)
+@json_option
+def rollback_command(machine: str, job: Job, to: int | None, actor: str | None, reason: str, as_json: bool) -> int:
+    """Make an earlier version of MACHINE's tables active again, byte for byte.
+
+    \b
+    Example:
+      compgen recal rollback mill-1 --reason "parts out of tolerance since Monday"
+    """
+    from compgen.recal.actions import rollback
+
+    return _decided(job, machine, rollback(job, machine, _actor(actor), reason, to=to), as_json)
+
+
+def _decided(job: Job, machine: str, decision: Any, as_json: bool) -> int:
+    from compgen.recal.overview import status
+
+    now = opened(job, lambda store: status(store, job, (machine,)))[0]
+    if as_json:
+        facts = {
+            "kind": decision.kind,
+            "actor": decision.actor,
+            "reason": decision.reason,
+            "at": decision.at.isoformat(),
+        }
+        print_json({"accepted": True, "machine": machine, "active": now.active, "decision": facts})
+    else:
+        active = "no tables are active" if now.active is None else f"version {now.active} is active"
+        stdout.print(f"{machine}: {decision.kind} by {decision.actor}; {active}", soft_wrap=True)
+    return 0
+
+
+#: Its commands belong to the group ``recal``.
+COMMANDS: tuple[click.Command, ...] = ()
