@@ -1,4 +1,7 @@
-"""What people do: approve, reject, roll back; the decision, the files that follow it, and the notification."""
+"""What people do: approve, reject, roll back; the decision, the files that follow it, and the notification.
+
+``clock`` tells the time of a simulated factory; None: that of the computer or the database.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,18 @@ from compgen.recal.job import Job, MachineJob
 from compgen.recal.notify import notify
 from compgen.recal.publish import publish
 from compgen.recal.records import DecisionRecord, MachineRecord
-from compgen.recal.store import Store, open_store
+from compgen.recal.store import Clock, Store, open_store
 
 
 def approve(
-    job: Job, name: str, version: int | None, actor: str, reason: str = "", *, override: bool = False
+    job: Job,
+    name: str,
+    version: int | None,
+    actor: str,
+    reason: str = "",
+    *,
+    override: bool = False,
+    clock: Clock | None = None,
 ) -> DecisionRecord:
     """Approve a version (None: the only one that is pending) and make its files the active ones.
 
@@ -26,21 +36,27 @@ def approve(
         chosen = _chosen(store, machine, version)
         return decisions.approve(store, machine, chosen, actor, reason, override=override)
 
-    return _done(job.machine(name), job.store, decide)
+    return _done(job.machine(name), job.store, decide, clock)
 
 
-def reject(job: Job, name: str, version: int | None, actor: str, reason: str) -> DecisionRecord:
+def reject(
+    job: Job, name: str, version: int | None, actor: str, reason: str, *, clock: Clock | None = None
+) -> DecisionRecord:
     """Reject a version (None: the only one that is open)."""
 
     def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
         return decisions.reject(store, machine, _chosen(store, machine, version), actor, reason)
 
-    return _done(job.machine(name), job.store, decide)
+    return _done(job.machine(name), job.store, decide, clock)
 
 
-def rollback(job: Job, name: str, actor: str, reason: str, *, to: int | None = None) -> DecisionRecord:
+def rollback(
+    job: Job, name: str, actor: str, reason: str, *, to: int | None = None, clock: Clock | None = None
+) -> DecisionRecord:
     """Make an earlier version active again, byte for byte; ``to`` = 0 leaves none active."""
-    return _done(job.machine(name), job.store, lambda store, m: decisions.rollback(store, m, actor, reason, to=to))
+    return _done(
+        job.machine(name), job.store, lambda store, m: decisions.rollback(store, m, actor, reason, to=to), clock
+    )
 
 
 def _chosen(store: Store, machine: MachineRecord, version: int | None) -> int:
@@ -56,9 +72,12 @@ def _chosen(store: Store, machine: MachineRecord, version: int | None) -> int:
 
 
 def _done(
-    machine_job: MachineJob, url: str, decide: Callable[[Store, MachineRecord], DecisionRecord]
+    machine_job: MachineJob,
+    url: str,
+    decide: Callable[[Store, MachineRecord], DecisionRecord],
+    clock: Clock | None = None,
 ) -> DecisionRecord:
-    store = open_store(url)
+    store = open_store(url, clock=clock)
     try:
         machine = store.machine(machine_job.name)
         decision = decide(store, machine)

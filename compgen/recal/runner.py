@@ -24,7 +24,7 @@ from compgen.recal.process import process
 from compgen.recal.publish import publish
 from compgen.recal.records import MachineRecord, MeasurementRecord, TableRecord
 from compgen.recal.results import ChangedMeanwhileError, keep_failure, keep_result
-from compgen.recal.store import Store, open_store
+from compgen.recal.store import Clock, Store, open_store
 
 #: What may pass by itself: a full disk, a file that cannot be read now, too many open files.
 PASSING = (
@@ -87,8 +87,17 @@ class RunOutcome:
         return {"accepted": self.accepted, "machines": [asdict(item) for item in self.outcomes]}
 
 
-def run_jobs(job: Job, names: Sequence[str] = (), *, mapper: Mapper = map, stop: Stop = lambda: False) -> RunOutcome:
+def run_jobs(
+    job: Job,
+    names: Sequence[str] = (),
+    *,
+    mapper: Mapper = map,
+    stop: Stop = lambda: False,
+    clock: Clock | None = None,
+) -> RunOutcome:
     """Make one pass over the machines ``names`` (default all); ``mapper`` may spread them over processes.
+
+    ``clock`` tells the time of a simulated factory; None: that of the computer or the database.
 
     Raises
     ------
@@ -97,17 +106,19 @@ def run_jobs(job: Job, names: Sequence[str] = (), *, mapper: Mapper = map, stop:
     """
     chosen = [job.machine(name) for name in names] if names else list(job.machines.values())
     open_store(job.store).close()
-    work = partial(run_machine, url=job.store) if mapper is not map else partial(run_machine, url=job.store, stop=stop)
+    work = partial(run_machine, url=job.store, clock=clock)
+    if mapper is map:
+        work = partial(work, stop=stop)
     return RunOutcome(tuple(mapper(work, chosen)))
 
 
-def run_machine(job: MachineJob, url: str, stop: Stop = lambda: False) -> MachineOutcome:
+def run_machine(job: MachineJob, url: str, stop: Stop = lambda: False, clock: Clock | None = None) -> MachineOutcome:
     """Make one pass over one machine; whatever goes wrong is part of the outcome, nothing is raised."""
     started = time.monotonic()
     if stop():
         return MachineOutcome(job.name, "ok", ("not looked at: stopped",))
     try:
-        store = open_store(url)
+        store = open_store(url, clock=clock)
         try:
             outcome = _Pass(store, job, store.add_machine(job.name), stop).run()
         finally:
