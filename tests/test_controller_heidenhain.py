@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
+from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 
@@ -560,6 +561,21 @@ def test_the_draft_holds_all_errors_and_is_accepted(tmp_path, make_errors, chain
     assert result.accepted, result.reasons
     assert result.after.max_um < 0.5
     assert "DRAFT" in made.preflight
+
+
+@pytest.mark.parametrize("reference", ["X", "Y"])
+def test_the_draft_holds_a_machine_far_out_of_square_to_below_a_micrometre(tmp_path, make_errors, reference):
+    """At 2.9 mrad the finite rotations of the control differ from the sum of the tables by 4 um over a metre."""
+    machine = machine_of(tmp_path, chain="WFYXZT", name="heidenhain-kinematics")
+    machine = replace(machine, squareness_reference=reference)
+    straight = make_errors(machine)
+    (name,) = {"EC0Y", "EC0X"} & set(straight.squareness)
+    errors = straight.replace(squareness={**straight.squareness, name: (2.9e-3, 0.0)})
+    made = export(machine, errors, "heidenhain-kinematics", allow_unverified=True)
+    paths = made.write(tmp_path / "out")
+    result = compgen.verify(machine, compgen.read_tables(machine, paths, "heidenhain-kinematics"), errors)
+    assert result.accepted, result.reasons
+    assert result.before.max_um > 1000 and result.after.max_um < 0.5
 
 
 def test_columns_rows_and_units_of_the_draft_are_those_of_the_manual(tmp_path):

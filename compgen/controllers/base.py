@@ -131,6 +131,8 @@ class Controller(ABC, Generic[Settings, Tables]):
     bidirectional: bool = False
     #: True if tables are looked up where the axes stand, after the correction, and not at the command.
     at_axes: bool = False
+    #: True if the correction is not the sum of the tables: the control moves the chain by finite rotations.
+    finite_rotations: bool = False
     #: Folder with the sub-folder of templates of a plug-in's control; None: the shipped templates.
     templates: Path | None = None
     #: Setting that names a file of the user's own control to follow: "style_from", "template_from", or None.

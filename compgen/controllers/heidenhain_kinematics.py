@@ -41,6 +41,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
     """All 21 errors as columns C1 to C6 and constants of the kinematics table: a draft for hand integration."""
 
     name = "heidenhain-kinematics"
+    finite_rotations = True
 
     def read_settings(self, machine: Machine) -> DraftSettings:
         """Check ``[controllers.heidenhain-kinematics]``."""

@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from compgen.controllers import AnyController, SourceFile, controller_named
+from compgen.controllers.base import Term
+from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable, format_errors
 from compgen.core.files import OutputFolder, sha256_of
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
+from compgen.core.points import Points
 from compgen.core.reversal import WORTH_MM, ReversalCurves, format_reversal, reversal_name
 from compgen.effects import advice_of_effects
 from compgen.errors import InputError
@@ -132,8 +135,7 @@ def export(
     settings = control.read_settings(machine)
     card = usable_format(controller, templates, allow_unverified=allow_unverified)
     basis = control.basis(machine, settings, errors)
-    values = synthesize(machine, errors, basis, anchored=control.anchored, at_axes=control.at_axes)
-    tables = control.build(machine, settings, basis, values)
+    tables = control.build(machine, settings, basis, _table_values(control, machine, settings, errors, basis))
     rest = reversal
     if reversal is not None:
         held = control.reversal_in_tables(settings, reversal)
@@ -154,6 +156,16 @@ def export(
     if companions:
         manifest["companions"] = _described(companions)
     return Export(controller, files, manifest, preflight, violations, own["warnings"], companions)
+
+
+def _table_values(
+    control: AnyController, machine: Machine, settings: Any, errors: ErrorTable, basis: Sequence[Term]
+) -> dict[str, FloatArray]:
+    def applied(values: Mapping[str, FloatArray], points: Points) -> FloatArray:
+        return control.emulate(machine, settings, control.build(machine, settings, basis, values), points)
+
+    how = applied if control.finite_rotations else None
+    return synthesize(machine, errors, basis, anchored=control.anchored, at_axes=control.at_axes, applied=how)
 
 
 def _described(files: Mapping[str, str]) -> list[dict[str, str]]:

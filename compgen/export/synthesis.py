@@ -6,7 +6,7 @@ contains what a first-order model leaves out, e.g. the 4 um over a metre that co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.emphasis import Vector3
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
+from compgen.core.points import Points
 from compgen.errors import ConvergenceError
 from compgen.model.basis import free_basis, hat_entries, hat_matrix
 from compgen.model.exact import exact_error
@@ -30,6 +31,11 @@ KEEP = 1e-7
 RIDGE = 1e-11
 #: A table's end interval of which less than this lies within the travel says too little about the node outside.
 LEAST_SHARE = 0.5
+#: Steps towards what a control applies that is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
+APPLIED_STEPS = 3
+
+#: What a control adds to the commands: values by term, points -> (n, 3), mm.
+Applied = Callable[[Mapping[str, FloatArray], Points], FloatArray]
 
 
 def wanted_correction(
@@ -210,24 +216,42 @@ def _keep_rows(basis: Sequence[Term]) -> FloatArray:
 
 
 def synthesize(
-    machine: Machine, errors: ErrorTable, basis: Sequence[Term], *, anchored: bool, at_axes: bool = False
+    machine: Machine,
+    errors: ErrorTable,
+    basis: Sequence[Term],
+    *,
+    anchored: bool,
+    at_axes: bool = False,
+    applied: Applied | None = None,
 ) -> dict[str, FloatArray]:
     """Return the table values by term that come closest to the wanted correction over the volume.
 
-    The machine's work zone and tools (``machine.emphasis``) say what counts more.
+    The machine's work zone and tools (``machine.emphasis``) say what counts more. ``applied`` says what a control adds
+    that does not simply sum its tables, see :func:`best_values`.
     """
     solver = projector(machine, basis, anchored=anchored)
-    return solver.by_name(best_values(machine, errors, solver, at_axes=at_axes))
+    return solver.by_name(best_values(machine, errors, solver, at_axes=at_axes, applied=applied))
 
 
-def best_values(machine: Machine, errors: ErrorTable, solver: Projector, *, at_axes: bool = False) -> FloatArray:
+def best_values(
+    machine: Machine, errors: ErrorTable, solver: Projector, *, at_axes: bool = False, applied: Applied | None = None
+) -> FloatArray:
     """Return all values (parameters,) of the best tables, over the tools of ``machine.emphasis`` if it has some.
 
-    With ``at_axes`` the tables are looked up where the axes stand: they hold minus the error there, not c*.
+    With ``at_axes`` the tables are looked up where the axes stand: they hold minus the error there, not c*. A control
+    whose correction ``applied(values by term, points)`` (n, 3) is not the sum of the basis, but close to it, gets
+    values for which that correction is the wanted one (Gauss-Newton).
     """
     if machine.emphasis.tools_mm:
         solver = projector(machine, solver.basis, anchored=bool(solver.offsets), tools_mm=machine.emphasis.tools_mm)
     wanted_at = (lambda *given: -exact_error(*given)) if at_axes else wanted_correction
     wanted = wanted_at(machine, errors, solver.position_mm, solver.sample_tool_mm)
     start = np.concatenate([term.start for term in solver.basis])
-    return solver.project(wanted, start)
+    values = solver.project(wanted, start)
+    if applied is not None:
+        tool_mm = np.broadcast_to(solver.sample_tool_mm, solver.position_mm.shape)
+        points = Points(solver.position_mm, np.array(tool_mm))
+        for _ in range(APPLIED_STEPS):
+            beyond = applied(solver.by_name(values), points) - solver.field(values)
+            values = solver.project(wanted - beyond, start)
+    return values
