@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 import time
 import warnings
@@ -38,6 +39,9 @@ NOT_OF_A_CONTROL = (
     "fitted.errors.csv",
     "fit.json",
 )
+#: How temporary folders begin; their names say nothing to a reader.
+FOLDER = "compgen-recal-"
+_TEMPORARY = re.compile(rf"\S*{FOLDER}[^/\\]+[/\\]measurement[/\\]")
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ def process(store: Store, job: MachineJob, record: MachineRecord, measurement: M
     machine = load_machine(job.machine)
     tables = store.tables(record)
     now = store.read(store.now)
-    with tempfile.TemporaryDirectory(prefix="compgen-recal-") as folder, warnings.catch_warnings(record=True) as caught:
+    with tempfile.TemporaryDirectory(prefix=FOLDER) as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
         paths = write_files(Path(folder) / "measurement", store.contents_of(measurement))
@@ -81,7 +85,7 @@ def process(store: Store, job: MachineJob, record: MachineRecord, measurement: M
         )
         active = _active_now(store, machine, tables, Path(folder) / "now")
         judgement = _judged(store, job, machine, measurement, (outcome, active, now))
-        judgement.figures["warnings"] = [str(item.message) for item in caught if _ours(item)]
+        judgement.figures["warnings"] = [without_folder(str(item.message)) for item in caught if _ours(item)]
         files = _tables_of(outcome, Path(folder) / "out")
         result = _result(Path(folder) / "out", machine, outcome, files, judgement)
     kept = NewResult(
@@ -92,6 +96,11 @@ def process(store: Store, job: MachineJob, record: MachineRecord, measurement: M
         seconds=time.monotonic() - started,
     )
     return Processed(kept, next((table.id for table in tables if table.state == "active"), None))
+
+
+def without_folder(message: str) -> str:
+    """Return a message that names files of a measurement as the inbox has them."""
+    return _TEMPORARY.sub("", message)
 
 
 def _ours(item: warnings.WarningMessage) -> bool:

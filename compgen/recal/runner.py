@@ -20,7 +20,7 @@ from compgen.recal.claims import Claim, ClaimLostError
 from compgen.recal.database import StoreError
 from compgen.recal.job import Job, MachineJob
 from compgen.recal.notify import notify
-from compgen.recal.process import process
+from compgen.recal.process import process, without_folder
 from compgen.recal.publish import publish
 from compgen.recal.records import MachineRecord, MeasurementRecord, TableRecord
 from compgen.recal.results import ChangedMeanwhileError, keep_failure, keep_result
@@ -142,6 +142,7 @@ class _Pass:
         self.store, self.job, self.machine, self.stop = store, job, machine, stop
         self.messages: list[str] = []
         self.processed: list[str] = []
+        self.present: set[str] = set()
         self.failed = False
         self.internal = False
 
@@ -189,6 +190,7 @@ class _Pass:
                 self._problem("inbox", str(group[0]), str(getattr(error, "message", error)))
                 continue
             self.store.add_measurement(self.machine, new)
+            self.present.add(new.sha256)
 
     def _waiting(self, settings: str) -> list[MeasurementRecord]:
         """Return what has no result yet, oldest first; what failed comes again only with other settings."""
@@ -229,7 +231,8 @@ class _Pass:
                 claims.give_back(self.store, claim)
                 self._problem("passing", measurement.name, f"{measurement.name}: {error}; it is tried again")
                 return
-            keep_failure(self.store, self.machine, claim, str(error), settings, time.monotonic() - started)
+            message = without_folder(str(error))
+            keep_failure(self.store, self.machine, claim, message, settings, time.monotonic() - started)
             return
         except Exception as error:
             self.internal = True
@@ -244,11 +247,7 @@ class _Pass:
     def _outcome(self, active: TableRecord | None, settings: str) -> MachineOutcome:
         """Judge by what the store holds, so that the same inbox gives the same outcome however often it is run."""
         tables = self.store.tables(self.machine)
-        names = {item.id: item.name for item in self.store.measurements(self.machine)}
-        for attempt in self.store.attempts(self.machine):
-            if attempt.outcome == "failed" and attempt.settings_sha256 == settings:
-                self.failed = True
-                self.messages.append(f"{names[attempt.measurement_id]}: {attempt.message}")
+        self._report_failures(settings)
         last = tables[-1] if tables else None
         held = last is not None and last.state in ("held", "refused")
         if last is not None and held:
@@ -262,6 +261,16 @@ class _Pass:
             waiting=tuple(table.version for table in tables if table.state in ("pending", "held")),
             internal=self.internal,
         )
+
+    def _report_failures(self, settings: str) -> None:
+        """Measurements that failed, as long as they stand in the inbox: who removed or mended one knows of it."""
+        names = {item.id: item.name for item in self.store.measurements(self.machine) if item.sha256 in self.present}
+        for attempt in self.store.attempts(self.machine):
+            name = names.get(attempt.measurement_id)
+            if name is not None and attempt.outcome == "failed" and attempt.settings_sha256 == settings:
+                self.failed = True
+                text = attempt.message
+                self.messages.append(text if text.startswith(f"{name}:") else f"{name}: {text}")
 
 
 def _give_back_quietly(store: Store, claim: Claim) -> None:
