@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import sqlalchemy as sa
 
 from compgen.errors import InputError
 from compgen.recal import schema
-from compgen.recal.database import StoreError, retried, shown
+from compgen.recal.database import StoreError, first_line, retried, shown
 from compgen.recal.store import Store, open_store
 
 #: Rows that are held in memory at once.
 ROWS = 200
+MAGIC = b"SQLite format 3\0"
+#: How a file system says that it knows no links.
+NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
 
 
 def backup(url: str, path: Path) -> dict[str, int]:
@@ -33,13 +39,11 @@ def backup(url: str, path: Path) -> dict[str, int]:
         target = open_store(f"sqlite:///{temporary}")
         try:
             counts = _copy(source, target)
-            with target.engine.connect() as connection:  # one file: nothing stays in the write-ahead log
-                connection.exec_driver_sql("COMMIT")
-                connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
+            retried(lambda: _make_one_file(target), target.url)
         finally:
             source.close()
             target.close()
-        os.link(temporary, path)  # unlike a rename it never replaces a file that came meanwhile
+        _publish(temporary, path)
         return counts
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror or error}", file=path) from error
@@ -48,8 +52,25 @@ def backup(url: str, path: Path) -> dict[str, int]:
             left.unlink(missing_ok=True)
 
 
+def _make_one_file(store: Store) -> None:
+    """Leave nothing in the write-ahead log."""
+    with store.engine.connect() as connection:
+        connection.exec_driver_sql("COMMIT")
+        connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
+
+
+def _publish(temporary: Path, path: Path) -> None:
+    """Give the file its name; never over another one that came meanwhile, where the file system can promise that."""
+    try:
+        os.link(temporary, path)
+    except OSError as error:
+        if error.errno not in NO_LINKS or path.exists():
+            raise
+        temporary.rename(path)
+
+
 def restore(path: Path, url: str) -> dict[str, int]:
-    """Fill an empty store from a backup; return the number of rows by table.
+    """Fill an empty store from a backup, which stays as it is; return the number of rows by table.
 
     Raises
     ------
@@ -58,33 +79,45 @@ def restore(path: Path, url: str) -> dict[str, int]:
     """
     if not path.is_file():
         raise InputError("no such backup", file=path)
-    if path.read_bytes()[:16] != b"SQLite format 3\0":
-        raise InputError("is not a backup (written by `compgen recal backup`)", file=path)
+    with tempfile.TemporaryDirectory(prefix="compgen-restore-") as folder:
+        copy = (
+            Path(folder) / "copy.sqlite"
+        )  # a backup of an older program is upgraded, and may be on a read-only medium
+        try:
+            with path.open("rb") as stream:
+                if stream.read(len(MAGIC)) != MAGIC:
+                    raise InputError("is not a backup (written by `compgen recal backup`)", file=path)
+            shutil.copyfile(path, copy)
+        except OSError as error:
+            raise InputError(f"cannot be copied: {error.strerror or error}", file=path) from error
+        return _filled(url, copy)
+
+
+def _filled(url: str, copy: Path) -> dict[str, int]:
     target = open_store(url)
-    source = open_store(f"sqlite:///{path}")
     try:
-        if target.machines():
-            raise InputError(f"the store {shown(url)} holds machines already; restore into a new one")
-        return _copy(source, target)
+        source = open_store(f"sqlite:///{copy}")
+        try:
+            if target.machines():
+                raise InputError(f"the store {shown(url)} holds machines already; restore into a new one")
+            return _copy(source, target)
+        finally:
+            source.close()
     finally:
-        source.close()
         target.close()
 
 
 def _copy(source: Store, target: Store) -> dict[str, int]:
     """Copy all rows as they were at one moment, in one transaction."""
-
-    def action() -> dict[str, int]:
+    try:
         reading = source.engine.connect().execution_options(reading=True)
         if source.engine.dialect.name == "postgresql":
             reading = reading.execution_options(isolation_level="REPEATABLE READ")
         with reading, target.engine.begin() as writing:
             return {table.name: _copy_table(reading, writing, table) for table in schema.ALL}
-
-    try:
-        return retried(action, source.url)
-    except sa.exc.IntegrityError as error:
-        raise StoreError(f"the store {shown(target.url)} does not take the rows: {error.orig}") from error
+    except sa.exc.DBAPIError as error:
+        place = f"{shown(source.url)} to {shown(target.url)}"
+        raise StoreError(f"nothing was copied from {place}: {first_line(error)}") from error
 
 
 def _copy_table(reading: sa.Connection, writing: sa.Connection, table: sa.Table) -> int:

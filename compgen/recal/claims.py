@@ -1,26 +1,35 @@
 """Leases: who works on a measurement. The chain of claims grows by one row, which only one runner can add.
 
-A lease of a process of this host that no longer runs is free at once; one of another host when its time is over.
+A lease of a process of this host that no longer runs is free at once; every other one when its time is over, unless it
+is renewed, which :class:`Renewal` does while somebody works.
 """
 
 from __future__ import annotations
 
 import os
 import socket
+import threading
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from types import TracebackType
 
 import sqlalchemy as sa
 
 from compgen.errors import CompgenError
-from compgen.recal import schema
+from compgen.recal import logs, schema
 from compgen.recal.records import MeasurementRecord
 from compgen.recal.store import Store
 
 #: How long a claim counts without being renewed, s.
 LEASE_S = 900.0
+#: A claim is renewed when this share of its time is over.
+RENEWED_AT = 1.0 / 3.0
+
+#: What this process works on: owner, store, measurement. A claim of this process that is not here was left behind.
+_working: set[tuple[str, str, int]] = set()
+_lock = threading.Lock()
 
 
 class ClaimLostError(CompgenError):
@@ -44,29 +53,39 @@ def owner_name() -> str:
     return f"{socket.gethostname()}/{_process_space()}/{pid}/{_start_of(pid)}"
 
 
-def take(store: Store, measurement: MeasurementRecord, owner: str, lease_s: float = LEASE_S) -> Claim | None:
-    """Claim a measurement; None if somebody works on it or it is done."""
+def take(store: Store, measurement: MeasurementRecord, owner: str, lease_s: float | None = None) -> Claim | None:
+    """Claim a measurement for ``lease_s`` (None: :data:`LEASE_S`); None if somebody works on it or it is done."""
+    key = (owner, store.url, measurement.id)
 
     def action(connection: sa.Connection) -> Claim | None:
         now = store.now(connection)
         last = _last(connection, measurement.id)
-        if _done(connection, measurement.id) or (last is not None and _held(last, now)):
+        if _done(connection, measurement.id) or (last is not None and last.owner != owner and _held(last, now)):
             return None
         return _add(connection, measurement.id, 1 if last is None else last.sequence + 1, "take", owner, now, lease_s)
 
+    with _lock:
+        if key in _working:  # another thread of this process
+            return None
+        _working.add(key)
+    claim = None
     try:
-        return store.write(action)
+        claim = store.write(action)
     except sa.exc.IntegrityError:  # another runner added this row first
-        return None
+        pass
+    finally:
+        if claim is None:
+            _working.discard(key)
+    return claim
 
 
-def renew(store: Store, claim: Claim, lease_s: float = LEASE_S) -> Claim:
-    """Prolong a claim; ClaimLostError if somebody else has taken over."""
+def renew(store: Store, claim: Claim, lease_s: float | None = None) -> Claim:
+    """Prolong a claim; ClaimLostError if somebody else has taken over. The claim as it was stays valid too."""
 
     def action(connection: sa.Connection) -> Claim:
-        check(connection, claim)
+        last = check(connection, claim)
         now = store.now(connection)
-        return _add(connection, claim.measurement_id, claim.sequence + 1, "renew", claim.owner, now, lease_s)
+        return _add(connection, claim.measurement_id, last + 1, "renew", claim.owner, now, lease_s)
 
     try:
         return store.write(action)
@@ -74,23 +93,62 @@ def renew(store: Store, claim: Claim, lease_s: float = LEASE_S) -> Claim:
         raise ClaimLostError("another runner took this measurement over") from error
 
 
-def check(connection: sa.Connection, claim: Claim) -> None:
-    """Raise ClaimLostError unless the claim is the last of its chain."""
+class Renewal:
+    """Prolongs a claim from a thread of its own for as long as the ``with`` block takes.
+
+    A store that is away is tried again; if somebody else took over meanwhile, whoever keeps the result notices it.
+    """
+
+    def __init__(self, store: Store, claim: Claim, lease_s: float | None = None) -> None:
+        self._store, self._claim, self._lease_s = store, claim, LEASE_S if lease_s is None else lease_s
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._prolong, name="renewal of a claim", daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _prolong(self) -> None:
+        while not self._over.wait(self._lease_s * RENEWED_AT):
+            try:
+                renew(self._store, self._claim, self._lease_s)
+            except ClaimLostError:
+                return
+            except (CompgenError, sa.exc.SQLAlchemyError) as error:
+                logs.warning("claim not renewed", measurement=self._claim.measurement_id, problem=str(error))
+
+
+def check(connection: sa.Connection, claim: Claim) -> int:
+    """Return the number of the last row of the chain; ClaimLostError unless it is the owner's and not released."""
     last = _last(connection, claim.measurement_id)
-    if last is None or last.sequence != claim.sequence or last.owner != claim.owner:
+    if last is None or last.owner != claim.owner or last.kind == "release" or last.sequence < claim.sequence:
         raise ClaimLostError("another runner took this measurement over")
+    return int(last.sequence)
 
 
 def release(store: Store, connection: sa.Connection, claim: Claim) -> None:
     """Give a claim back in the transaction that keeps its result; ClaimLostError if it is somebody else's."""
-    check(connection, claim)
-    _add(connection, claim.measurement_id, claim.sequence + 1, "release", claim.owner, store.now(connection), 0.0)
+    last = check(connection, claim)
+    _add(connection, claim.measurement_id, last + 1, "release", claim.owner, store.now(connection), 0.0)
 
 
 def give_back(store: Store, claim: Claim) -> None:
     """Give a claim back without a result; one that is lost needs none."""
-    with suppress(ClaimLostError, sa.exc.IntegrityError):
-        store.write(lambda connection: release(store, connection, claim))
+    try:
+        with suppress(ClaimLostError, sa.exc.IntegrityError):
+            store.write(lambda connection: release(store, connection, claim))
+    finally:
+        forget(store, claim)
+
+
+def forget(store: Store, claim: Claim) -> None:
+    """Say that this process no longer works on a measurement, whatever the store says."""
+    _working.discard((claim.owner, store.url, claim.measurement_id))
 
 
 def _last(connection: sa.Connection, measurement_id: int) -> sa.Row[tuple[object, ...]] | None:
@@ -105,11 +163,10 @@ def _done(connection: sa.Connection, measurement_id: int) -> bool:
 
 
 def _held(last: sa.Row[tuple[object, ...]], now: datetime) -> bool:
-    """Whether the last claim of a chain still counts; a clock that went back does not prolong a dead process's one."""
-    if last.kind == "release":
+    """Whether the last claim of a chain still counts; a clock that went back prolongs it at most by its own length."""
+    if last.kind == "release" or _alive(str(last.owner)) is False:
         return False
-    alive = _alive(str(last.owner))
-    return bool(last.until > now) if alive is None else alive
+    return bool(now < last.until and last.at - now < last.until - last.at)
 
 
 def _alive(owner: str) -> bool | None:
@@ -140,8 +197,15 @@ def _start_of(pid: int) -> str:
 
 
 def _add(
-    connection: sa.Connection, measurement_id: int, sequence: int, kind: str, owner: str, now: datetime, lease_s: float
+    connection: sa.Connection,
+    measurement_id: int,
+    sequence: int,
+    kind: str,
+    owner: str,
+    now: datetime,
+    lease_s: float | None,
 ) -> Claim:
     row = {"measurement_id": measurement_id, "sequence": sequence, "kind": kind, "owner": owner, "at": now}
-    connection.execute(sa.insert(schema.claims).values(**row, until=now + timedelta(seconds=lease_s)))
+    until = now + timedelta(seconds=LEASE_S if lease_s is None else lease_s)
+    connection.execute(sa.insert(schema.claims).values(**row, until=until))
     return Claim(measurement_id, sequence, owner)

@@ -17,8 +17,16 @@ Result = TypeVar("Result")
 
 #: Waits between attempts to reach the store, s.
 WAITS_S = (0.2, 0.5, 1.0, 2.0)
-#: How long a writer waits for another one on SQLite, s.
+#: How long a writer waits for another one, s; who waited that long for a lock does not try again.
 BUSY_S = 60.0
+#: A server that does not answer is noticed: waits for a connection, and for an answer on one that broke, s.
+REACHABLE = {
+    "connect_timeout": 10,
+    "keepalives_idle": 30,
+    "keepalives_interval": 10,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 60_000,  # ms
+}
 #: Key of the lock under which PostgreSQL stores are upgraded.
 UPGRADE_LOCK = 7305211
 
@@ -35,13 +43,24 @@ def engine_of(url: str) -> sa.Engine:
         raise InputError(f"{url!r} is not the URL of a store; give sqlite:///FILE or postgresql://HOST/NAME") from error
     kind = parsed.get_backend_name()
     if kind == "postgresql":
-        return sa.create_engine(parsed.set(drivername="postgresql+psycopg"), pool_pre_ping=True, pool_size=2)
+        return _postgresql(parsed)
     if kind != "sqlite" or not parsed.database or parsed.database == ":memory:":
         raise InputError(f"{shown(url)} is not a store; give sqlite:///FILE or postgresql://HOST/NAME")
-    Path(parsed.database).parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(parsed.database).absolute().parent
+    if not folder.is_dir():  # not made here: on a drive that is not mounted a new, empty store would begin
+        raise StoreError(f"the store {shown(url)} cannot be used: there is no folder {folder}; mount or make it first")
     engine = sa.create_engine(parsed, connect_args={"timeout": BUSY_S}, poolclass=sa.pool.QueuePool, pool_size=2)
     event.listen(engine, "connect", _configure_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
+    return engine
+
+
+def _postgresql(url: sa.URL) -> sa.Engine:
+    """One connection for the work and one for the renewal of leases; what the URL says itself counts."""
+    arguments = {name: value for name, value in REACHABLE.items() if name not in url.query}
+    url = url.set(drivername="postgresql+psycopg")
+    engine = sa.create_engine(url, connect_args=arguments, pool_pre_ping=True, pool_size=2)
+    event.listen(engine, "connect", _configure_postgresql)
     return engine
 
 
@@ -63,6 +82,12 @@ def _configure_sqlite(connection: Any, _record: object) -> None:
     cursor.close()
 
 
+def _configure_postgresql(connection: Any, _record: object) -> None:
+    """Wait for a lock of somebody else as long as on SQLite, not for ever."""
+    connection.execute(f"SET lock_timeout = {int(BUSY_S * 1000)}")
+    connection.commit()
+
+
 def _begin_sqlite(connection: sa.Connection) -> None:
     """Writers take the lock at once, so that none has to give up half way."""
     reading = connection.get_execution_options().get("reading", False)
@@ -72,26 +97,29 @@ def _begin_sqlite(connection: sa.Connection) -> None:
 def retried(action: Callable[[], Result], url: str, wait: Callable[[float], None] = time.sleep) -> Result:
     """Do ``action`` again while the store cannot be reached, then raise StoreError."""
     for pause in (*WAITS_S, None):
+        started = time.monotonic()
         try:
             return action()
-        except sa.exc.OperationalError as error:
-            if pause is None or not _may_pass(error):
-                raise StoreError(f"the store {shown(url)} cannot be used: {_first_line(error)}") from error
+        except sa.exc.IntegrityError:
+            raise
+        except (sa.exc.DBAPIError, sa.exc.TimeoutError) as error:
+            waited = time.monotonic() - started >= BUSY_S
+            if pause is None or waited or not _may_pass(error):
+                raise StoreError(f"the store {shown(url)} cannot be used: {first_line(error)}") from error
             wait(pause)
-        except sa.exc.DatabaseError as error:
-            if isinstance(error, sa.exc.IntegrityError):
-                raise
-            raise StoreError(f"the store {shown(url)} cannot be used: {_first_line(error)}") from error
     raise AssertionError("unreachable")
 
 
-def _first_line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
+    """Return what the database says, without the statement."""
     lines = str(getattr(error, "orig", error)).strip().splitlines()
     return lines[0] if lines else type(error).__name__
 
 
-def _may_pass(error: sa.exc.OperationalError) -> bool:
-    """Whether waiting may help: not for a wrong name, password or a full disk."""
+def _may_pass(error: sa.exc.SQLAlchemyError) -> bool:
+    """Whether waiting may help: not for a wrong name, password, a full disk or a damaged file."""
+    if not isinstance(error, sa.exc.OperationalError | sa.exc.InterfaceError):
+        return False
     text = str(error).lower()
     lasting = ("authentication", "does not exist", "no such table", "no such column", "disk is full", "readonly")
     return not any(word in text for word in lasting)

@@ -49,8 +49,28 @@ def keep_result(
         _decide(store, connection, machine, table_id, new)
         return table_id
 
-    table_id = store.write(action)
+    try:
+        table_id = store.write(action)
+    except claims.ClaimLostError:
+        found = _own_result(store, claim)
+        if found is None:
+            raise
+        table_id = found
+    claims.forget(store, claim)
     return next(table for table in store.tables(machine) if table.id == table_id)
+
+
+def _own_result(store: Store, claim: Claim) -> int | None:
+    """Return the tables that this claim led to: the store may have kept a result and gone away before it said so."""
+    kept, tried = schema.identifications, schema.attempts
+    query = (
+        sa.select(schema.tables.c.id)
+        .join(kept, kept.c.id == schema.tables.c.identification_id)
+        .join(tried, tried.c.measurement_id == kept.c.measurement_id)
+        .where(kept.c.measurement_id == claim.measurement_id)
+        .where(tried.c.outcome == "done", tried.c.owner == claim.owner)
+    )
+    return store.read(lambda connection: connection.execute(query).scalar())
 
 
 def _decide(store: Store, connection: sa.Connection, machine: MachineRecord, table_id: int, new: NewResult) -> None:
@@ -124,6 +144,7 @@ def keep_failure(
         add_attempt(store, connection, machine, claim, "failed", message, settings_sha256, seconds)
 
     store.write(action)
+    claims.forget(store, claim)
 
 
 def add_attempt(

@@ -32,6 +32,22 @@ class UtcTime(sa.types.TypeDecorator[datetime]):
         return None if value is None else value.replace(tzinfo=UTC)
 
 
+class PlainText(sa.types.TypeDecorator[str]):
+    """Text that every database takes: PostgreSQL refuses a NUL, and none takes the rest of a name that is not UTF-8."""
+
+    impl = sa.Text
+    cache_ok = True
+
+    def process_bind_param(self, value: str | None, dialect: sa.engine.Dialect) -> str | None:
+        """Escape what cannot be kept."""
+        return None if value is None else plain(value)
+
+
+def plain(text: str) -> str:
+    """Return the text with NUL and lone surrogates as escapes."""
+    return text.replace("\0", "\\x00").encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 metadata = sa.MetaData()
 
 
@@ -49,7 +65,7 @@ def _at(name: str = "at") -> sa.Column[datetime]:
 
 
 def _text(name: str, *, optional: bool = False) -> sa.Column[str]:
-    return sa.Column(name, sa.Text, nullable=optional)
+    return sa.Column(name, PlainText, nullable=optional)
 
 
 def _json(name: str) -> sa.Column[object]:

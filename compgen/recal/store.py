@@ -20,7 +20,7 @@ import sqlalchemy as sa
 from compgen.core.error_table import ErrorTable, read_errors
 from compgen.core.files import sha256_of
 from compgen.core.machine import Machine, read_machine
-from compgen.errors import InputError
+from compgen.errors import CompgenError, InputError
 from compgen.identify.covariance import Covariance, read_covariance
 from compgen.recal import schema
 from compgen.recal.database import StoreError, engine_of, retried, shown, upgrade
@@ -67,7 +67,12 @@ class Store:
             with self.engine.connect().execution_options(reading=True) as connection:
                 return action(connection)
 
-        return retried(once, self.url)
+        try:
+            return retried(once, self.url)
+        except CompgenError:
+            raise
+        except ValueError as error:  # no time, no JSON
+            raise StoreError(f"the store {shown(self.url)} is damaged: {error}; restore a backup") from error
 
     def write(self, action: Callable[[sa.Connection], Result]) -> Result:
         """Do ``action`` in a transaction, all of it or nothing; again while the store cannot be reached."""
@@ -225,7 +230,7 @@ class Store:
 
     def add_event(self, kind: str, subject: str, message: str, machine: MachineRecord | None = None) -> bool:
         """Keep an event unless the last one of this machine, kind and subject says the same; return whether it is new."""
-        table, machine_id = schema.events, None if machine is None else machine.id
+        table, machine_id, message = schema.events, None if machine is None else machine.id, schema.plain(message)
         same = sa.and_(
             table.c.machine_id.is_not_distinct_from(machine_id), table.c.kind == kind, table.c.subject == subject
         )
