@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 from compgen.controllers import SourceFile, controller_named
-from compgen.controllers.fanuc_pitch_tables import PitchBlock, PitchTables
+from compgen.controllers.fanuc.pitch_tables import PitchBlock, PitchTables
 from compgen.controllers.trilinear import FANUC_CORNERS, box_of_corners, trilinear
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import read_machine

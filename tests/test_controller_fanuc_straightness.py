@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compgen.controllers import SourceFile, controller_named
-from compgen.controllers.fanuc_polyline import best_polyline
+from compgen.controllers.fanuc.polyline import best_polyline
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Axis, Chain, Machine
 from compgen.core.points import Points

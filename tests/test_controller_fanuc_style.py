@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compgen.controllers import SourceFile, controller_named
-from compgen.controllers.fanuc_pitch_tables import PitchTables
-from compgen.controllers.fanuc_sample import style_of
-from compgen.controllers.fanuc_style import FanucStyle
+from compgen.controllers.fanuc.pitch_tables import PitchTables
+from compgen.controllers.fanuc.sample import style_of
+from compgen.controllers.fanuc.style import FanucStyle
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Axis, Chain, Machine
 from compgen.errors import InputError

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import compgen
 from compgen.controllers import SourceFile, controller_named
 from compgen.controllers.grids import curve_nodes_mm
-from compgen.controllers.heidenhain_grid import GRADIENT_SHARE, intervals, spacing_mm, widest_exponent
+from compgen.controllers.heidenhain.grid import GRADIENT_SHARE, intervals, spacing_mm, widest_exponent
 from compgen.controllers.terms import one_dimensional_terms
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import read_machine

@@ -15,8 +15,8 @@ from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.controllers import CONTROLLERS
 from compgen.controllers.base import SourceFile
-from compgen.controllers.error_files import read_error_file
-from compgen.controllers.etalon_exchange import errors_from_etalon
+from compgen.controllers.isg.error_files import read_error_file
+from compgen.controllers.isg.etalon_exchange import errors_from_etalon
 from compgen.core import tomlio
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import CHAINS, Axis, Chain, Machine

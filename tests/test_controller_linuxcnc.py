@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 import compgen
 from compgen.controllers import SourceFile, controller_named
-from compgen.controllers.linuxcnc_comp_table import CompTable, parse_comp, standstill_outcome
-from compgen.controllers.linuxcnc_volcomp import VolCurve, VolTable, VolTerm
-from compgen.controllers.linuxcnc_volcomp_parse import parse_volcomp
+from compgen.controllers.linuxcnc.comp_table import CompTable, parse_comp, standstill_outcome
+from compgen.controllers.linuxcnc.volcomp import VolCurve, VolTable, VolTerm
+from compgen.controllers.linuxcnc.volcomp_parse import parse_volcomp
 from compgen.core import tomlio
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import CHAINS, Axis, Chain, Machine

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import compgen
 from compgen.controllers import SourceFile, controller_named
-from compgen.controllers.mitsubishi_tables import values_of
+from compgen.controllers.mitsubishi.tables import values_of
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import read_machine
 from compgen.core.points import Points

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import compgen
 from compgen.controllers import CONTROLLERS, SourceFile
-from compgen.controllers.pmac_tables import Line, Sheet
+from compgen.controllers.pmac.tables import Line, Sheet
 from compgen.core import tomlio
 from compgen.core.machine import Axis, Chain, Machine
 from compgen.core.reversal import ReversalCurves

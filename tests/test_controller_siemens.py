@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from compgen.controllers import SourceFile, controller_named
 from compgen.controllers.base import Monomial, Term
-from compgen.controllers.siemens_cec import CecTables
-from compgen.controllers.siemens_limits import largest_slopes, largest_sums
-from compgen.controllers.siemens_products import balanced_factors, balanced_scale, folded_tables
+from compgen.controllers.siemens.cec import CecTables
+from compgen.controllers.siemens.limits import largest_slopes, largest_sums
+from compgen.controllers.siemens.products import balanced_factors, balanced_scale, folded_tables
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import CHAINS, Machine, read_machine
 from compgen.core.names import CURVE_NAMES, error_named

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from compgen.controllers import CONTROLLERS, SourceFile, controller_named
-from compgen.controllers.siemens_profiles import PROFILES
-from compgen.controllers.siemens_ranking import chosen_terms, table_count
+from compgen.controllers.siemens.profiles import PROFILES
+from compgen.controllers.siemens.ranking import chosen_terms, table_count
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Axis, Chain, Machine
 from compgen.core.names import error_named

@@ -24,7 +24,7 @@ import pytest
 
 import compgen
 from compgen.controllers import SourceFile, controller_named
-from compgen.controllers.linuxcnc_comp_table import standstill_outcome
+from compgen.controllers.linuxcnc.comp_table import standstill_outcome
 from compgen.core.error_table import Curve
 from compgen.core.reversal import ReversalCurves
 from compgen.model.exact import exact_error

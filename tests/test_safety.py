@@ -12,7 +12,7 @@ import compgen
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.controllers import CONTROLLERS
-from compgen.controllers.siemens_eec import SiemensEec
+from compgen.controllers.siemens.eec import SiemensEec
 from compgen.core.deviations import Deviations
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.lengths import Lengths

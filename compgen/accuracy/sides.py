@@ -14,8 +14,8 @@ from compgen.accuracy.figure import Figure
 from compgen.accuracy.pairing import MeasuredField, measured_field
 from compgen.accuracy.runs import RunStatistics, axis_statistics
 from compgen.accuracy.source import ErrorSource, error_source
-from compgen.controllers.error_files import read_error_file
-from compgen.controllers.etalon_exchange import is_exchange_text
+from compgen.controllers.isg.error_files import read_error_file
+from compgen.controllers.isg.etalon_exchange import is_exchange_text
 from compgen.core.axis_runs import AxisRuns
 from compgen.core.csvio import read_csv
 from compgen.core.deviations import Deviations

@@ -8,7 +8,7 @@ import click
 
 from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.cli.identify_commands import sixdof_option
-from compgen.controllers.error_files import read_error_file
+from compgen.controllers.isg.error_files import read_error_file
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.diagnose import DiagnoseOptions, Diagnosis, diagnose

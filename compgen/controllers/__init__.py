@@ -1,24 +1,24 @@
-"""The controls: one module per family, one explicit registry."""
+"""The controls: one folder per vendor or family, what they share beside them, one explicit registry."""
 
 from __future__ import annotations
 
 from compgen.controllers.base import AnyController, Controller, Monomial, SourceFile, Term
-from compgen.controllers.etalon_exchange import EtalonExchange
-from compgen.controllers.fanuc_3d import Fanuc3d
-from compgen.controllers.fanuc_pitch import FanucPitch
-from compgen.controllers.fanuc_straightness import FanucStraightness
-from compgen.controllers.heidenhain_com import HeidenhainCom
-from compgen.controllers.heidenhain_kinematics import HeidenhainKinematics
-from compgen.controllers.isg_csv import IsgCsv
-from compgen.controllers.linuxcnc_comp import LinuxcncComp
-from compgen.controllers.linuxcnc_volumetric import LinuxcncVolumetric
-from compgen.controllers.mitsubishi import Mitsubishi
-from compgen.controllers.neutral import Neutral
-from compgen.controllers.pmac import Pmac
-from compgen.controllers.siemens_cec import SiemensCec
-from compgen.controllers.siemens_cec_eec import SiemensCecEec
-from compgen.controllers.siemens_eec import SiemensEec
-from compgen.controllers.twincat_lists import TwincatLists
+from compgen.controllers.fanuc.pitch import FanucPitch
+from compgen.controllers.fanuc.straightness import FanucStraightness
+from compgen.controllers.fanuc.volumetric import Fanuc3d
+from compgen.controllers.heidenhain.com import HeidenhainCom
+from compgen.controllers.heidenhain.kinematics import HeidenhainKinematics
+from compgen.controllers.isg.etalon_exchange import EtalonExchange
+from compgen.controllers.isg.volcomp import IsgCsv
+from compgen.controllers.linuxcnc.comp import LinuxcncComp
+from compgen.controllers.linuxcnc.volumetric import LinuxcncVolumetric
+from compgen.controllers.mitsubishi.control import Mitsubishi
+from compgen.controllers.neutral.control import Neutral
+from compgen.controllers.pmac.control import Pmac
+from compgen.controllers.siemens.cec import SiemensCec
+from compgen.controllers.siemens.cec_eec import SiemensCecEec
+from compgen.controllers.siemens.eec import SiemensEec
+from compgen.controllers.twincat.lists import TwincatLists
 from compgen.core.plugins import why_missing
 from compgen.core.text import nearest
 from compgen.errors import InputError

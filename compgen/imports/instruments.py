@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controllers.etalon_exchange import errors_from_etalon
+from compgen.controllers.isg.etalon_exchange import errors_from_etalon
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import InputError
 from compgen.imports.capture import read_capture

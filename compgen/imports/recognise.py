@@ -6,10 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from compgen.controllers.etalon_exchange import is_exchange_text
+from compgen.controllers.isg.etalon_exchange import is_exchange_text
 from compgen.errors import CompgenError, InputError
 from compgen.imports.capture import MOST_BYTES as MOST_CAPTURE
 from compgen.imports.capture import is_capture
+from compgen.imports.columns import check_field
 from compgen.imports.ecmc import is_ecmc
 from compgen.imports.grid import grid_of_text
 from compgen.imports.instruments import import_capture, import_ecmc, import_exchange, import_renishaw
@@ -28,6 +29,26 @@ OWN = {
     "deviations": {"x_mm", "y_mm", "z_mm"},
 }
 _DEVIATIONS = {"dx_um", "dy_um", "dz_um"}
+_FLAGS = {
+    "columns": "--map",
+    "units": "--unit",
+    "axis": "--axis",
+    "error": "--error",
+    "sign": "--sign",
+    "directions": "--directions",
+    "sheet": "--sheet",
+    "dates": "--dates",
+}
+_ONE_AXIS = ("axis", "error", "sign", "directions", "dates")
+#: What each format leaves to the user.
+_TAKES: dict[str, tuple[str, ...]] = {
+    "renishaw": ("units", *_ONE_AXIS),
+    "renishaw-capture": ("dates",),
+    "ecmc-iso230": _ONE_AXIS[:-1],
+    "etalon-exchange": ("sign",),
+    "table": tuple(name for name in _FLAGS if name != "sheet"),
+    "xlsx": tuple(_FLAGS),
+}
 
 
 def own_kind(path: Path) -> str | None:
@@ -75,10 +96,25 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
         with file, line and column for one that is damaged, cut, too large or not known.
     """
     source, chosen = Path(path), options or ImportOptions()
-    item = READERS[form_of(source)](source, chosen)
+    form = form_of(source)
+    _check_options(source, form, chosen)
+    item = READERS[form](source, chosen)
     if chosen.kind is not None and item.kind != chosen.kind:
         raise InputError(f"holds {item.kind}, not {chosen.kind}", file=source, field="--kind")
     return item
+
+
+def _check_options(path: Path, form: str, options: ImportOptions) -> None:
+    """Refuse what a format cannot take, and names that are none: an option that is silently ignored misleads."""
+    for name, flag in _FLAGS.items():
+        if getattr(options, name) and name not in _TAKES[form]:
+            taken = ", ".join(_FLAGS[key] for key in _TAKES[form]) or "none"
+            raise InputError(f"does not apply to a file of the format {form}; {taken} do", file=path, field=flag)
+    for key in options.units:
+        if form == "renishaw" and key not in ("value", "deviation"):
+            raise InputError("of this format only the unit of the values is open", file=path, field=f"--unit {key}")
+        if key != "value":
+            check_field(key, "--unit")
 
 
 def _import_text(path: Path, options: ImportOptions) -> Imported:

@@ -1,0 +1,177 @@
+"""What the templates of straightness compensation show: records, plan, parameters to set, worked numbers."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+
+from compgen.controllers.fanuc.straightness_settings import StraightnessSettings
+from compgen.controllers.fanuc.straightness_tables import (
+    ENTRIES,
+    GRID_PARAMETERS,
+    MOVING,
+    StraightTable,
+    StraightTables,
+    entry_numbers,
+)
+from compgen.controllers.fanuc.style import Punched
+from compgen.core.csvio import fixed
+from compgen.core.machine import Machine
+from compgen.core.names import AXES, MM_PER_UM
+
+
+def straightness_context(machine: Machine, settings: StraightnessSettings, tables: StraightTables) -> dict[str, Any]:
+    """Return the context beyond the common one."""
+    common = _common(settings, tables)
+    grids = _grids(settings, tables)
+    return {
+        "sign_statement": _sign_statement(machine, settings, tables),
+        "parameters": _rows(settings, tables, common, grids),
+        "warnings": _warnings(settings, tables),
+        "tables": [_summary(machine, settings, entry) for entry in tables.entries],
+        "settings": settings,
+        "style_notes": list(settings.style_notes),
+        "file": _punched(settings, common, grids),
+        "plan": {
+            "common": common,
+            "axes": {number: {axis: text for axis, text in values} for number, values in grids.items()},
+            "stores": settings.stores,
+            "detection_unit_um": settings.detection_unit_um,
+        },
+        "check": _check(machine, settings, tables.entries[0]) if tables.entries else None,
+    }
+
+
+def _common(settings: StraightnessSettings, tables: StraightTables) -> dict[int, int]:
+    """Parameter number -> value of the entries."""
+    found: dict[int, int] = {}
+    for k, entry in enumerate(tables.entries):
+        axes = (settings.axis_numbers[entry.moving], settings.axis_numbers[entry.compensated])
+        found.update(zip(entry_numbers(k), (*axes, *entry.numbers, *entry.amounts), strict=True))
+    return dict(sorted(found.items()))
+
+
+def _grids(settings: StraightnessSettings, tables: StraightTables) -> dict[int, list[tuple[int, str]]]:
+    """Parameters 3620 ... of the moving axes: number -> (axis number, value as text)."""
+    style = settings.style
+    found: dict[int, list[tuple[int, str]]] = {number: [] for number in GRID_PARAMETERS}
+    for entry in tables.entries:
+        grid, axis = entry.grid, settings.axis_numbers[entry.moving]
+        unit = Decimal(1) if style.real_point else Decimal(repr(settings.interval_unit_mm))
+        length = style.length(grid.interval_mm / unit)
+        texts = (*map(style.whole, (grid.reference, grid.first, grid.last)), length)
+        for number, text in zip(GRID_PARAMETERS, texts, strict=True):
+            found[number].append((axis, text))
+    return {number: sorted(values) for number, values in found.items()}
+
+
+def _punched(
+    settings: StraightnessSettings, common: dict[int, int], grids: dict[int, list[tuple[int, str]]]
+) -> Punched:
+    style, records = settings.style, []
+    for number, values in grids.items():
+        records += style.parameter(number, values, style.real_letter if number == GRID_PARAMETERS[3] else "P")
+    records += [style.common(number, value) for number, value in common.items()]
+    return Punched(style.file(records, []))
+
+
+def _sign_statement(machine: Machine, settings: StraightnessSettings, tables: StraightTables) -> str:
+    stored = "the correction, which the control adds" if settings.stores == "correction" else "the error"
+    text = (
+        f"The amounts are {stored} to the command of the compensated axis; one count is {settings.detection_unit_um:g} um. "
+        f"Linear between the four points, zero outside."
+    )
+    for entry in tables.entries[:1]:
+        k = int(np.argmax(np.abs(entry.amounts)))
+        moved = settings.sign * entry.amounts[k] * settings.detection_unit_um
+        at = machine.reference_point_mm[entry.moving] + entry.along_mm[k]
+        text += (
+            f" At point {entry.numbers[k]}, {AXES[entry.moving]} = {at:g} mm, the amount {entry.amounts[k]:+d} moves "
+            f"{AXES[entry.compensated]} by {moved:+g} um."
+        )
+    return text
+
+
+def _rows(
+    settings: StraightnessSettings,
+    tables: StraightTables,
+    common: dict[int, int],
+    grids: dict[int, list[tuple[int, str]]],
+) -> list[dict[str, str]]:
+    names = dict(zip(settings.axis_numbers, AXES, strict=True))
+    meanings = dict(
+        zip(GRID_PARAMETERS, ("point at the reference point", "first point", "last point", "interval"), strict=True)
+    )
+    rows = [
+        {
+            "name": f"{number} ({names[axis]}, A{axis})",
+            "value": text,
+            "meaning": f"{meanings[number]}; must be the value that stored pitch error compensation uses",
+        }
+        for number, values in grids.items()
+        for axis, text in values
+    ]
+    for k, entry in enumerate(tables.entries):
+        words = [
+            "moving axis",
+            "compensated axis",
+            *(f"point {n}" for n in "abcd"),
+            *(f"amount at {n}" for n in "abcd"),
+        ]
+        rows += [
+            {"name": str(number), "value": str(common[number]), "meaning": f"{entry.name}: {word}"}
+            for number, word in zip(entry_numbers(k), words, strict=True)
+        ]
+    rows += [
+        {"name": str(MOVING + k), "value": "0", "meaning": "no moving axis: this entry is not used"}
+        for k in ENTRIES[len(tables.entries) :]
+    ]
+    return rows
+
+
+def _warnings(settings: StraightnessSettings, tables: StraightTables) -> list[str]:
+    found = ["Sign, range and parameter numbers are not settled by public documents: check one entry first (part 3)."]
+    if settings.style_notes:
+        found.append("The style was taken from the sample: " + "; ".join(settings.style_notes) + ".")
+    for entry in tables.entries:
+        grid = entry.grid
+        if not settings.stated[entry.moving]:
+            found.append(
+                f"The compensation points of {AXES[entry.moving]} are assumed: {grid.first} to {grid.last}, reference point "
+                f"{grid.reference}, every {grid.interval_mm:f} mm. If pitch compensation uses others, state them as "
+                f"points.{AXES[entry.moving]} in the machine file and export again."
+            )
+        ends = [settings.sign * entry.amounts[k] * settings.count_mm / MM_PER_UM for k in (0, 3)]
+        if any(ends):
+            found.append(
+                f"{entry.name}: beyond its outer points the control is taken to drop to zero, a step of {fixed(ends[0], 1)} "
+                f"and {fixed(ends[1], 1)} um."
+            )
+    return found
+
+
+def _summary(machine: Machine, settings: StraightnessSettings, entry: StraightTable) -> dict[str, Any]:
+    knots = machine.reference_point_mm[entry.moving] + entry.along_mm
+    return {
+        "name": entry.name,
+        "knots": [
+            {"number": number, "mm": float(mm), "amount": amount}
+            for number, mm, amount in zip(entry.numbers, knots, entry.amounts, strict=True)
+        ],
+    }
+
+
+def _check(machine: Machine, settings: StraightnessSettings, entry: StraightTable) -> dict[str, Any]:
+    """A trial of one entry: all amounts 0 but one, and what the compensated axis must do there."""
+    counts = 10
+    return {
+        "moving": AXES[entry.moving],
+        "compensated": AXES[entry.compensated],
+        "parameter": entry_numbers(0)[7],
+        "counts": counts,
+        "at_mm": float(machine.reference_point_mm[entry.moving] + entry.along_mm[1]),
+        "zero_mm": float(machine.reference_point_mm[entry.moving] + entry.along_mm[2]),
+        "change_um": settings.sign * counts * settings.detection_unit_um,
+    }

@@ -1,0 +1,1 @@
+"""HEIDENHAIN TNC: .COM/.CMA tables (heidenhain-com), KinematicsComp as a draft (heidenhain-kinematics)."""

@@ -1,0 +1,1 @@
+"""Mitsubishi: memory type relative position error (mitsubishi)."""

@@ -1,0 +1,1 @@
+"""Neutral samples of the correction as CSV and JSON (neutral)."""

@@ -1,0 +1,1 @@
+"""Omron PMAC: compensation tables of one and two dimensions (pmac)."""

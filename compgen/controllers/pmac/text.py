@@ -1,0 +1,207 @@
+"""Reading PMAC download files with ``DEFINE COMP`` and ``DEFINE BLCOMP``, strictly; ``;`` starts a comment."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from compgen.controllers.base import SourceFile
+from compgen.controllers.isg.parameters import content_lines
+from compgen.controllers.pmac.tables import Backlash, IntArray, Line, PmacTables, Sheet
+from compgen.core.text import one_line
+
+_DEFINE = re.compile(r"DEFINE ?(BL)?COMP ?([0-9]{1,6})(\.[0-9]{1,6})?,([#0-9D, ]{1,80})", re.IGNORECASE)
+_ADDRESS = re.compile(r"#([0-9]{1,2})(?: |$)")
+_SOURCE = re.compile(r"#([0-9]{1,2})(D?)")
+_WHOLE = re.compile(r"[+-]?[0-9]{1,8}")
+_VARIABLE = re.compile(r"I ?([0-9]{1,4}) ?= ?([+-]?[0-9]{1,9})")
+_DELETE = re.compile(r"DELETE ?(?:BL|T)?(?:COMP|BUF)|DELETE ?(?:GATHER|ROTARY|LOOKAHEAD)|CLOSE", re.IGNORECASE)
+_DECLARED = re.compile(r";\s{0,9}tables:\s{0,9}([0-9]{1,4})\s*$")
+_LARGEST = 2**23 - 1
+_MOST_MOTOR = 32
+_MOST_ENTRIES = 150_000
+
+
+@dataclass
+class _Open:
+    """A table whose entries are being read."""
+
+    line: int
+    head: str
+    motor: int
+    backlash: bool
+    shape: tuple[int, ...]
+    sources: list[tuple[int, bool]]
+    spans: list[int]
+    entries: list[int] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        """Number of entries that are due."""
+        if len(self.shape) == 1:
+            return self.shape[0]
+        return (self.shape[0] + 1) * (self.shape[1] + 1) - 1
+
+
+@dataclass
+class _Reader:
+    source: SourceFile
+    motor: int | None = None
+    open: _Open | None = None
+    tables: list[Line | Sheet] = field(default_factory=list)
+    backlash: list[Backlash] = field(default_factory=list)
+    constants: dict[int, int] = field(default_factory=dict)
+    seen: dict[str, int] = field(default_factory=dict)
+    enabled: bool | None = None
+
+    def take(self, line: int, text: str) -> None:
+        """Read one line without its comment."""
+        rest = " ".join(text.split())
+        if self.open is not None:
+            self._entries(line, rest)
+            return
+        address = _ADDRESS.match(rest)
+        if address:
+            self.motor = self._motor(line, address.group(1))
+            rest = rest[address.end() :].strip()
+        if not rest or _DELETE.fullmatch(rest):
+            return
+        define, variable = _DEFINE.fullmatch(rest), _VARIABLE.fullmatch(rest.upper())
+        if define:
+            self._define(line, rest, define)
+        elif variable:
+            self._variable(line, int(variable.group(1)), int(variable.group(2)))
+        else:
+            shown = one_line(rest)[:60]
+            raise self.source.fail(f"{shown!r} is not understood; #1, DEFINE COMP 8,4000 or I51=1 is due", line)
+
+    def _motor(self, line: int, word: str) -> int:
+        if not 1 <= int(word) <= _MOST_MOTOR:
+            raise self.source.fail(f"#{word} is no motor; 1 to {_MOST_MOTOR} are", line)
+        return int(word)
+
+    def _variable(self, line: int, number: int, value: int) -> None:
+        key = f"I{number}"
+        self._once(line, key, f"{key} is set")
+        if number == 51 and value in (0, 1):
+            self.enabled = value == 1
+        elif number % 100 == 86 and 1 <= number // 100 <= _MOST_MOTOR and abs(value) <= _LARGEST:
+            self.constants[number // 100] = value
+        else:
+            raise self.source.fail(f"I{number}={value} is no part of compensation; I51=1 or Ixx86 (backlash) is", line)
+
+    def _once(self, line: int, key: str, what: str) -> None:
+        first = self.seen.setdefault(key, line)
+        if first != line:
+            raise self.source.fail(f"{what} a second time; the first is in line {first}", line)
+
+    def _define(self, line: int, text: str, match: re.Match[str]) -> None:
+        if self.motor is None:
+            raise self.source.fail("no motor is addressed; #1 (or another) is due before DEFINE", line)
+        backlash, two = bool(match.group(1)), bool(match.group(3))
+        self._once(line, f"{'BL' if backlash else ''}#{self.motor}", f"motor {self.motor} gets a table")
+        shape = (int(match.group(2)),) + ((int(match.group(3)[1:]),) if two else ())
+        words = [word.strip() for word in match.group(4).upper().split(",")]
+        spans = words[-2:] if two else words[-1:]
+        sources = [_SOURCE.fullmatch(word) for word in words[: -len(spans)]]
+        least, most = (0, 0) if backlash else (1, 3) if two else (0, 2)
+        if (
+            backlash
+            and two
+            or not least <= len(sources) <= most
+            or not all(sources)
+            or not all(map(_WHOLE.fullmatch, spans))
+        ):
+            raise self.source.fail(f"{text[:80]!r} has wrong arguments; {_SYNTAX[backlash, two]} is due", line)
+        if min(shape) < 1 or min(map(int, spans)) < 1 or len(spans) != 1 + two:
+            raise self.source.fail(f"{text[:80]!r}: sizes and spans are whole numbers above zero", line)
+        named = [(self._motor(line, found.group(1)), found.group(2) == "D") for found in sources if found]
+        self.open = _Open(line, text, self.motor, backlash, shape, named, [int(word) for word in spans])
+        if self.open.count > _MOST_ENTRIES:
+            raise self.source.fail(f"{self.open.count} entries; at most {_MOST_ENTRIES} are read", line)
+
+    def _entries(self, line: int, text: str) -> None:
+        table = self.open
+        assert table is not None
+        for word in text.split():
+            if not _WHOLE.fullmatch(word) or abs(int(word)) > _LARGEST:
+                done = f"{len(table.entries)} of {table.count} entries of the table in line {table.line} are there"
+                shown = one_line(word)[:30]
+                raise self.source.fail(f"{shown!r} is not a whole number of 1/16 counts; {done}", line)
+            if len(table.entries) == table.count:
+                raise self.source.fail(f"{word} is one entry too many for {table.head[:60]!r}", line)
+            table.entries.append(int(word))
+        if len(table.entries) == table.count:
+            self._close(table)
+
+    def _close(self, table: _Open) -> None:
+        self.open = None
+        values = np.array(table.entries, dtype=np.int64)
+        if table.backlash:
+            self.backlash.append(Backlash(table.motor, table.spans[0], values))
+        elif len(table.shape) == 1:
+            self.tables.append(_line(table, values))
+        else:
+            self.tables.append(_sheet(table, values))
+
+
+_SYNTAX = {
+    (False, False): "DEFINE COMP entries,[#source[D],[#target],]length",
+    (False, True): "DEFINE COMP rows.columns,#row[D],[#column[D],[#target],]row span,column span",
+    (True, False): "DEFINE BLCOMP entries,length",
+    (True, True): "DEFINE BLCOMP entries,length",
+}
+
+
+def _line(table: _Open, values: IntArray) -> Line:
+    source, desired = table.sources[0] if table.sources else (table.motor, False)
+    target = table.sources[1][0] if len(table.sources) > 1 else table.motor
+    return Line(table.motor, source, target, table.spans[0], values, desired)
+
+
+def _sheet(table: _Open, values: IntArray) -> Sheet:
+    row, column, target = [*table.sources, *[(table.motor, False)] * 3][:3]
+    rows, columns = table.shape
+    grid = np.concatenate([[0], values]).reshape(rows + 1, columns + 1)
+    row_span, column_span = table.spans
+    return Sheet(table.motor, row[0], column[0], target[0], row_span, column_span, grid, row[1], column[1])
+
+
+def parse_pmac(files: Sequence[SourceFile]) -> PmacTables:
+    """Return the tables of all files; InputError with file and line for anything malformed or cut."""
+    readers = [_read(source) for source in files]
+    owners: dict[tuple[bool, int], SourceFile] = {}
+    for reader in readers:
+        for table in (*reader.tables, *reader.backlash):
+            first = owners.setdefault((isinstance(table, Backlash), table.motor), reader.source)
+            if first is not reader.source:
+                raise reader.source.fail(f"motor {table.motor} has a table in {first.path.name} already")
+    switches = [reader.enabled for reader in readers if reader.enabled is not None]
+    return PmacTables(
+        tables=tuple(table for reader in readers for table in reader.tables),
+        backlash=tuple(table for reader in readers for table in reader.backlash),
+        constants={motor: value for reader in readers for motor, value in reader.constants.items()},
+        enabled=switches[-1] if switches else None,
+    )
+
+
+def _read(source: SourceFile) -> _Reader:
+    reader, line = _Reader(source), 0
+    for line, text in content_lines(source, ";"):
+        reader.take(line, text)
+    if reader.open is not None:
+        table = reader.open
+        have = f"{len(table.entries)} of {table.count} entries"
+        raise source.fail(f"the table in line {table.line} has {have}: the file was cut", line)
+    count = len(reader.tables) + len(reader.backlash)
+    declared = next((m for text in source.text.split("\n")[:50] if (m := _DECLARED.match(text[:200].strip()))), None)
+    if declared and int(declared.group(1)) != count:
+        raise source.fail(f"declares {declared.group(1)} tables but holds {count}: it was cut or edited by hand")
+    if declared and (reader.enabled is None or not source.text.endswith("\n")):
+        raise source.fail("has no I51 at its end: it was cut")
+    if not count:
+        raise source.fail("holds no compensation table")
+    return reader

@@ -1,0 +1,308 @@
+"""SINUMERIK cross-error compensation (CEC, sag): any axis corrected as a function of any axis, and products of tables.
+
+Source: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245-252, 264; 802D sl, p. 215-222.
+The sign of the sum is not settled by the readable documents and must be stated in the machine file.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.siemens.limits import cec_usage, largest_sums, set_violations, stated_limit_violations
+from compgen.controllers.siemens.preflight import cec_parameters, cec_sign_statement, cec_warnings
+from compgen.controllers.siemens.products import (
+    MM_DECIMALS,
+    NEGLIGIBLE_PRODUCT_MM,
+    CecMap,
+    CecTable,
+    folded_tables,
+    labels_in,
+    sum_into_axes,
+    term_names,
+    written_decimals,
+)
+from compgen.controllers.siemens.ranking import Choice, chosen_terms, terms_of_tables
+from compgen.controllers.siemens.reversal import backlash_rows, reversal_statement, with_reversal_tables
+from compgen.controllers.siemens.settings import CecSettings, take_cec_settings
+from compgen.controllers.siemens.syntax import (
+    PROTECTING,
+    SWITCHES,
+    Assignment,
+    TableParts,
+    axis_of,
+    read_assignments,
+)
+from compgen.controllers.terms import one_dimensional_terms, product_terms
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.names import AXES
+from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
+from compgen.errors import CompgenWarning
+
+#: Variables of the tables and their switches without ``$``, with the number of their indices (K3-2013, p. 245-249).
+VARIABLES = {
+    "AN_CEC": 2,
+    "AN_CEC_INPUT_AXIS": 1,
+    "AN_CEC_OUTPUT_AXIS": 1,
+    "AN_CEC_STEP": 1,
+    "AN_CEC_MIN": 1,
+    "AN_CEC_MAX": 1,
+    "AN_CEC_DIRECTION": 1,
+    "AN_CEC_MULT_BY_TABLE": 1,
+    "AN_CEC_IS_MODULO": 1,
+    "MA_CEC_ENABLE": 1,
+    "SN_CEC_TABLE_ENABLE": 1,
+    "SN_CEC_TABLE_WEIGHT": 1,
+}
+#: (output, axis) of every table without products.
+ALL_PAIRS = [(output, axis) for output in range(3) for axis in range(3)]
+_AXIS_VALUE = re.compile(r'\(\s*([A-Z0-9_]{1,32})\s*\)|"([A-Z0-9_]{1,32})"')
+#: Every output axis has three ordinary tables and, on every chain, at most three products.
+_ORDINARY_PER_AXIS = _PRODUCTS_PER_AXIS = 3
+#: Factors of a product have 9 decimals and stay below some mm: what their rounding may add up to on one axis.
+_FACTOR_ROUNDING_MM = 1e-8
+
+
+@dataclass(frozen=True)
+class CecTables:
+    """Tables by index, with the numbers as the file has them."""
+
+    tables: CecMap
+
+
+class SiemensCec(Controller[CecSettings, CecTables]):
+    """SINUMERIK CEC: straightness, squareness, positioning, and angular errors as products of tables."""
+
+    name = "siemens-cec"
+    bidirectional = True
+
+    def read_settings(self, machine: Machine) -> CecSettings:
+        """Check the settings; ``sign`` is mandatory."""
+        section = machine.controller_settings(self.name)
+        settings = take_cec_settings(section, machine)
+        section.finish()
+        return settings
+
+    def basis(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> list[Term]:
+        """Return nine tables output over axis, and the products with levers that count from the reference point.
+
+        If the control has fewer tables than that takes, those remain that leave the least error over the volume.
+        """
+        return self._choice(machine, settings, errors).kept
+
+    def basis_of(self, machine: Machine, settings: CecSettings, errors: ErrorTable, tables: CecTables) -> list[Term]:
+        """Return the terms that the tables hold, if no better set fits into the control."""
+        choice = self._choice(machine, settings, errors)
+        terms = cec_terms(machine, settings, errors, ALL_PAIRS)
+        return terms_of_tables(machine, errors, terms, settings.mult_mode, choice, term_names(tables.tables))
+
+    def left_out(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> list[str]:
+        """Return which tables the control has no room for, and what stays uncorrected for that, in words."""
+        return self._choice(machine, settings, errors).statements()
+
+    def _choice(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> Choice:
+        terms = cec_terms(machine, settings, errors, ALL_PAIRS)
+        return chosen_terms(machine, errors, terms, settings.mult_mode, settings.tables_usable)
+
+    def build(
+        self, machine: Machine, settings: CecSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
+    ) -> CecTables:
+        """Return the tables with balanced folding, in whole units of the last decimal."""
+        return cec_tables_of(machine, settings, basis, values)
+
+    def with_reversal(
+        self, machine: Machine, settings: CecSettings, tables: CecTables, reversal: ReversalCurves
+    ) -> CecTables:
+        """Return the tables with a pair DIRECTION 1 and -1 for each reversal."""
+        return CecTables(
+            with_reversal_tables(
+                machine,
+                tables.tables,
+                reversal,
+                subtracts=settings.subtracts,
+                max_points=settings.max_points,
+                step_mm=settings.step_mm,
+            )
+        )
+
+    def context(self, machine: Machine, settings: CecSettings, tables: CecTables) -> dict[str, Any]:
+        """Return tables, machine data and the sign with a number from the file."""
+        sums = largest_sums(machine, tables.tables, settings.mult_mode)
+        both = {index: entry for index, entry in tables.tables.items() if entry.direction == 0}
+        mean_sums = largest_sums(machine, both, settings.mult_mode) if len(both) < len(tables.tables) else sums
+        names, subtracts = settings.axis_names, settings.subtracts
+        return {
+            "sign_statement": cec_sign_statement(names, subtracts, mean_sums)
+            + reversal_statement(tables.tables, names),
+            "parameters": cec_parameters(machine, names, tables.tables, settings.mult_mode, sums)
+            + backlash_rows(tables.tables, names),
+            "warnings": cec_warnings(machine, names, tables.tables, settings, sums),
+            "sign": settings.sign,
+            "mult_mode": settings.mult_mode,
+            "container": settings.container.kind,
+            "program_enables": settings.container.enables,
+            "outputs": [names[axis] for axis in sorted({entry.output_axis for entry in tables.tables.values()})],
+            "has_products": any(entry.multiplier for entry in tables.tables.values()),
+            "tables": [self._table_context(settings, index, entry) for index, entry in sorted(tables.tables.items())],
+        }
+
+    def _table_context(self, settings: CecSettings, index: int, entry: CecTable) -> dict[str, Any]:
+        return {
+            "index": index,
+            "label": entry.label,
+            "input": _styled(settings, entry.input_axis),
+            "output": _styled(settings, entry.output_axis),
+            "step_mm": float(entry.table.step_mm),
+            "minimum_mm": float(entry.table.start_mm),
+            "maximum_mm": float(entry.table.last_mm),
+            "direction": entry.direction,
+            "multiplier": entry.multiplier,
+            "modulo": int(entry.table.modulo),
+            "enabled": int(entry.enabled),
+            "weight": float(entry.weight),
+            "decimals": entry.decimals,
+            "values_mm": [float(value) for value in entry.table.values],
+        }
+
+    def parse(self, machine: Machine, settings: CecSettings, files: Sequence[SourceFile]) -> CecTables:
+        """Read the tables; every variable of a table must be there, because the control keeps old values."""
+        return cec_tables_from(read_assignments(files, VARIABLES), files, settings)
+
+    def emulate(self, machine: Machine, settings: CecSettings, tables: CecTables, points: Points) -> FloatArray:
+        """Return what the control adds: the clipped sum of the tables, subtracted or added as ``sign`` says.
+
+        A table with DIRECTION 1 or -1 acts where the last travel of its input axis (``points.approach``) has that
+        sign. Where that is unknown (0, or no approach at all) it does not act, and a CompgenWarning says so: what a
+        control does before the first motion is not documented.
+        """
+        outputs = {index: _output(entry, points) for index, entry in tables.tables.items()}
+        totals = sum_into_axes(tables.tables, settings.mult_mode, outputs)
+        total = np.column_stack([np.broadcast_to(part, (len(points),)) for part in totals])
+        if settings.max_sum_mm is not None:
+            total = np.clip(total, -np.array(settings.max_sum_mm), np.array(settings.max_sum_mm))
+        return -total if settings.subtracts else total
+
+    def violations(self, machine: Machine, settings: CecSettings, tables: CecTables) -> list[str]:
+        """Return broken rules of the set, and sums above MD32720 or too fast for MD32730 if the file states them."""
+        found = set_violations(machine, tables.tables, settings.max_points, settings.tables_available)
+        return found + stated_limit_violations(machine, tables.tables, settings)
+
+    def table_nodes_mm(self, machine: Machine, settings: CecSettings, tables: CecTables) -> tuple[FloatArray, ...]:
+        """Return the nodes of all tables by their input axis."""
+        return nodes_by_axis((entry.input_axis, entry.table.nodes_mm) for entry in tables.tables.values())
+
+    def usage(self, machine: Machine, settings: CecSettings, tables: CecTables) -> list[Usage]:
+        """Return nodes, tables, sums and their change against the limits; those not stated against usual defaults."""
+        return cec_usage(machine, tables.tables, settings)
+
+    def resolution_mm(self, settings: CecSettings) -> float:
+        """Half of the last decimal of every ordinary table and of every product that is too small to be written."""
+        ordinary = _ORDINARY_PER_AXIS * 0.5 * 10.0**-MM_DECIMALS
+        return ordinary + settings.products * (_PRODUCTS_PER_AXIS * NEGLIGIBLE_PRODUCT_MM + _FACTOR_ROUNDING_MM)
+
+
+def _styled(settings: CecSettings, axis: int) -> str:
+    name = settings.axis_names[axis]
+    return f"({name})" if settings.axis_style == "paren" else f'"{name}"'
+
+
+def cec_terms(
+    machine: Machine, settings: CecSettings, errors: ErrorTable, pairs: Sequence[tuple[int, int]]
+) -> list[Term]:
+    """Return the terms of tables output over axis for the pairs, and of the products unless the settings forbid them."""
+    nodes = [
+        equidistant_grid(
+            machine, errors, axis, most=settings.max_points, step_mm=settings.step_mm[axis], loss_mm=settings.loss_mm
+        ).nodes_mm
+        for axis in range(3)
+    ]
+    if not settings.products:
+        return one_dimensional_terms(machine, errors, nodes, pairs)
+    origin = machine.reference_point_mm
+    ordinary = one_dimensional_terms(machine, errors, nodes, pairs, lever_origin_mm=origin)
+    return ordinary + product_terms(machine, errors, nodes, origin)
+
+
+def cec_tables_of(
+    machine: Machine, settings: CecSettings, terms: Sequence[Term], values: Mapping[str, FloatArray]
+) -> CecTables:
+    """Return the tables of term values, rounded as written."""
+    travel = [axis.range_mm for axis in machine.axes]
+    mode = settings.mult_mode
+    return CecTables(folded_tables(terms, values, flip=settings.subtracts, mode=mode, travel_mm=travel))
+
+
+def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], settings: CecSettings) -> CecTables:
+    """Return the tables that assignments make; ``files`` are looked at for the names of the tables in comments."""
+    parts: dict[int, TableParts] = {}
+    switches: dict[tuple[str, int], Assignment] = {}
+    for item in items:
+        if item.variable in PROTECTING:
+            axis_of(item, item.index[-1], settings.axis_names)
+            continue
+        index = item.index_number(0, 999)
+        if item.variable in SWITCHES:
+            switches[item.variable, index] = item
+            continue
+        part = parts.setdefault(index, TableParts(f"table {index}", item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
+    labels = labels_in(files)
+    found = {
+        index: _read_table(part, settings.axis_names, labels.get(index, "")) for index, part in sorted(parts.items())
+    }
+    for (variable, index), item in switches.items():
+        if variable == "SN_CEC_TABLE_ENABLE" and index in found:
+            found[index] = replace(found[index], enabled=item.whole(0, 1) == 1)
+        elif index in found:
+            found[index] = replace(found[index], weight=item.number())
+        elif item.number() != 0:
+            raise item.fail(f"the files hold no table {index}")
+    return CecTables(found)
+
+
+def _read_table(part: TableParts, axis_names: Sequence[str], label: str) -> CecTable:
+    input_item, output_item = part.scalar("$AN_CEC_INPUT_AXIS"), part.scalar("$AN_CEC_OUTPUT_AXIS")
+    direction = part.scalar("$AN_CEC_DIRECTION").whole(-1_000_000, 1_000_000)
+    multiplier = part.scalar("$AN_CEC_MULT_BY_TABLE").whole(0, 1_000_000)
+    table = part.table("$AN_CEC")
+    return CecTable(
+        _axis_value(input_item, axis_names),
+        _axis_value(output_item, axis_names),
+        table,
+        direction,
+        multiplier,
+        decimals=written_decimals(table),
+        label=label,
+    )
+
+
+def _axis_value(item: Assignment, axis_names: Sequence[str]) -> int:
+    match = _AXIS_VALUE.fullmatch(item.value)
+    if match is None:
+        raise item.fail(f'{item.value[:40]!r} is not an axis; write ({axis_names[0]}) or "{axis_names[0]}"')
+    return axis_of(item, match.group(1) or match.group(2), axis_names)
+
+
+def _output(entry: CecTable, points: Points) -> FloatArray:
+    """Interpolated value of one table at the points, zero where its direction of travel is not the last one."""
+    value = entry.at(points.position_mm[:, entry.input_axis])
+    if entry.direction == 0:
+        return value
+    travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, entry.input_axis])
+    if np.any(travel == 0):
+        message = (
+            f"a table acts in one direction of {AXES[entry.input_axis]} only, and some points do not say from where "
+            "they were approached: there it is taken as not acting; give approach_x, approach_y, approach_z"
+        )
+        warnings.warn(message, CompgenWarning, stacklevel=3)
+    return np.where(travel == entry.direction, value, 0.0)

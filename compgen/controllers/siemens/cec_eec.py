@@ -1,0 +1,201 @@
+"""SINUMERIK with both kinds of tables: positioning in the encoder tables (EEC), everything else in the cross tables (CEC).
+
+Sources as in :mod:`compgen.controllers.siemens.eec` and :mod:`compgen.controllers.siemens.cec`. The encoder tables act on
+the actual position and are zero at the reference point, the cross tables act on the setpoint; the axis makes both
+corrections. No CEC table may hold the positioning of an axis as well: what products fold into the table of an axis over
+itself cancels the direct term of their factor and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from compgen.controllers.base import Controller, SourceFile, Term, Usage
+from compgen.controllers.siemens.cec import VARIABLES as CEC_VARIABLES
+from compgen.controllers.siemens.cec import CecTables, SiemensCec, cec_tables_from, cec_tables_of, cec_terms
+from compgen.controllers.siemens.eec import VARIABLES as EEC_VARIABLES
+from compgen.controllers.siemens.eec import EecTables, SiemensEec, eec_tables_from, eec_terms
+from compgen.controllers.siemens.products import MULT_MODES, term_names
+from compgen.controllers.siemens.ranking import Choice, chosen_terms, terms_of_tables
+from compgen.controllers.siemens.settings import CecSettings, EecSettings, take_cec_settings, take_eec_settings
+from compgen.controllers.siemens.syntax import read_assignments
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.names import MM_PER_UM
+from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
+
+#: Sections of the machine file that describe the same control: what the own section does not say is taken from them.
+OTHER_SECTIONS = ("siemens-cec", "siemens-eec")
+#: Keys that both kinds of tables have with a meaning of their own: those of the encoder tables have this prefix.
+PREFIX, OWN_KEYS = "eec_", ("max_points", "step_mm", "decimals")
+#: A CEC table of an axis over itself may leave this much beside what it cancels (rounding), mm.
+ROUNDING_MM = 2e-6
+
+_CROSS = [(output, axis) for output in range(3) for axis in range(3) if output != axis]
+
+
+@dataclass(frozen=True)
+class CecEecSettings:
+    """Settings ``[controllers.siemens-cec-eec]``: those of both kinds of tables."""
+
+    cec: CecSettings
+    eec: EecSettings
+
+
+@dataclass(frozen=True)
+class CecEecTables:
+    """Tables of both kinds, with the numbers as the files have them."""
+
+    cec: CecTables
+    eec: EecTables
+
+
+class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
+    """SINUMERIK EEC and CEC together: positioning, straightness, squareness, angles as products of tables."""
+
+    name = "siemens-cec-eec"
+    bidirectional = True
+    _cec, _eec = SiemensCec(), SiemensEec()
+
+    def read_settings(self, machine: Machine) -> CecEecSettings:
+        """Check the settings; ``sign`` is mandatory here or in ``[controllers.siemens-cec]``."""
+        section = machine.controller_settings(self.name)
+        for other in OTHER_SECTIONS:
+            for key, value in machine.controller_settings(other).data.items():
+                own = PREFIX + key if other == "siemens-eec" and key in OWN_KEYS else key
+                section.data.setdefault(own, value)
+        cec = take_cec_settings(section, machine)
+        settings = CecEecSettings(cec, take_eec_settings(section, machine, PREFIX))
+        section.finish()
+        return settings
+
+    def basis(self, machine: Machine, settings: CecEecSettings, errors: ErrorTable) -> list[Term]:
+        """Return positioning over the axis itself, the six tables over another axis, and the products."""
+        return _pitch(machine, settings, errors) + self._choice(machine, settings, errors).kept
+
+    def basis_of(
+        self, machine: Machine, settings: CecEecSettings, errors: ErrorTable, tables: CecEecTables
+    ) -> list[Term]:
+        """Return positioning, and the terms that the cross tables hold if no better set fits into the control."""
+        choice, mode = self._choice(machine, settings, errors), settings.cec.mult_mode
+        terms = cec_terms(machine, settings.cec, errors, _CROSS)
+        held = terms_of_tables(machine, errors, terms, mode, choice, term_names(tables.cec.tables))
+        return _pitch(machine, settings, errors) + held
+
+    def left_out(self, machine: Machine, settings: CecEecSettings, errors: ErrorTable) -> list[str]:
+        """Return which CEC tables the control has no room for, and what stays uncorrected for that, in words."""
+        return self._choice(machine, settings, errors).statements()
+
+    def _choice(self, machine: Machine, settings: CecEecSettings, errors: ErrorTable) -> Choice:
+        terms = cec_terms(machine, settings.cec, errors, _CROSS)
+        pitch = _pitch(machine, settings, errors)
+        return chosen_terms(machine, errors, terms, settings.cec.mult_mode, settings.cec.tables_usable, pitch)
+
+    def build(
+        self, machine: Machine, settings: CecEecSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
+    ) -> CecEecTables:
+        """Return both kinds of tables, rounded as written."""
+        pitch = [term for term in basis if term.axis == term.carrier[0].output and term.carrier[0].lever is None]
+        cross = [term for term in basis if term not in pitch]
+        cec = cec_tables_of(machine, settings.cec, cross, values)
+        return CecEecTables(cec, self._eec.build(machine, settings.eec, pitch, values))
+
+    def with_reversal(
+        self, machine: Machine, settings: CecEecSettings, tables: CecEecTables, reversal: ReversalCurves
+    ) -> CecEecTables:
+        """Return the tables with a pair of CEC tables, DIRECTION 1 and -1, for each reversal."""
+        return CecEecTables(self._cec.with_reversal(machine, settings.cec, tables.cec, reversal), tables.eec)
+
+    def context(self, machine: Machine, settings: CecEecSettings, tables: CecEecTables) -> dict[str, Any]:
+        """Return the contexts of both kinds under ``cec`` and ``eec``, and what they say together."""
+        cec = self._cec.context(machine, settings.cec, tables.cec)
+        eec = self._eec.context(machine, settings.eec, tables.eec)
+        return {
+            "sign_statement": f"Encoder tables: {eec['sign_statement']} Cross tables: {cec['sign_statement']}",
+            "parameters": [*eec["parameters"], *cec["parameters"]],
+            "warnings": [*eec["warnings"], *cec["warnings"]],
+            "tables": [*eec["tables"], *cec["tables"]],
+            "container": cec["container"],
+            "cec": cec,
+            "eec": eec,
+        }
+
+    def parse(self, machine: Machine, settings: CecEecSettings, files: Sequence[SourceFile]) -> CecEecTables:
+        """Read both kinds of tables from files of any order; both must be there."""
+        items = read_assignments(files, {**EEC_VARIABLES, **CEC_VARIABLES})
+        eec_items = [item for item in items if item.variable in EEC_VARIABLES]
+        cec_items = [item for item in items if item.variable in CEC_VARIABLES]
+        for found, array, what in ((eec_items, "AA_ENC_COMP", "encoder"), (cec_items, "AN_CEC", "cross")):
+            if not any(item.variable == array for item in found):
+                raise files[-1].fail(f"the files hold no {what} tables (${array}); give both AX_EEC and NC_CEC")
+        return CecEecTables(cec_tables_from(cec_items, files, settings.cec), eec_tables_from(eec_items, settings.eec))
+
+    def emulate(self, machine: Machine, settings: CecEecSettings, tables: CecEecTables, points: Points) -> FloatArray:
+        """Return the sum of both corrections."""
+        cec = self._cec.emulate(machine, settings.cec, tables.cec, points)
+        return cec + self._eec.emulate(machine, settings.eec, tables.eec, points)
+
+    def violations(self, machine: Machine, settings: CecEecSettings, tables: CecEecTables) -> list[str]:
+        """Return the broken rules of either kind, and positioning that stands in both."""
+        return [
+            *self._eec.violations(machine, settings.eec, tables.eec),
+            *self._cec.violations(machine, settings.cec, tables.cec),
+            *_double_positioning(settings, tables),
+        ]
+
+    def table_nodes_mm(
+        self, machine: Machine, settings: CecEecSettings, tables: CecEecTables
+    ) -> tuple[FloatArray, ...]:
+        """Return the nodes of all tables by their input axis."""
+        cec = self._cec.table_nodes_mm(machine, settings.cec, tables.cec)
+        eec = self._eec.table_nodes_mm(machine, settings.eec, tables.eec)
+        return tuple(np.union1d(a, b) for a, b in zip(cec, eec, strict=True))
+
+    def usage(self, machine: Machine, settings: CecEecSettings, tables: CecEecTables) -> list[Usage]:
+        """Return how much of each limit either kind uses."""
+        return [
+            *self._eec.usage(machine, settings.eec, tables.eec),
+            *self._cec.usage(machine, settings.cec, tables.cec),
+        ]
+
+    def resolution_mm(self, settings: CecEecSettings) -> float:
+        """Rounding of both kinds together."""
+        return self._cec.resolution_mm(settings.cec) + self._eec.resolution_mm(settings.eec)
+
+
+def _pitch(machine: Machine, settings: CecEecSettings, errors: ErrorTable) -> list[Term]:
+    """Terms of the encoder tables; angles count in them with levers from where those of the products begin."""
+    return eec_terms(machine, settings.eec, errors, machine.reference_point_mm if settings.cec.products else None)
+
+
+def _double_positioning(settings: CecEecSettings, tables: CecEecTables) -> list[str]:
+    """Name axes whose CEC tables over themselves do not cancel (mean of both directions) beside an encoder table."""
+    first_stays, multiplier_stays = MULT_MODES[settings.cec.mult_mode]
+    entries = tables.cec.tables
+    multipliers = {entry.multiplier - 1 for entry in entries.values() if entry.multiplier}
+    found = []
+    for axis in sorted({axis for axis, _ in tables.eec.tables}):
+        own = {
+            index: entry
+            for index, entry in entries.items()
+            if entry.input_axis == entry.output_axis == axis
+            and (first_stays or not entry.multiplier)
+            and (multiplier_stays or index not in multipliers)
+        }
+        if not own:
+            continue
+        where = np.unique(np.concatenate([entry.table.nodes_mm for entry in own.values()]))
+        total = sum(entry.at(where) * (0.5 if entry.direction else 1.0) for entry in own.values())
+        largest = float(np.max(np.abs(total)))
+        if largest > ROUNDING_MM:
+            found.append(
+                f"the positioning of {settings.cec.axis_names[axis]} stands in its encoder table and, with up to "
+                f"{largest / MM_PER_UM:.3f} um, in the CEC tables {sorted(own)} as well: it would be corrected twice"
+            )
+    return found

@@ -1,0 +1,263 @@
+"""SINUMERIK leadscrew and measuring-system error compensation (LEC, MSEC, EEC): one table per axis.
+
+Sources: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 237-239, 242; 808D Function Manual p. 106.
+The control adds the table value to the ACTUAL position, so that a positive value moves the axis in the negative
+direction (p. 238): the table holds the measured error, actual minus nominal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+
+from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.siemens.profiles import PROFILES
+from compgen.controllers.siemens.reversal import plain_backlash_rows
+from compgen.controllers.siemens.settings import EecSettings, take_eec_settings
+from compgen.controllers.siemens.syntax import (
+    SWITCHES,
+    Assignment,
+    LinearTable,
+    TableParts,
+    axis_of,
+    exact_grid,
+    read_assignments,
+    table_violations,
+)
+from compgen.controllers.terms import one_dimensional_terms
+from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
+from compgen.core.machine import Machine
+from compgen.core.names import AXES
+from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
+
+#: Variables of the table without ``$``, with the number of their indices (K3-2013, p. 242).
+VARIABLES = {
+    "AA_ENC_COMP": 3,
+    "AA_ENC_COMP_STEP": 2,
+    "AA_ENC_COMP_MIN": 2,
+    "AA_ENC_COMP_MAX": 2,
+    "AA_ENC_COMP_IS_MODULO": 2,
+    "MA_ENC_COMP_ENABLE": 2,
+}
+BYTES_PER_VALUE = 8
+
+
+@dataclass(frozen=True)
+class EecTables:
+    """Tables by (axis 0..2, encoder); the values are errors in mm (actual minus nominal), as the file has them."""
+
+    tables: Mapping[tuple[int, int], LinearTable]
+
+
+class SiemensEec(Controller[EecSettings, EecTables]):
+    """SINUMERIK measuring-system and leadscrew error compensation: positioning of X, Y, Z."""
+
+    name = "siemens-eec"
+    anchored = True
+
+    def read_settings(self, machine: Machine) -> EecSettings:
+        """Check the settings; all have defaults."""
+        section = machine.controller_settings(self.name)
+        settings = take_eec_settings(section, machine)
+        section.finish()
+        return settings
+
+    def basis(self, machine: Machine, settings: EecSettings, errors: ErrorTable) -> list[Term]:
+        """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node."""
+        return eec_terms(machine, settings, errors)
+
+    def build(
+        self, machine: Machine, settings: EecSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
+    ) -> EecTables:
+        """Return the tables: minus the correction, rounded to the decimals of the file."""
+        tables = {}
+        for term in basis:
+            start, step, last = exact_grid(term.nodes_mm)
+            quantum = 10**settings.decimals
+            counts = np.rint(-np.asarray(values[term.name]) * quantum).astype(np.int64)
+            numbers = tuple(Decimal(int(count)).scaleb(-settings.decimals) for count in counts)
+            axis = term.carrier[0].output
+            for encoder in settings.encoders[axis]:
+                tables[axis, encoder] = LinearTable(start, step, last, numbers)
+        return EecTables(tables)
+
+    def context(self, machine: Machine, settings: EecSettings, tables: EecTables) -> dict[str, Any]:
+        """Return tables, machine data and the sign with a number from the file."""
+        return {
+            "sign_statement": self._sign_statement(settings, tables),
+            "parameters": self._parameters(settings, tables),
+            "warnings": self._warnings(machine, settings, tables),
+            "container": settings.container.kind,
+            "program_enables": settings.container.enables,
+            "active": [
+                f"{name}: {encoder + 1}" for name, encoder in zip(settings.axis_names, settings.active, strict=True)
+            ],
+            "decimals": settings.decimals,
+            "tables": [
+                {
+                    "letter": AXES[axis],
+                    "axis": settings.axis_names[axis],
+                    "encoder": encoder,
+                    "minimum_mm": float(table.start_mm),
+                    "maximum_mm": float(table.last_mm),
+                    "step_mm": float(table.step_mm),
+                    "modulo": int(table.modulo),
+                    "values_mm": [float(value) for value in table.values],
+                }
+                for (axis, encoder), table in sorted(tables.tables.items())
+            ],
+        }
+
+    def _sign_statement(self, settings: EecSettings, tables: EecTables) -> str:
+        (axis, _), table = max(tables.tables.items(), key=lambda item: float(np.max(np.abs(item[1].numbers))))
+        node = int(np.argmax(np.abs(table.numbers)))
+        value = float(table.values[node])
+        return (
+            "A table value is the measured error, actual minus nominal, in mm. The control adds it to the ACTUAL "
+            f"position, so a positive value moves the axis in the negative direction. Here: at {AXES[axis]} = "
+            f"{table.nodes_mm[node]:.3f} mm the table holds {value:+.6f} mm, the axis {settings.axis_names[axis]} is "
+            f"moved by {-value:+.6f} mm."
+        )
+
+    def _parameters(self, settings: EecSettings, tables: EecTables) -> list[dict[str, str]]:
+        rows = []
+        for (axis, encoder), table in sorted(tables.tables.items()):
+            name, count = settings.axis_names[axis], len(table.values)
+            rows.append(
+                {
+                    "name": f"MD38000 $MA_MM_ENC_COMP_MAX_POINTS[{encoder},{name}]",
+                    "value": f">= {count}",
+                    "meaning": f"reserved nodes; {count * BYTES_PER_VALUE} bytes of static memory, which the change "
+                    "re-formats: save all data first",
+                }
+            )
+            rows.append(
+                {
+                    "name": f"MD32700 $MA_ENC_COMP_ENABLE[{encoder}] of {name}",
+                    "value": "0, then 1",
+                    "meaning": "0 while the file is loaded; 1 makes the table act and write-protects it",
+                }
+            )
+        return rows
+
+    def _warnings(self, machine: Machine, settings: EecSettings, tables: EecTables) -> list[str]:
+        found, small = [], PROFILES["808D"].eec_nodes
+        for (axis, encoder), table in sorted(tables.tables.items()):
+            name = settings.axis_names[axis]
+            at_reference = float(table.at(np.array([machine.reference_point_mm[axis]]))[0])
+            if abs(at_reference) > self.resolution_mm(settings):
+                found.append(
+                    f"{name}: the table holds {at_reference:+.6f} mm at the reference point; the axis jumps by it when "
+                    "the compensation is enabled"
+                )
+            if len(table.values) > small and settings.max_points > small:
+                found.append(f"{name}: {len(table.values)} nodes; a SINUMERIK 808D holds {small}")
+            if encoder != settings.active[axis]:
+                found.append(
+                    f"{name}: the table of measuring system {encoder + 1} holds the same errors as that of measuring "
+                    f"system {settings.active[axis] + 1}; it is right only if they were measured with either, or the "
+                    "errors are those of the guideway"
+                )
+        if not settings.max_points_known:
+            found.append(
+                f"how many nodes this model holds is not documented; {settings.max_points} are taken as the limit, the "
+                "smallest number documented for any model: state max_points"
+            )
+        return found
+
+    def parse(self, machine: Machine, settings: EecSettings, files: Sequence[SourceFile]) -> EecTables:
+        """Read the tables of the machine's axes; an axis without any assignment has no table."""
+        return eec_tables_from(read_assignments(files, VARIABLES), settings)
+
+    def emulate(self, machine: Machine, settings: EecSettings, tables: EecTables, points: Points) -> FloatArray:
+        """Return minus the interpolated values of the active measuring system: the actual position is corrected by it."""
+        correction = np.zeros((len(points), 3))
+        for (axis, encoder), table in tables.tables.items():
+            if encoder == settings.active[axis]:
+                correction[:, axis] = -table.at(points.position_mm[:, axis])
+        return correction
+
+    def violations(self, machine: Machine, settings: EecSettings, tables: EecTables) -> list[str]:
+        """Return broken rules of the tables: whole number of steps, node count, travel, a missing measuring system."""
+        found: list[str] = []
+        for (axis, encoder), table in sorted(tables.tables.items()):
+            what = f"the table of {settings.axis_names[axis]}"
+            what += f", measuring system {encoder + 1}" if len(settings.encoders[axis]) > 1 else ""
+            found += table_violations(machine, axis, table, settings.max_points, what)
+        for axis in sorted({axis for axis, _ in tables.tables}):
+            found += [
+                f"{settings.axis_names[axis]} has no table for measuring system {encoder + 1}"
+                for encoder in settings.encoders[axis]
+                if (axis, encoder) not in tables.tables
+            ]
+        return found
+
+    def table_nodes_mm(self, machine: Machine, settings: EecSettings, tables: EecTables) -> tuple[FloatArray, ...]:
+        """Return the nodes of each axis."""
+        return nodes_by_axis((axis, table.nodes_mm) for (axis, _), table in tables.tables.items())
+
+    def backlash_parameters(
+        self, machine: Machine, settings: EecSettings, reversal: ReversalCurves
+    ) -> list[dict[str, str]]:
+        """Return MD32450 of each axis with a reversal along itself."""
+        return plain_backlash_rows(reversal, settings.axis_names, settings.encoders)
+
+    def usage(self, machine: Machine, settings: EecSettings, tables: EecTables) -> list[Usage]:
+        """Return the nodes of each axis against what the control can hold."""
+        return [
+            Usage(f"nodes of {settings.axis_names[axis]}", len(table.values), settings.max_points, "nodes")
+            for (axis, _), table in sorted(tables.tables.items())
+        ]
+
+    def resolution_mm(self, settings: EecSettings) -> float:
+        """Half of the last decimal."""
+        return 0.5 * 10.0**-settings.decimals
+
+
+def eec_terms(
+    machine: Machine, settings: EecSettings, errors: ErrorTable, lever_origin_mm: Sequence[float] | None = None
+) -> list[Term]:
+    """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node of their grids.
+
+    ``lever_origin_mm`` as in :func:`compgen.controllers.terms.one_dimensional_terms`.
+    """
+    nodes = [
+        equidistant_grid(
+            machine,
+            errors,
+            axis,
+            most=settings.max_points,
+            step_mm=settings.step_mm[axis],
+            anchor=True,
+            loss_mm=settings.loss_mm,
+            output=axis,
+        ).nodes_mm
+        for axis in range(3)
+    ]
+    pairs = [(axis, axis) for axis in range(3)]
+    return one_dimensional_terms(machine, errors, nodes, pairs, anchored=True, lever_origin_mm=lever_origin_mm)
+
+
+def eec_tables_from(items: Sequence[Assignment], settings: EecSettings) -> EecTables:
+    """Return the tables that assignments make; InputError for an encoder that the settings do not have."""
+    parts: dict[tuple[int, int], TableParts] = {}
+    for item in items:
+        encoder = item.index_number(0, 1)
+        axis = axis_of(item, item.index[-1], settings.axis_names)
+        own = settings.encoders[axis]
+        if encoder not in own:
+            stated = own[0] if len(own) == 1 else list(own)
+            raise item.fail(f"belongs to encoder {encoder}; the machine file has encoder = {stated}")
+        if item.variable in SWITCHES:
+            continue
+        what = f"table of {settings.axis_names[axis]}" + (f", encoder {encoder}" if len(own) > 1 else "")
+        part = parts.setdefault((axis, encoder), TableParts(what, item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AA_ENC_COMP" else None)
+    return EecTables({key: part.table("$AA_ENC_COMP") for key, part in sorted(parts.items())})

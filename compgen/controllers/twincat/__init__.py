@@ -1,0 +1,1 @@
+"""Beckhoff TwinCAT: position and cross compensation lists (twincat-lists)."""

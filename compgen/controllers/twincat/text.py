@@ -1,0 +1,245 @@
+"""Reading the axis lists of the TwinCAT CNC (``achskw*.lis``): one ``key value`` a line, strictly.
+
+``#`` starts a comment line, ``/* ... */`` a comment behind a value. Key grammar::
+
+    kopf.achs_nr | kopf.log_achs_name | kw.<structure>.<parameter> | kw.<structure>.table[i].<parameter>
+    kw.crosscomp2.table[j][i].correction            j: second master
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from compgen.controllers.base import SourceFile
+from compgen.controllers.isg.parameters import check_complete, content_lines
+from compgen.controllers.twincat.tables import AxisList, Cross, Plane, Screw
+from compgen.core.csvio import FloatArray
+from compgen.core.text import nearest, one_line
+from compgen.errors import InputError
+
+_SPACED_INDEX = re.compile(r"\[\s{0,9}([0-9]{1,6})\s{0,9}\]")
+_KEY = re.compile(r"([a-z0-9_]{1,20})\.([a-z0-9_.]{1,60})((?:\[[0-9]{1,6}\]){0,2})(?:\.([a-z0-9_]{1,30}))?")
+_NUMBER = re.compile(r"[+-]?(?:[0-9]{1,15}(?:\.[0-9]{0,15})?|\.[0-9]{1,15})")
+_SWITCHES = ("max_points", "manual_activation")
+#: Parameters of each structure, those of its table with the number of their indices.
+_KNOWN: dict[str, tuple[str, ...]] = {
+    "kopf": ("achs_nr", "log_achs_nr", "log_achs_name"),
+    "kw.ssfk": ("unit", "interval", "kw_startpos", "kw_nr_max", "bilateral", "modulo", *_SWITCHES),
+    "kw.crosscomp": ("unit", "last_index", "master_ax_nr", "n_cycles", *_SWITCHES),
+    "kw.crosscomp2": (
+        "unit", "interval", "last_index_master1", "last_index_master2", "start_position_master1",
+        "start_position_master2", "master1_ax_nr", "master2_ax_nr", "n_cycles", *_SWITCHES,
+    ),
+}  # fmt: skip
+_TABLES: dict[str, tuple[int, tuple[str, ...]]] = {
+    "kw.ssfk": (1, ("setpoint", "pos", "neg")),
+    "kw.crosscomp": (1, ("setpoint", "correction")),
+    "kw.crosscomp2": (2, ("correction",)),
+}
+_LARGEST = 2.0**53
+_MOST_POINTS = 150_000
+
+
+@dataclass(frozen=True)
+class _Entry:
+    value: str
+    line: int
+
+
+@dataclass
+class _Body:
+    """The entries of one file: parameters by structure and name, table entries by structure, name and index."""
+
+    source: SourceFile
+    axis_names: tuple[str, ...]
+    logical_axes: tuple[int, ...]
+    scalars: dict[tuple[str, str], _Entry] = field(default_factory=dict)
+    tables: dict[tuple[str, str], dict[tuple[int, ...], _Entry]] = field(default_factory=dict)
+
+    def number(self, structure: str, name: str, default: float | None = None) -> float:
+        """Return a parameter as a number."""
+        entry = self.scalars.get((structure, name))
+        if entry is None:
+            if default is None:
+                raise self.source.fail(f"{structure}.{name} is missing; was the file cut?")
+            return default
+        return self.value(f"{structure}.{name}", entry)
+
+    def value(self, label: str, entry: _Entry) -> float:
+        """Return the number of an entry, or the error that says why it is none."""
+        if not _NUMBER.fullmatch(entry.value) or abs(float(entry.value)) > _LARGEST:
+            hint = "; the decimal mark is '.'" if "," in entry.value else ""
+            hint = "; an exponent is not documented, write plain digits" if "e" in entry.value.lower() else hint
+            shown = one_line(entry.value)[:40]
+            raise self.source.fail(f"{label}: {shown!r} is not a number of the list{hint}", entry.line)
+        return float(entry.value)
+
+    def whole(self, structure: str, name: str, low: int, high: int, default: int | None = None) -> int:
+        """Return a parameter as a whole number within limits."""
+        number = self.number(structure, name, default)
+        if number != int(number) or not low <= number <= high:
+            raise self.fail(structure, name, f"{number:g} is not a whole number from {low} to {high}")
+        return int(number)
+
+    def fail(self, structure: str, name: str, message: str) -> InputError:
+        """Return the error that points at a parameter."""
+        entry = self.scalars.get((structure, name))
+        return self.source.fail(f"{structure}.{name}: {message}", entry.line if entry else None)
+
+    def axis(self, structure: str, name: str) -> int:
+        """Return the axis 0..2 that a logical axis number means."""
+        number = self.whole(structure, name, 0, 65535)
+        if number not in self.logical_axes:
+            known = ", ".join(map(str, self.logical_axes))
+            raise self.fail(structure, name, f"no axis has the logical number {number}; logical_axes has {known}")
+        return self.logical_axes.index(number)
+
+    def column(self, structure: str, name: str, shape: tuple[int, ...]) -> FloatArray:
+        """Return a column of the table of a structure with every index from 0 on, shape ``shape``."""
+        entries = self.tables.get((structure, name), {})
+        result = np.zeros(shape)
+        for index, entry in entries.items():
+            if any(k >= n for k, n in zip(index, shape, strict=True)):
+                places = "".join(f"[0 ... {n - 1}]" for n in shape)
+                raise self.source.fail(f"{_label(structure, name, index)}: the table goes over {places}", entry.line)
+            result[index] = self.value(_label(structure, name, index), entry)
+        if len(entries) != result.size:
+            missing = next(index for index in np.ndindex(*shape) if index not in entries)
+            raise self.source.fail(f"{_label(structure, name, missing)} is missing; was the file cut?")
+        return result
+
+
+def _label(structure: str, name: str, index: Sequence[int]) -> str:
+    return f"{structure}.table{''.join(f'[{k}]' for k in index)}.{name}"
+
+
+def parse_axis_list(
+    source: SourceFile, axis_names: tuple[str, ...], logical_axes: tuple[int, ...]
+) -> tuple[int, AxisList]:
+    """Return the axis (0..2) of a list and its tables; InputError with file and line for anything malformed."""
+    body = _Body(source, axis_names, logical_axes)
+    count = 0
+    for line, text in content_lines(source, "#"):
+        if code := _without_comment(source, line, text):
+            _take(body, line, code)
+            count += 1
+    if not count:
+        raise source.fail("holds no entry; is it the right file?")
+    check_complete(source, count, "entries")
+    older = ("kopf", "achs_nr") not in body.scalars and ("kopf", "log_achs_nr") in body.scalars
+    axis = body.axis("kopf", "log_achs_nr" if older else "achs_nr")
+    present = {structure for structure, _ in (*body.scalars, *body.tables)}
+    return axis, AxisList(
+        _screw(body) if "kw.ssfk" in present else None,
+        _cross(body) if "kw.crosscomp" in present else None,
+        _plane(body) if "kw.crosscomp2" in present else None,
+    )
+
+
+def _without_comment(source: SourceFile, line: int, text: str) -> str:
+    code, start, rest = text.partition("/*")
+    if start:
+        _, end, behind = rest.partition("*/")
+        if not end or behind.strip():
+            raise source.fail("a comment /* ... */ ends on its line, and nothing stands behind it", line)
+    return code.strip()
+
+
+def _take(body: _Body, line: int, code: str) -> None:
+    words = _SPACED_INDEX.sub(r"[\1]", code).split(maxsplit=1)
+    key = words[0]
+    match = _KEY.fullmatch(key)
+    if match is None:
+        raise body.source.fail(f"{code[:60]!r} is no entry; e.g. kw.ssfk.table[0].pos 21 is due", line)
+    if len(words) == 1:
+        raise body.source.fail(f"{key} has no value", line)
+    entry = _Entry(words[1].strip(), line)
+    head, _, name = f"{match.group(1)}.{match.group(2)}".rpartition(".")
+    if match.group(3):
+        index = tuple(int(part) for part in match.group(3)[1:-1].split("]["))
+        known = name == "table" and head in _TABLES and match.group(4) in _TABLES[head][1]
+        if not known or len(index) != _TABLES[head][0]:
+            raise _unknown(body, line, key)
+        column = body.tables.setdefault((head, match.group(4)), {})
+        first = column.setdefault(index, entry)
+    else:
+        if name not in _KNOWN.get(head, ()) or match.group(4):
+            raise _unknown(body, line, key)
+        first = body.scalars.setdefault((head, name), entry)
+    if first is not entry:
+        raise body.source.fail(f"{key} stands here a second time; the first is in line {first.line}", line)
+
+
+def _unknown(body: _Body, line: int, key: str) -> InputError:
+    known = [f"{head}.{name}" for head, names in _KNOWN.items() for name in names]
+    known += [_label(head, name, [0] * count) for head, (count, names) in _TABLES.items() for name in names]
+    return body.source.fail(f"{key[:60]!r} is not a parameter of these lists; {nearest(key[:60], known)}", line)
+
+
+def _check_unit(body: _Body, structure: str) -> None:
+    if body.whole(structure, "unit", 0, 1) == 0:
+        raise body.fail(structure, "unit", "0 means encoder increments, which have no known length here; 1 is due")
+
+
+def _ascending(body: _Body, structure: str, setpoints: FloatArray) -> FloatArray:
+    place = np.flatnonzero(np.diff(setpoints) <= 0)
+    if place.size:
+        index = (int(place[0]) + 1,)
+        entry = body.tables[structure, "setpoint"][index]
+        message = f"{_label(structure, 'setpoint', index)}: {entry.value} is not above the position before it"
+        raise body.source.fail(message, entry.line)
+    return setpoints
+
+
+def _screw(body: _Body) -> Screw:
+    name = "kw.ssfk"
+    _check_unit(body, name)
+    if body.whole(name, "modulo", 0, 1, 0):
+        raise body.fail(name, "modulo", "1 belongs to rotary axes; the model has three linear ones")
+    count = body.whole(name, "kw_nr_max", 1, _MOST_POINTS)
+    interval = body.number(name, "interval")
+    if interval < 0:
+        raise body.fail(name, "interval", f"{interval:g} is negative")
+    if interval:
+        setpoints = np.asarray(body.number(name, "kw_startpos") + interval * np.arange(count), dtype=np.float64)
+        _refuse(body, name, "setpoint", "an equidistant table (interval above 0) has no setpoints")
+    else:
+        setpoints = _ascending(body, name, body.column(name, "setpoint", (count,)))
+    pos = body.column(name, "pos", (count,))
+    two_sided = body.whole(name, "bilateral", 0, 1, 0) == 1
+    if two_sided or (name, "neg") in body.tables:
+        neg = body.column(name, "neg", (count,))
+    return Screw(setpoints, pos, neg if two_sided else None, interval)
+
+
+def _refuse(body: _Body, structure: str, name: str, message: str) -> None:
+    for index, entry in body.tables.get((structure, name), {}).items():
+        raise body.source.fail(f"{_label(structure, name, index)}: {message}", entry.line)
+
+
+def _cross(body: _Body) -> Cross:
+    name = "kw.crosscomp"
+    _check_unit(body, name)
+    count = body.whole(name, "last_index", 0, _MOST_POINTS - 1) + 1
+    setpoints = _ascending(body, name, body.column(name, "setpoint", (count,)))
+    return Cross(body.axis(name, "master_ax_nr"), setpoints, body.column(name, "correction", (count,)))
+
+
+def _plane(body: _Body) -> Plane:
+    name = "kw.crosscomp2"
+    _check_unit(body, name)
+    first, second = (body.whole(name, f"last_index_master{k}", 0, _MOST_POINTS - 1) + 1 for k in (1, 2))
+    if first * second > _MOST_POINTS:
+        raise body.fail(name, "last_index_master2", f"gives {first} x {second} points; at most {_MOST_POINTS} are read")
+    interval = body.number(name, "interval")
+    if interval <= 0:
+        raise body.fail(name, "interval", f"{interval:g} is not above zero (the control's error 70430)")
+    masters = (body.axis(name, "master1_ax_nr"), body.axis(name, "master2_ax_nr"))
+    if masters[0] == masters[1]:
+        raise body.fail(name, "master2_ax_nr", "is the first master too; a plane needs two axes")
+    starts = (body.number(name, "start_position_master1"), body.number(name, "start_position_master2"))
+    return Plane(masters, starts, interval, body.column(name, "correction", (second, first)))
