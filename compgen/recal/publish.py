@@ -35,6 +35,9 @@ KEPT = 3
 def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord | None:
     """Make the folder what the store says and return the active tables; InputError if it cannot be written.
 
+    InputError as well if the pointer leads to a version of which this store does not know that it was ever active: then
+    the store is not the one that the folder belongs to, and nothing is changed.
+
     Files of the active and the proposed versions that are missing or altered are put back; those of a retired version
     when it becomes active again.
     """
@@ -42,6 +45,7 @@ def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord |
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder):
             tables = store.tables(machine)
+            _check_pointer(folder, tables)
             _remove_leftovers(folder)
             for table in tables:
                 wanted = folder / version_name(table)
@@ -122,6 +126,18 @@ def _make(target: Path, contents: dict[str, bytes]) -> None:
         _sync(inner)
     temporary.rename(target)
     _sync(target.parent)
+
+
+def _check_pointer(folder: Path, tables: Sequence[TableRecord]) -> None:
+    """Leave tables that are active on the machine alone where the store is empty, older, or that of something else."""
+    pointer = folder / POINTER
+    known = {version_name(table) for table in tables if table.state in ("active", "retired")}
+    if pointer.is_symlink() and os.readlink(pointer) not in known:
+        raise InputError(
+            f"leads to {os.readlink(pointer)}, which was never active by this store, so it is not the store of this "
+            "folder; give the right store, restore its backup, or remove the pointer",
+            file=pointer,
+        )
 
 
 def _point(folder: Path, active: TableRecord | None) -> None:

@@ -5,7 +5,6 @@ Machines do not disturb each other: whatever goes wrong with one becomes part of
 
 from __future__ import annotations
 
-import errno
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,26 +19,14 @@ from compgen.recal.claims import Claim, ClaimLostError
 from compgen.recal.database import StoreError
 from compgen.recal.job import Job, MachineJob
 from compgen.recal.notify import notify
+from compgen.recal.passing import passes
 from compgen.recal.process import process, without_folder
 from compgen.recal.publish import publish
 from compgen.recal.records import MachineRecord, MeasurementRecord, TableRecord
 from compgen.recal.results import ChangedMeanwhileError, keep_failure, keep_result
+from compgen.recal.schema import plain
 from compgen.recal.store import Clock, Store, open_store
 
-#: What may pass by itself: a full disk, a file that cannot be read now, too many open files.
-PASSING = (
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EIO,
-    errno.EACCES,
-    errno.EPERM,
-    errno.EMFILE,
-    errno.ENFILE,
-    errno.ENOMEM,
-    errno.EROFS,
-    errno.ESTALE,
-    errno.EBUSY,
-)
 #: How often a measurement is judged again because other tables became active meanwhile.
 JUDGED_AT_MOST = 5
 
@@ -53,7 +40,8 @@ class MachineOutcome:
 
     ``state`` is "ok", "held" (the newest tables are held back or refused) or "failed" (something could not be taken or
     processed); ``messages`` say why. ``processed`` names the measurements of this pass, ``active`` is the active version,
-    ``waiting`` are the versions that wait for a person.
+    ``waiting`` are the versions that wait for a person. With ``again`` something may pass by itself (a full disk, an
+    unreadable file, another runner, a store that is away), with ``unreachable`` it is the store.
     """
 
     machine: str
@@ -64,6 +52,8 @@ class MachineOutcome:
     waiting: tuple[int, ...] = ()
     internal: bool = False
     seconds: float = 0.0
+    again: bool = False
+    unreachable: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,8 +69,10 @@ class RunOutcome:
 
     @property
     def exit_code(self) -> int:
-        """0: all is well; 1: something is held back or failed; 3: an internal error."""
-        return 3 if any(item.internal for item in self.outcomes) else 0 if self.accepted else 1
+        """0: all is well; 1: something is held back or failed; 2: the store went away; 3: an internal error."""
+        if any(item.internal for item in self.outcomes):
+            return 3
+        return 2 if any(item.unreachable for item in self.outcomes) else 0 if self.accepted else 1
 
     def summary(self) -> dict[str, Any]:
         """Return the object that ``--json`` prints."""
@@ -124,7 +116,8 @@ def run_machine(job: MachineJob, url: str, stop: Stop = lambda: False, clock: Cl
         finally:
             store.close()
     except CompgenError as error:
-        outcome = MachineOutcome(job.name, "failed", (str(error),))
+        lost = isinstance(error, StoreError)
+        outcome = MachineOutcome(job.name, "failed", (plain(str(error)),), again=passes(error), unreachable=lost)
     except Exception as error:  # a bug here must not stop the other machines
         outcome = MachineOutcome(
             job.name, "failed", (f"internal error: {type(error).__name__}: {error}",), internal=True
@@ -145,6 +138,7 @@ class _Pass:
         self.present: set[str] = set()
         self.failed = False
         self.internal = False
+        self.again = False
 
     def run(self) -> MachineOutcome:
         """Take, process, publish, notify."""
@@ -157,7 +151,9 @@ class _Pass:
                 break
             self._process(measurement, settings)
         active = publish(self.store, self.machine, self.job.out)
-        self.messages += notify(self.store, self.machine, self.job.notify)
+        problems = notify(self.store, self.machine, self.job.notify)
+        self.messages += problems
+        self.again = self.again or bool(problems)
         return self._outcome(active, settings)
 
     def _check_clock(self) -> None:
@@ -174,6 +170,8 @@ class _Pass:
     def _problem(self, kind: str, subject: str, message: str, *, fail: bool = True) -> None:
         """Report something; it is kept in the store if it is news there."""
         self.failed = self.failed or fail
+        self.again = self.again or fail
+        subject, message = plain(subject), plain(message)
         self.messages.append(f"{subject}: {message}" if kind == "inbox" else message)
         if self.store.add_event(kind, subject, message, self.machine):
             logs.warning(kind, machine=self.job.name, subject=subject, message=message)
@@ -206,7 +204,7 @@ class _Pass:
         for _ in range(JUDGED_AT_MOST):
             claim = claims.take(self.store, measurement, claims.owner_name())
             if claim is None:
-                self.messages.append(f"{measurement.name}: another runner has it")
+                self._leave(measurement, "another runner has it")
                 return
             try:
                 self._keep(measurement, claim, settings)
@@ -214,20 +212,28 @@ class _Pass:
             except ChangedMeanwhileError:
                 claims.give_back(self.store, claim)
             except (ClaimLostError, sa.exc.IntegrityError):
-                self.messages.append(f"{measurement.name}: another runner took it over")
+                claims.forget(self.store, claim)
+                self._leave(measurement, "another runner took it over")
                 return
             except BaseException:
                 _give_back_quietly(self.store, claim)
                 raise
+        self._leave(measurement, "other tables became active again and again; it is judged by the next run")
+
+    def _leave(self, measurement: MeasurementRecord, why: str) -> None:
+        """Say why a measurement is not processed now."""
+        self.messages.append(f"{measurement.name}: {why}")
+        self.again = True
 
     def _keep(self, measurement: MeasurementRecord, claim: Claim, settings: str) -> None:
         started = time.monotonic()
         try:
-            done = process(self.store, self.job, self.machine, measurement)
+            with claims.Renewal(self.store, claim):
+                done = process(self.store, self.job, self.machine, measurement)
         except ClaimLostError:
             raise
         except (CompgenError, OSError, MemoryError) as error:
-            if _passes(error):
+            if passes(error):
                 claims.give_back(self.store, claim)
                 self._problem("passing", measurement.name, f"{measurement.name}: {error}; it is tried again")
                 return
@@ -260,6 +266,7 @@ class _Pass:
             active=None if active is None else active.version,
             waiting=tuple(table.version for table in tables if table.state in ("pending", "held")),
             internal=self.internal,
+            again=self.again,
         )
 
     def _report_failures(self, settings: str) -> None:
@@ -279,13 +286,3 @@ def _give_back_quietly(store: Store, claim: Claim) -> None:
         claims.give_back(store, claim)
     except (CompgenError, sa.exc.SQLAlchemyError) as error:
         logs.error("claim not given back", problem=str(error))
-
-
-def _passes(error: BaseException) -> bool:
-    """Whether the cause may pass by itself, so that the measurement is tried again by the next run."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, MemoryError | StoreError) or (isinstance(cause, OSError) and cause.errno in PASSING):
-            return True
-        cause = cause.__cause__
-    return False
