@@ -470,7 +470,8 @@ def test_files_of_500_megabytes_are_refused_within_a_second(tmp_path):
         (b"position [mm],deviation [um]\n0,1\n1,2\n3", "it was cut"),
         (b"position [mm],deviation [um],direction\n0,1,up\n1,2,sideways\n", "'sideways' is no direction"),
         (b"pos [mm],deviation [um],deviation [um]\n0,1,2\n", "twice"),
-        (b"position [kg],deviation [um]\n0,1\n0,2\n", "its columns are not known"),
+        (b"position [kg],deviation [um]\n0,1\n0,2\n", "kg is no length"),
+        (b"weight [kg],force [N]\n0,1\n0,2\n", "its columns are not known"),
     ],
 )
 def test_what_is_no_measurement_is_refused_with_the_place(tmp_path, content, message):

@@ -25,14 +25,17 @@ from compgen.imports.result import KINDS
 _HELP = {
     "kind": "What the file holds; default: told by its columns.",
     "map": "FIELD=COLUMN: position, actual, deviation, correction, direction, run, axis; x, y, z, length, station, point; "
-    "dx, dy, dz, xa, ya, za; error, value. May be given several times.",
+    "dx, dy, dz, xa, ya, za; error, value; temperature, temp_NAME, time, date, feed, load, tool_x, approach_x, repeat, line, "
+    "block, setup, pose, u_value. May be given several times.",
     "unit": "FIELD=UNIT, e.g. deviation=um, position=mm, or UNIT alone for the values. um, mm, nm, m, in; urad, mrad, arcsec, "
-    "rad, deg.",
+    "rad, deg; temp_NAME=degC, K, degF; time=s, ms, min, h; feed=mm/min; load=kg.",
     "axis": "The axis that moved.",
     "error": "The error that the values are (EYX, ECX, ...), for straightness and angles.",
     "sign": "error: measured minus commanded (default where the format says so); correction: to be turned round.",
     "directions": "labels: as the file names them; motion: from the order of the rows; alternate: odd runs up, even down.",
     "sheet": "Sheet of a workbook.",
+    "dates": "Order of dates such as 03/04/2025 (never guessed): day, month, year.",
+    "zero_runs": "Laser runs that are zero at every target: not made (drop) or measured (keep).",
     "machine": "Machine whose travel the positions are held against.",
     "machines": "Further folder with machine files (may be given several times).",
     "out": "Folder for the contract file; without it nothing is written.",
@@ -63,6 +66,8 @@ def _pairs(given: Sequence[str], option: str, alone: str | None = None) -> dict[
 @click.option("--sign", type=click.Choice(("error", "correction")), help=_HELP["sign"])
 @click.option("--directions", type=click.Choice(("labels", "motion", "alternate")), help=_HELP["directions"])
 @click.option("--sheet", metavar="NAME", help=_HELP["sheet"])
+@click.option("--dates", type=click.Choice(("dmy", "mdy", "ymd")), help=_HELP["dates"])
+@click.option("--zero-runs", type=click.Choice(("drop", "keep")), help=_HELP["zero_runs"])
 @click.option("--machine", metavar="MACHINE", help=_HELP["machine"])
 @click.option("--machines", multiple=True, type=click.Path(path_type=Path), help=_HELP["machines"])
 @click.option("--out", metavar="DIR", type=click.Path(path_type=Path), help=_HELP["out"])

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from compgen.core.names import ERROR_NAMES
 from compgen.core.text import nearest
 from compgen.errors import InputError
+from compgen.imports.units import Quantity, further_unit
 
 MM_PER_LENGTH = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "m": 1e3, "cm": 10.0, "in": 25.4, "mil": 0.0254, "0.1um": 1e-4}
 RAD_PER_ANGLE = {
@@ -40,18 +41,24 @@ _UNIT_WORDS = {
 #: Words of column names by field; the words are compared without case, accents, blanks and units.
 FIELDS: Mapping[str, tuple[str, ...]] = {
     "position": ("position", "pos", "target", "targetposition", "nominal", "nominalposition", "soll", "sollposition",
-                 "sollwert", "command", "commanded", "cmd", "setpoint", "targets", "zielposition", "axisposition"),
+                 "sollwert", "command", "commanded", "cmd", "setpoint", "targets", "zielposition", "axisposition",
+                 "posizione", "posicion", "cible", "consigne"),
     "actual": ("actual", "actualposition", "measured", "measuredposition", "ist", "istposition", "istwert", "reading",
-               "laserreading", "laserposition", "measurement"),
+               "laserreading", "laserposition", "measurement", "mesure", "misura", "medida"),
     "deviation": ("deviation", "dev", "error", "err", "abweichung", "positionsabweichung", "fehler", "diff", "difference",
-                  "delta", "poserror", "positionerror", "positioningerror", "positiondeviation"),
-    "correction": ("correction", "compensation", "comp", "korrektur", "korrekturwert", "compensationvalue"),
-    "direction": ("direction", "dir", "richtung", "approach", "fahrtrichtung", "way", "anfahrrichtung"),
-    "run": ("run", "cycle", "lauf", "messlauf", "pass", "zyklus", "runno", "runnumber", "cycleno", "messreihe"),
-    "axis": ("axis", "achse"),
+                  "delta", "poserror", "positionerror", "positioningerror", "positiondeviation", "ecart", "erreur", "scarto",
+                  "scostamento", "errore", "desviacion"),
+    "correction": ("correction", "compensation", "comp", "korrektur", "korrekturwert", "compensationvalue",
+                   "correzione", "correccion"),
+    "direction": ("direction", "dir", "richtung", "approach", "fahrtrichtung", "way", "anfahrrichtung",
+                  "sens", "direzione", "direccion"),
+    "run": ("run", "cycle", "lauf", "messlauf", "pass", "zyklus", "runno", "runnumber", "cycleno", "messreihe",
+            "essai", "prova", "ciclo", "ensayo"),
+    "axis": ("axis", "achse", "axe", "asse", "eje"),
     "station": ("station", "tracer", "stationid", "trackerposition", "standpunkt"),
     "point": ("point", "pointid", "pt", "punkt", "pointno", "pointname", "target id", "id", "no", "nr"),
-    "length": ("length", "displacement", "distance", "laenge", "lange", "laserlength", "laser", "range", "abstand"),
+    "length": ("length", "displacement", "distance", "laenge", "lange", "laserlength", "laser", "range", "abstand",
+               "longueur", "lunghezza", "longitud", "distanza"),
     "x": ("x", "xcmd", "xcommanded", "xnom", "xnominal", "xsoll", "xpos", "xposition", "commandedx", "nominalx", "xtarget"),
     "y": ("y", "ycmd", "ycommanded", "ynom", "ynominal", "ysoll", "ypos", "yposition", "commandedy", "nominaly", "ytarget"),
     "z": ("z", "zcmd", "zcommanded", "znom", "znominal", "zsoll", "zpos", "zposition", "commandedz", "nominalz", "ztarget"),
@@ -63,11 +70,31 @@ FIELDS: Mapping[str, tuple[str, ...]] = {
     "za": ("zactual", "zmeasured", "zmeas", "zist", "actualz", "measuredz", "zact"),
     "error": ("errorname", "parameter", "component", "parametername"),
     "value": ("value", "wert"),
-    "u_value": ("uvalue", "u", "uncertainty", "standarduncertainty", "unsicherheit"),
-    "time": ("time", "zeit", "times", "timestamp", "elapsed"),
+    "u_value": ("uvalue", "ulength", "udeviation", "standarduncertainty", "standardunsicherheit"),
+    "date": ("date", "datum", "messdatum", "measurementdate", "testdate", "fecha"),
+    "time": ("time", "zeit", "times", "timestamp", "elapsed", "datetime", "dateandtime", "datumzeit", "datumuhrzeit",
+             "zeitstempel", "uhrzeit", "messzeit", "temps", "heure", "tempo", "ora", "tiempo", "hora"),
+    "tool_x": ("toolx", "tooloffsetx", "xtool", "xtooloffset", "werkzeugx", "werkzeugversatzx"),
+    "tool_y": ("tooly", "tooloffsety", "ytool", "ytooloffset", "werkzeugy", "werkzeugversatzy"),
+    "tool_z": ("toolz", "tooloffsetz", "ztool", "ztooloffset", "werkzeugz", "werkzeugversatzz"),
+    "approach_x": ("approachx", "xapproach", "directionx", "xdirection", "dirx", "richtungx"),
+    "approach_y": ("approachy", "yapproach", "directiony", "ydirection", "diry", "richtungy"),
+    "approach_z": ("approachz", "zapproach", "directionz", "zdirection", "dirz", "richtungz"),
+    "feed": ("feed", "feedrate", "vorschub", "vorschubgeschwindigkeit", "velocity", "speed", "geschwindigkeit", "f",
+             "avance", "avanzamento"),
+    "load": ("load", "weight", "mass", "payload", "workpieceweight", "tableload", "gewicht", "masse", "last", "beladung",
+             "werkstuckgewicht", "poids", "peso", "carico"),
+    "repeat": ("repeat", "repetition", "wiederholung"),
+    "line": ("line", "linie", "messlinie"),
+    "block": ("block",),
+    "setup": ("setup", "aufstellung", "setupno"),
+    "pose": ("pose", "stop", "halt"),
 }  # fmt: skip
+#: A channel of temperature that the user names by --map temp_NAME=COLUMN.
+CHANNEL = re.compile(r"temp_[a-z0-9_]{1,30}")
+_TEMPERATURE = re.compile(r"(?<!at)temp(?!o|late|s$)")
 _BRACKETS = re.compile(r"\s*[\[(<{]\s*([^\])>}]{1,20}?)\s*[\])>}]\s*")
-_SUFFIX = re.compile(r"^(.*?\w)[\s_/,]+([a-zA-Z\u00b5\u03bc\"']{1,12}|um/m|mm/m)$")
+_SUFFIX = re.compile(r"^(.*?\w)[\s_/,]+([a-zA-Z\u00b0\u00b5\u03bc\"']{1,12}|um/m|mm/m|m{1,2}/min|m{1,2}/s)$")
 _WAYS_UP = (
     "+",
     "+1",
@@ -131,13 +158,30 @@ def split_name(name: str) -> Column:
     (Column(name='Pos. [mm]', word='pos', unit='mm'), 'um', 'um')
     """
     bracket = _BRACKETS.search(name)
-    if bracket and known_unit(bracket.group(1)):
-        rest = name[: bracket.start()] + " " + name[bracket.end() :]
-        return Column(name, _word(rest), known_unit(bracket.group(1)))
+    unit = bracket and (known_unit(bracket.group(1)) or further_unit(bracket.group(1)))
+    if bracket and unit:
+        return Column(name, _word(f"{name[: bracket.start()]} {name[bracket.end() :]}"), unit)
     suffix = _SUFFIX.match(name.strip())
-    if suffix and known_unit(suffix.group(2)):
-        return Column(name, _word(suffix.group(1)), known_unit(suffix.group(2)))
+    if suffix:
+        word = _word(suffix.group(1))
+        quantity = quantity_of(word)
+        unit = known_unit(suffix.group(2)) or (further_unit(suffix.group(2), quantity) if quantity else None)
+        if unit:
+            return Column(name, word, unit)
     return Column(name, _word(name), None)
+
+
+def quantity_of(word: str) -> Quantity | None:
+    """Return what a column beside the readings holds, by the word of its name; None if the word does not say it.
+
+    >>> quantity_of("airtemp"), quantity_of("vorschub"), quantity_of("timestamp"), quantity_of("position")
+    ('temperature', 'feed', 'time', None)
+    """
+    quantities: tuple[Quantity, ...] = ("time", "feed", "load")
+    for key in quantities:
+        if word in FIELDS[key]:
+            return key
+    return "temperature" if _TEMPERATURE.search(word) else None
 
 
 def _word(text: str) -> str:
@@ -153,8 +197,7 @@ def fields_of(header: Sequence[str], given: Mapping[str, str]) -> dict[str, Colu
     columns = [split_name(name) for name in header]
     found: dict[str, Column] = {}
     for key, name in given.items():
-        if key not in FIELDS:
-            raise InputError(f"{key!r} is no field; {nearest(key, FIELDS)}", field="--map")
+        check_field(key, "--map")
         if name not in header:
             raise InputError(f"there is no column {name!r}; {nearest(name, header)}", field="--map")
         found[key] = split_name(name)
@@ -167,6 +210,12 @@ def fields_of(header: Sequence[str], given: Mapping[str, str]) -> dict[str, Colu
             found[key] = min(matching, key=lambda column: words.index(column.word))
             taken.add(found[key].name)
     return found
+
+
+def check_field(key: str, option: str) -> None:
+    """Raise InputError for a name that is no field of a table."""
+    if key not in FIELDS and key != "temperature" and not CHANNEL.fullmatch(key):
+        raise InputError(f"{key!r} is no field; {nearest(key, [*FIELDS, 'temperature', 'temp_NAME'])}", field=option)
 
 
 def error_columns(header: Sequence[str]) -> dict[str, Column]:

@@ -22,7 +22,7 @@ _ANGLES = {name: RAD_PER_ANGLE[name] for name in ("urad", "mrad", "arcsec", "deg
 
 @dataclass
 class Findings:
-    """One table being read; ``fields`` holds its columns by field."""
+    """One table being read; ``fields`` holds its columns by field, ``used`` the names of columns that gave values."""
 
     table: Table
     fields: Mapping[str, Column]
@@ -30,6 +30,7 @@ class Findings:
     understood: dict[str, Any] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    used: set[str] = field(default_factory=set)
 
     def numbers(self, key: str) -> FloatArray:
         """Return the column of a field as it stands (rows,)."""

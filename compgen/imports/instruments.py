@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,14 @@ from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import InputError
 from compgen.imports.capture import read_capture
 from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, known_unit
+from compgen.imports.dates import header_date
 from compgen.imports.ecmc import read_ecmc
 from compgen.imports.hypotheses import ABSURD_DECADES, decades_off, unit_of_deviations, usual_deviation_mm
 from compgen.imports.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion
-from compgen.imports.renishaw import UNITS, Renishaw, read_renishaw
+from compgen.imports.renishaw import UNITS, Renishaw, read_renishaw, without_runs
 from compgen.imports.result import Imported, ImportOptions, Kind
 from compgen.imports.source import read_source
+from compgen.imports.surroundings import surroundings_of
 from compgen.imports.tables import runs_of
 
 MOST_EXCHANGE_BYTES = 16_000_000
@@ -44,8 +47,15 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     found = read_renishaw(path)
     angular = found.letter == "a"
     doubts: list[str] = []
-    notes = [*found.notes, "deviations are measured minus target (errors), as the maker's software has them"]
-    axis = options.axis or axis_in(found.keys.get("axis", ""))
+    found, zero = _without_zero_runs(found, options, doubts)
+    around = surroundings_of(found.beside.get("ENVIRONMENT", {}), found.keys.get("date", ""), options.dates)
+    notes = [
+        *found.notes,
+        *zero,
+        *around.notes,
+        "deviations are measured minus target (errors), as the maker's software has them",
+    ]
+    axis = options.axis or axis_in(found.keys.get("axis", "")) or _axis_of_name(path, notes)
     runs, unit = _scaled(found, options, doubts, notes)
     runs = _with_directions(found, runs, options, doubts)
     if options.sign == "correction":
@@ -60,8 +70,14 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
         "instrument": found.keys.get("owner") or "Renishaw laser software",
         "encoding": found.encoding,
         **{key: found.keys[key] for key in _USER_TEXT if found.keys.get(key)},
+        **{section.lower(): dict(values) for section, values in found.beside.items()},
+        "measured_at": around.measured_at,
+        "temperatures_c": dict(around.temperatures_c) or None,
     }
-    metadata = {"source": path.name, **({"date": found.keys["date"]} if found.keys.get("date") else {})}
+    metadata = {"source": path.name}
+    if around.measured_at:
+        metadata |= {"measured_at": around.measured_at, "date": around.measured_at}
+    runs = replace(runs, covariates={k: np.full(len(runs.value), c) for k, c in around.temperatures_c.items()})
     if found.letter == "l" and options.error is None:
         if axis is None:
             named = f" ('{found.keys['axis']}')" if found.keys.get("axis") else ""
@@ -71,6 +87,25 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     error = _error_named(path, axis, options, doubts, angular=angular)
     table, reversal = errors_of(runs, error, metadata)
     return Imported(path, "renishaw", "errors", table, understood, tuple(doubts), tuple(notes), reversal)
+
+
+def _without_zero_runs(found: Renishaw, options: ImportOptions, doubts: list[str]) -> tuple[Renishaw, list[str]]:
+    """Leave out runs of zeros that stand for runs never made; some programs fill a test in one direction up with them."""
+    if not found.zero_runs or options.zero_runs == "keep":
+        return found, []
+    named = f"run{'s' if len(found.zero_runs) > 1 else ''} {', '.join(map(str, found.zero_runs[:8]))}"
+    if found.one_way_test or options.zero_runs == "drop":
+        return without_runs(found, found.zero_runs), [f"{named}: zero at every target, left out as not made"]
+    doubts.append(f"{named}: zero at every target; say --zero-runs drop if not made, keep if measured")
+    return found, []
+
+
+def _axis_of_name(path: Path, notes: list[str]) -> str | None:
+    """Return the axis that the name of a file says, with a note."""
+    axis = axis_in(re.sub(r"[_\-.]", " ", path.stem))
+    if axis:
+        notes.append(f"axis {axis} by the name of the file")
+    return axis
 
 
 def _error_named(path: Path, axis: str | None, options: ImportOptions, doubts: list[str], *, angular: bool) -> str:
@@ -134,7 +169,8 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
     """Import an ISO 230-2 input file of the ecmc tools; it does not say which axis it is."""
     found = read_ecmc(path)
     doubts, notes = [], ["deviations are reading minus target; nothing was taken out of them"]
-    if options.axis is None and options.error is None:
+    axis = options.axis or _axis_of_name(path, notes)
+    if axis is None and options.error is None:
         doubts.append("the file does not say X, Y or Z; give --axis")
     if abs(found.slope - 1.0) > SLOPE_TOLERANCE:
         doubts.append(
@@ -147,7 +183,7 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
     if options.sign == "correction":
         runs = runs.negated()
     understood = {
-        "axis": options.axis,
+        "axis": axis,
         **_facts(runs, angular=False),
         "unit": found.keys.get("UNIT", "mm (none stated)"),
         "sign": "reading minus target",
@@ -158,9 +194,9 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
     }
     metadata = {"source": path.name}
     if options.error is None:
-        data = runs_of({options.axis or "": runs}, str(path), metadata)
+        data = runs_of({axis or "": runs}, str(path), metadata)
         return Imported(path, "ecmc-iso230", "axis", data, understood, tuple(doubts), tuple(notes))
-    error = _error_named(path, options.axis, options, doubts, angular=False)
+    error = _error_named(path, axis, options, doubts, angular=False)
     table, reversal = errors_of(runs, error, metadata)
     return Imported(path, "ecmc-iso230", "errors", table, understood, tuple(doubts), tuple(notes), reversal)
 
@@ -202,10 +238,15 @@ def _absurd(understood: dict[str, Any]) -> list[str]:
     return [f"{name} reaches {value:.4g} {unit}: are the numbers mm and rad?"]
 
 
-def import_capture(path: Path, _: ImportOptions) -> Imported:
+def import_capture(path: Path, options: ImportOptions) -> Imported:
     """Import a dynamic capture: displacement over time."""
     found = read_capture(path)
     understood = {**found.summary(), "axis": axis_in(found.keys.get("axis", "")), "instrument": found.keys.get("owner")}
     understood |= {key: found.keys[key] for key in ("machine", "serial no", "date", "velocity") if found.keys.get(key)}
-    note = "a capture over time has no targets: no other command computes from it"
-    return Imported(path, "renishaw-capture", "capture", found, understood, (), (note,))
+    at, against = header_date(found.keys.get("date", ""), options.dates)
+    understood["measured_at"] = at
+    keys = {key: value for key, value in found.keys.items() if key != "date"} | (
+        {"measured_at": at, "date": at} if at else {}
+    )
+    notes = ("a capture over time has no targets: no other command computes from it", *([against] if against else []))
+    return Imported(path, "renishaw-capture", "capture", replace(found, keys=keys), understood, (), notes)

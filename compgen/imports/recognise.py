@@ -38,16 +38,17 @@ _FLAGS = {
     "directions": "--directions",
     "sheet": "--sheet",
     "dates": "--dates",
+    "zero_runs": "--zero-runs",
 }
 _ONE_AXIS = ("axis", "error", "sign", "directions", "dates")
 #: What each format leaves to the user.
 _TAKES: dict[str, tuple[str, ...]] = {
-    "renishaw": ("units", *_ONE_AXIS),
+    "renishaw": ("units", *_ONE_AXIS, "zero_runs"),
     "renishaw-capture": ("dates",),
     "ecmc-iso230": _ONE_AXIS[:-1],
     "etalon-exchange": ("sign",),
-    "table": tuple(name for name in _FLAGS if name != "sheet"),
-    "xlsx": tuple(_FLAGS),
+    "table": tuple(name for name in _FLAGS if name not in ("sheet", "zero_runs")),
+    "xlsx": tuple(name for name in _FLAGS if name != "zero_runs"),
 }
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,10 @@ MOST_BYTES = 64_000_000
 MOST_TARGETS, MOST_RUNS = 100_000, 1_000
 _SECTION = re.compile(r"\s{0,20}([A-Za-z][A-Za-z0-9 _\-]{0,40})::\s*")
 _KEY = re.compile(r"\s{0,40}([A-Za-z][^:]{0,60}?)\s{0,40}:(.*)")
+#: Sections about the surroundings and the instrument; their keys are not those of the machine.
+BESIDE = ("ENVIRONMENT", "EQUIPMENT")
+#: Keys after which numbers follow; a line of user text that is called the same begins nothing.
+_BLOCKS = ("targets", "run target data")
 _SIGNS = ("run target data", "target-count", "run-count")
 
 
@@ -40,7 +44,8 @@ class _File:
     keys: dict[str, str] = field(default_factory=dict)
     targets: list[float] = field(default_factory=list)
     rows: list[tuple[int, int, int, float]] = field(default_factory=list)
-    environment: list[str] = field(default_factory=list)
+    beside: dict[str, dict[str, str]] = field(default_factory=dict)
+    unread: list[str] = field(default_factory=list)
     section: str = ""
     reading: str = ""
     complete: bool = False
@@ -52,7 +57,8 @@ class Renishaw:
     """A text file of the laser software: ``letter`` of its type, axis runs in the file's unit, user text by key.
 
     ``one_way`` holds the run numbers of the file (n,); ``sorted_rows`` says that the flags name two directions, but all
-    runs list their targets in the same order.
+    runs list their targets in the same order. ``beside`` holds the keys of ENVIRONMENT and EQUIPMENT, ``zero_runs`` the runs
+    that are zero at every target while others are not; ``one_way_test`` says that the flags name one direction only.
     """
 
     letter: str
@@ -62,6 +68,9 @@ class Renishaw:
     notes: tuple[str, ...]
     one_way: IntArray
     sorted_rows: bool
+    beside: Mapping[str, Mapping[str, str]]
+    zero_runs: tuple[int, ...]
+    one_way_test: bool
 
 
 def is_renishaw_text(head: str) -> bool:
@@ -92,7 +101,10 @@ def _take_line(source: Text, found: _File, number: int, line: str) -> None:
     if not line.strip():
         return
     key = _KEY.fullmatch(line)
-    if key and key.group(1).lower() in ("targets", "run target data"):
+    if found.section in BESIDE:
+        _take_beside(found, line, key)
+        return
+    if key and key.group(1).lower() in _BLOCKS and found.section != "USER-TEXT":
         found.reading, line = key.group(1).lower(), key.group(2)
     elif key and not (found.section == "DEVIATIONS" and parse_number(line.split()[0]) is not None):
         found.reading = ""
@@ -102,8 +114,13 @@ def _take_line(source: Text, found: _File, number: int, line: str) -> None:
         _take_targets(source, found, number, line)
     elif found.reading == "run target data" and line.split():
         found.rows.append(_row(source, found, number, line))
-    elif found.section == "ENVIRONMENT":
-        found.environment.append(line.strip())
+
+
+def _take_beside(found: _File, line: str, key: re.Match[str] | None) -> None:
+    if key is None:
+        found.unread.append(line.strip())
+    else:
+        found.beside.setdefault(found.section, {}).setdefault(key.group(1).lower(), key.group(2).strip())
 
 
 def _take_targets(source: Text, found: _File, number: int, line: str) -> None:
@@ -184,19 +201,32 @@ def _assembled(source: Text, found: _File) -> Renishaw:
         notes.append("there is no end mark EOF::; all declared readings are there")
     if source.encoding not in ("utf-8", "utf-8-sig"):
         notes.append(f"is not UTF-8; user text was read as {source.encoding}")
-    if found.environment:
-        notes.append(f"{len(found.environment)} lines in ENVIRONMENT without a known layout were not used")
+    if found.unread:
+        notes.append(f"{len(found.unread)} lines in {' and '.join(BESIDE)} without a key were not used")
     flags = found.keys.get("flags", "").split()
     runs = OneAxis(position, direction, cycles(direction, run), value, numbers)
     two_ways = flags[:2] == ["0", "0"] and alternating
-    return Renishaw(letter, runs, found.keys, source.encoding, tuple(notes), run, two_ways)
+    numbered = np.unique(run).tolist()
+    zero = tuple(number for number in numbered if not value[run == number].any()) if value.any() else ()
+    return Renishaw(
+        letter, runs, found.keys, source.encoding, tuple(notes), run, two_ways, found.beside, zero, flags[1:2] == ["1"]
+    )
+
+
+def without_runs(found: Renishaw, numbers: tuple[int, ...]) -> Renishaw:
+    """Return a file without some of its one-way runs."""
+    keep = ~np.isin(found.one_way, numbers)
+    one_way, old = found.one_way[keep], found.runs
+    direction = old.direction[keep]
+    runs = OneAxis(old.position_mm[keep], direction, cycles(direction, one_way), old.value[keep], old.line[keep])
+    return replace(found, runs=runs, one_way=one_way)
 
 
 def _letter(source: Text, found: _File) -> str:
     """Type by the file's name, else by the value of 'File type'."""
     by_name = SUFFIXES.get(source.path.suffix.lower())
     kind = found.keys.get("file type", "").lower()
-    by_key = next((SUFFIXES[suffix] for suffix in SUFFIXES if suffix[1:] in kind), None)
+    by_key = next((SUFFIXES[suffix] for suffix in SUFFIXES if suffix[1:] in re.findall("[a-z]+", kind)), None)
     if by_key is None:
         words = {"linear": "l", "angular": "a", "straightness": "s"}
         by_key = next((letter for word, letter in words.items() if word in kind), None)

@@ -14,6 +14,7 @@ from compgen.core.lengths import Lengths, format_lengths
 from compgen.core.reversal import ReversalCurves, format_reversal
 from compgen.errors import InputError
 from compgen.imports.capture import Capture, format_capture
+from compgen.imports.dates import Order
 
 Kind = Literal["axis", "lengths", "deviations", "errors", "capture"]
 KINDS: tuple[Kind, ...] = ("axis", "lengths", "deviations", "errors", "capture")
@@ -41,6 +42,8 @@ class ImportOptions:
     sign : "error" (measured minus commanded) or "correction" (what is to be added; turned round on import).
     directions : "labels", "motion" (from the order of the rows) or "alternate" (odd runs up, even runs down).
     sheet : name of the sheet of a workbook.
+    zero_runs : what becomes of laser runs that are zero at every target.
+    dates : order of day, month and year where the file writes them as numbers.
     """
 
     kind: Kind | None = None
@@ -51,6 +54,8 @@ class ImportOptions:
     sign: Literal["error", "correction"] | None = None
     directions: Literal["labels", "motion", "alternate"] | None = None
     sheet: str | None = None
+    dates: Order | None = None
+    zero_runs: Literal["drop", "keep"] | None = None
 
 
 @dataclass(frozen=True)

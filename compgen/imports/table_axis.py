@@ -12,6 +12,7 @@ from compgen.core.names import AXES
 from compgen.identify.axis_runs import SAME_TARGET_MM
 from compgen.imports.columns import FIELDS, MM_PER_LENGTH, RunColumn, run_columns, split_name, way
 from compgen.imports.findings import Findings
+from compgen.imports.further import Further, further_of
 from compgen.imports.hypotheses import USUAL_URAD, slope_of, usual_deviation_mm
 from compgen.imports.one_axis import IntArray, OneAxis, axis_in, cycles, motion
 from compgen.imports.source import shown
@@ -33,19 +34,21 @@ class _Rows:
     name: str
 
 
-def axis_readings(findings: Findings, *, angular: bool = False) -> dict[str, OneAxis]:
-    """Return the readings of each axis; the key is "" where nothing says which axis it is."""
+def axis_readings(findings: Findings, *, angular: bool = False) -> tuple[dict[str, OneAxis], Further]:
+    """Return the readings of each axis, "" where nothing says which it is, and what stands beside the rows."""
     rows = _rows(findings)
     target = findings.positions_mm("position", findings.numbers("position"))[rows.row]
     value = _deviations(findings, rows, target, angular=angular)
     letters = _axes(findings, rows.row)
+    further = further_of(findings, "axis", once=len(np.unique(rows.row)) == len(rows.row))
     found = {}
     for letter in dict.fromkeys(letters):
         own = np.flatnonzero(np.array(letters) == letter)
         line = np.array(findings.table.lines, dtype=np.int64)[rows.row[own]]
         direction, run = _directions(findings, target[own], rows.run[own], rows.label[own])
-        found[letter] = OneAxis(target[own], direction, run, value[own], line)
-    return found
+        beside = {name: values[rows.row[own]] for name, values in further.covariates.items()}
+        found[letter] = OneAxis(target[own], direction, run, value[own], line, beside)
+    return found, further
 
 
 def _rows(findings: Findings) -> _Rows:
@@ -59,6 +62,7 @@ def _rows(findings: Findings) -> _Rows:
             findings.table.header_line,
         )
     labels = _labels(findings)
+    findings.used |= {fields[key].name} if key else {column.name for column in wide}
     if key is None:
         return _wide(findings, wide, labels)
     values = findings.numbers(key)

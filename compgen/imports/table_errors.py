@@ -6,13 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.names import ERROR_INDEX, ERROR_NAMES, SQUARENESS_NAMES, error_named
 from compgen.core.text import nearest
 from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, Column
 from compgen.imports.findings import Findings
 from compgen.imports.hypotheses import USUAL_URAD, usual_deviation_mm
-from compgen.imports.source import parse_number, shown
+from compgen.imports.source import shown
 
 
 def wide_errors(findings: Findings, columns: Mapping[str, Column]) -> ErrorTable:
@@ -26,10 +27,13 @@ def wide_errors(findings: Findings, columns: Mapping[str, Column]) -> ErrorTable
         raise findings.table.grid.fail("a position stands here twice", findings.table.header_line)
     curves, squareness = {}, {}
     for name, column in columns.items():
+        findings.used.add(column.name)
         values = np.array(findings.table.numbers(column.name, empty=True))
         known = np.flatnonzero(np.isfinite(values[order]))
         si = _si(findings, name, column, values[order][known], float(np.ptp(position)))
         if name in SQUARENESS_NAMES:
+            if np.ptp(si) > 0:
+                raise findings.table.grid.fail(f"{name} is one number, several stand here", None, column.name)
             squareness[name] = (float(si[0]), float("nan"))
         else:
             curves[name] = Curve(position[order][known], si, np.full(len(known), np.nan))
@@ -44,9 +48,8 @@ def long_errors(findings: Findings) -> ErrorTable:
         if name not in ERROR_INDEX:
             message = f"{shown(name)} is no error of ISO 230-1; {nearest(name, ERROR_NAMES)}"
             raise table.grid.fail(message, line, findings.fields["error"].name)
-    cells = table.column(findings.fields["position"].name)
     values = findings.numbers("value")
-    raw = np.array([np.nan if not cell else parse_number(cell) or 0.0 for cell in cells])
+    raw = np.array(table.numbers(findings.fields["position"].name, empty=True))
     span = raw[np.isfinite(raw)]
     position = np.full(len(raw), np.nan)
     if span.size:
@@ -55,15 +58,34 @@ def long_errors(findings: Findings) -> ErrorTable:
     for name in dict.fromkeys(names):
         rows = np.flatnonzero(np.array(names) == name)
         si = _si(findings, name, findings.fields["value"], values[rows], float(np.ptp(span)) if span.size else 0.0)
+        u_si = _u_si(findings, name, rows, values[rows], si)
         if name in SQUARENESS_NAMES:
-            squareness[name] = (float(si[0]), float("nan"))
+            if len(rows) > 1:
+                raise table.grid.fail(f"{name} is one number, it stands here again", table.lines[int(rows[1])])
+            squareness[name] = (float(si[0]), float(u_si[0]))
             continue
-        order = rows[np.argsort(position[rows])]
-        at = position[order]
+        order = np.argsort(position[rows])
+        at = position[rows][order]
         if not np.all(np.isfinite(at)) or np.any(np.diff(at) == 0):
             raise table.grid.fail(f"{name} has a position that is empty or stands twice", table.lines[int(rows[0])])
-        curves[name] = Curve(at, si[np.argsort(position[rows])], np.full(len(rows), np.nan))
+        curves[name] = Curve(at, si[order], u_si[order])
     return _finished(findings, curves, squareness)
+
+
+def _u_si(findings: Findings, name: str, rows: np.ndarray, values: np.ndarray, si: np.ndarray) -> FloatArray:
+    """Standard uncertainties of rows in mm or rad, nan where none stands; in their own unit, else in that of the values."""
+    if "u_value" not in findings.fields:
+        return np.full(len(rows), np.nan)
+    column = findings.fields["u_value"]
+    u = np.array(findings.table.numbers(column.name, empty=True))[rows]
+    if np.any(u < 0):
+        line = findings.table.lines[int(rows[np.flatnonzero(u < 0)[0]])]
+        raise findings.table.grid.fail("a standard uncertainty is not negative", line, column.name)
+    units = RAD_PER_ANGLE if error_named(name).kind != "linear" else MM_PER_LENGTH
+    unit = findings.given_unit("u_value") or column.unit
+    largest = int(np.argmax(np.abs(values)))
+    common = si[largest] / values[largest] if values[largest] else float("nan")
+    return np.asarray(u * units.get(unit or "", common), dtype=np.float64)
 
 
 def _si(findings: Findings, name: str, column: Column, values: np.ndarray, span_mm: float) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,7 @@ from compgen.core.deviations import Deviations
 from compgen.core.lengths import Lengths
 from compgen.imports.columns import MM_PER_LENGTH
 from compgen.imports.findings import Findings
+from compgen.imports.further import Further, further_of, metadata_of
 from compgen.imports.hypotheses import LengthEvidence, judge_lengths, slope_of, usual_deviation_mm
 
 #: The unit of lengths by their geometry must agree with a known one so well (the machine's errors are far smaller).
@@ -34,14 +37,19 @@ def lengths_of(findings: Findings) -> Lengths:
     reading = findings.numbers("length")
     scale = _length_scale(findings, position, reading, station)
     findings.understood |= {"stations": len(stations), "readings": rows}
+    further = further_of(findings, "lengths")
+    labels = _numbered(findings, [names, points], position, reading, further)
     return Lengths(
         stations=stations,
         station=station,
         point=points,
         position_mm=position,
         length_mm=reading * scale,
-        labels=_runs(findings),
-        metadata={"source": table.grid.path.name},
+        tool_mm=further.tool_mm,
+        approach=further.approach,
+        labels=labels,
+        covariates=further.covariates,
+        metadata=metadata_of(findings, further),
         origin=[(str(table.grid.path), line) for line in table.lines],
     )
 
@@ -109,11 +117,56 @@ def _sign_by_geometry(evidence: list[LengthEvidence]) -> int:
     return signs.pop() if len(signs) == 1 else 0
 
 
-def _runs(findings: Findings) -> dict[str, NDArray[np.int64]]:
-    if "run" not in findings.fields:
-        return {}
-    _, index = np.unique(np.array(findings.table.column(findings.fields["run"].name)), return_inverse=True)
-    return {"run": index.astype(np.int64) + 1}
+def _numbered(
+    findings: Findings, names: Sequence[Sequence[str]], position: FloatArray, value: FloatArray, further: Further
+) -> dict[str, NDArray[np.int64]]:
+    """Return the labels; rows that nothing tells apart are numbered as repeats, or refused if they are a copy.
+
+    Raises
+    ------
+    InputError
+        if three or more rows repeat earlier ones, and each of them to the last digit: they were pasted twice.
+    """
+    first, count = _earlier(_keys(names, position, further))
+    again = np.flatnonzero(count > 1)
+    if not again.size:
+        return further.labels
+    if again.size >= 3 and np.array_equal(value[again], value[first[again]]):
+        line, earlier = (findings.table.lines[k] for k in (int(again[0]), int(first[again[0]])))
+        message = f"{again.size} rows repeat earlier ones to the last digit (this one line {earlier}): take out what is a copy"
+        raise findings.table.grid.fail(message, line)
+    findings.notes.append(
+        f"{again.size} rows repeat a position without a run or repeat: they were numbered as they come"
+    )
+    if "repeat" in further.labels:
+        count = count + further.labels["repeat"] * (1 + int(count.max()))
+    return {**further.labels, "repeat": count}
+
+
+def _keys(names: Sequence[Sequence[str]], position: FloatArray, further: Further) -> FloatArray:
+    """Return what tells rows apart, a number for each column (rows, k)."""
+    numbered = [np.unique(np.array(cells), return_inverse=True)[1] for cells in names]
+    times = [further.covariates[key] for key in ("time_s", "approach") if key in further.covariates]
+    vectors = [part for part in (position, further.tool_mm, further.approach) if part is not None]
+    return np.column_stack([*numbered, *times, *further.labels.values(), *vectors]) + 0.0
+
+
+def _earlier(keys: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return for each row the first one with the same key, and how often it stood so far (1: the first time), (rows,)."""
+    rows = (
+        np.ascontiguousarray(keys)
+        .view([("", keys.dtype)] * keys.shape[1])
+        .ravel()
+        .view(f"V{keys.itemsize * keys.shape[1]}")
+    )
+    _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
+    order = np.argsort(inverse.ravel(), kind="stable")
+    group = inverse.ravel()[order]
+    starts = np.flatnonzero(np.concatenate([[True], group[1:] != group[:-1]]))
+    position_in_group = np.arange(len(group)) - np.repeat(starts, np.diff([*starts, len(group)]))
+    count = np.empty(len(group), dtype=np.int64)
+    count[order] = position_in_group + 1
+    return first[inverse.ravel()].astype(np.int64), count
 
 
 def deviations_of(findings: Findings) -> Deviations:
@@ -134,11 +187,15 @@ def deviations_of(findings: Findings) -> Deviations:
     else:
         findings.understood["sign"] = "measured minus commanded"
     findings.understood["readings"] = len(position)
+    further = further_of(findings, "deviations")
     return Deviations(
         position_mm=position,
         deviation_mm=deviation,
-        labels=_runs(findings),
-        metadata={"source": findings.table.grid.path.name},
+        tool_mm=further.tool_mm,
+        approach=further.approach,
+        labels=_numbered(findings, [], position, np.nan_to_num(deviation).sum(axis=1), further),
+        covariates=further.covariates,
+        metadata=metadata_of(findings, further),
         origin=[(str(findings.table.grid.path), line) for line in findings.table.lines],
     )
 

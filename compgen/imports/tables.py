@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from compgen.core.axis_runs import AxisRuns, check_single
+from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.core.reversal import ReversalCurves
 from compgen.errors import InputError
 from compgen.imports.columns import error_columns, fields_of
 from compgen.imports.findings import Findings
+from compgen.imports.further import further_of, metadata_of
 from compgen.imports.grid import Grid, find_table
 from compgen.imports.one_axis import OneAxis, check_error, errors_of
 from compgen.imports.result import Data, Imported, ImportOptions, Kind
@@ -21,6 +23,9 @@ from compgen.imports.source import shown
 from compgen.imports.table_axis import axis_readings
 from compgen.imports.table_errors import long_errors, wide_errors
 from compgen.imports.table_points import deviations_of, lengths_of
+
+#: So many lines above a table are shown.
+_MOST_HEADER = 12
 
 
 def import_table(grid: Grid, options: ImportOptions, form: str = "table") -> Imported:
@@ -30,6 +35,8 @@ def import_table(grid: Grid, options: ImportOptions, form: str = "table") -> Imp
     findings.notes.extend(table.grid.notes)
     kind = options.kind or _kind(findings)
     findings.understood["columns"] = {key: column.name for key, column in findings.fields.items()}
+    if table.metadata:
+        findings.understood["header"] = dict(list(table.metadata.items())[:_MOST_HEADER])
     reversal: ReversalCurves | None = None
     data: Data
     if kind == "lengths":
@@ -44,6 +51,7 @@ def import_table(grid: Grid, options: ImportOptions, form: str = "table") -> Imp
         else:
             _need(findings, "position")
         data = wide_errors(findings, columns) if columns else long_errors(findings)
+        data = data.replace(metadata=metadata_of(findings, further_of(findings, "errors")))
     else:
         _need(findings, "position")
         data, reversal, kind = _along_axes(findings)
@@ -91,7 +99,8 @@ def _need(findings: Findings, *keys: str) -> None:
 def _along_axes(findings: Findings) -> tuple[Data, ReversalCurves | None, Kind]:
     error = findings.options.error
     angular = error is not None and error[1:2] in ("A", "B", "C")
-    found = axis_readings(findings, angular=angular)
+    found, further = axis_readings(findings, angular=angular)
+    metadata = metadata_of(findings, further)
     path = findings.table.grid.path
     if error is not None:
         if len(found) > 1:
@@ -100,10 +109,10 @@ def _along_axes(findings: Findings) -> tuple[Data, ReversalCurves | None, Kind]:
         check_error(error, letter or None, angular=angular)
         findings.understood |= _described(runs, 1e-6 if angular else MM_PER_UM)
         findings.doubts[:] = [text for text in findings.doubts if "--axis" not in text]
-        table, reversal = errors_of(runs, error, {"source": path.name})
+        table, reversal = errors_of(runs, error, metadata)
         return table, reversal, "errors"
     findings.understood["axes"] = {letter or "?": _described(runs, MM_PER_UM) for letter, runs in found.items()}
-    return runs_of(found, str(path), {"source": path.name}), None, "axis"
+    return runs_of(found, str(path), metadata), None, "axis"
 
 
 def _described(runs: OneAxis, unit: float) -> dict[str, object]:
@@ -124,6 +133,7 @@ def runs_of(found: dict[str, OneAxis], file: str, metadata: dict[str, str]) -> A
         direction=np.concatenate([item.direction for _, item in parts]),
         run=np.concatenate([item.run for _, item in parts]),
         deviation_mm=np.concatenate([item.value for _, item in parts]),
+        covariates=_together([item.covariates for _, item in parts]),
         metadata=metadata,
         origin=[(file, int(line)) for _, item in parts for line in item.line],
     )
@@ -150,6 +160,12 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
     return replace(first, data=data, understood=understood, doubts=doubts, notes=notes)
 
 
+def _together(parts: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
+    """Return the numbers beside the readings that every part has, one after the other."""
+    common = [name for name in parts[0] if all(name in part for part in parts)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in common}
+
+
 def _joined_runs(parts: Sequence[AxisRuns]) -> AxisRuns:
     runs = AxisRuns(
         axis=np.concatenate([item.axis for item in parts]),
@@ -157,6 +173,7 @@ def _joined_runs(parts: Sequence[AxisRuns]) -> AxisRuns:
         direction=np.concatenate([item.direction for item in parts]),
         run=np.concatenate([item.run for item in parts]),
         deviation_mm=np.concatenate([item.deviation_mm for item in parts]),
+        covariates=_together([item.covariates for item in parts]),
         metadata=parts[0].metadata,
         origin=[place for item in parts for place in item.origin],
     )

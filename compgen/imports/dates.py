@@ -1,0 +1,223 @@
+"""Dates and times as instruments and spreadsheets write them; the order of day and month is never guessed.
+
+A date whose numbers allow several orders (``03/04/2025``) is settled by the other dates of the same column, where one of
+them allows one order only, or by the user (``--dates``). Dots mean day.month.year, a year of four digits in front
+year-month-day, and a month may have its English or German name.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Literal
+
+from compgen.errors import InputError
+from compgen.imports.source import shown
+
+Order = Literal["dmy", "mdy", "ymd"]
+ORDERS: tuple[Order, ...] = ("dmy", "mdy", "ymd")
+#: Days since 1899-12-30 that spreadsheets write for dates of the years 2000 to 2099.
+SERIAL_DAYS = (36526.0, 73050.0)
+MOST_CHARACTERS = 60
+_SERIAL_ZERO = datetime(1899, 12, 30)
+_CLOCK = re.compile(
+    r"(?<![\d:])(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?(?![\d:])\s{0,2}([aApP])?(?:\.?[mM]\b)?"
+)
+_ZONE = re.compile(r"(?<=\d)\s?(Z|[+-]\d{2}:?\d{2})$")
+_NUMBERS = re.compile(r"(?<!\d)(\d{4}|\d{1,2})\s?([./-])\s?(\d{1,2})\s?\2\s?(\d{4}|\d{1,2})(?!\d)")
+_WORD = re.compile(r"[A-Za-z\u00e4\u00c4]{3,9}")
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_GERMAN = {"m\u00e4r": 3, "mrz": 3, "mae": 3, "mai": 5, "okt": 10, "dez": 12}
+_MONTH_NAMES = frozenset(
+    [
+        "january",
+        "february",
+        "march",
+        "april",
+        "may",
+        "june",
+        "july",
+        "august",
+        "september",
+        "october",
+        "november",
+        "december",
+        "januar",
+        "februar",
+        "märz",
+        "maerz",
+        "mai",
+        "juni",
+        "juli",
+        "oktober",
+        "dezember",
+        "sept",
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Written:
+    """One date as it stands: what each possible order makes of it (at midnight), seconds of the day, and the zone."""
+
+    text: str
+    days: Mapping[Order, datetime]
+    clock_s: float | None
+    zone: str
+
+    @property
+    def settled(self) -> bool:
+        """Whether all orders that are possible say the same day."""
+        return len(set(self.days.values())) == 1
+
+
+def read_date(text: str) -> Written | None:
+    """Return the date, the time, or both, that a cell or a line holds; None if it is neither.
+
+    >>> sorted(read_date("03/04/2025 12:58").days), read_date("13/04/2025").settled, read_date("10:46 Dec 12 2016").clock_s
+    (['dmy', 'mdy'], True, 38760.0)
+    """
+    content = text.strip().strip("\"'")
+    if not 4 <= len(content) <= MOST_CHARACTERS:
+        return None
+    found = _CLOCK.search(content)
+    clock_s = _seconds(found) if found else None
+    if found and clock_s is None:
+        return None
+    zone = _ZONE.search(content) if found else None
+    rest = content if found is None else f"{content[: found.start()]} {content[found.end() :]}"
+    if zone:
+        rest = rest[: len(rest) - len(zone.group(0))]
+    days = _numeric_days(rest) or _named_day(rest)
+    if not days and (clock_s is None or re.search(r"\d", rest)):
+        return None
+    return Written(content, days, clock_s, zone.group(1) if zone else "")
+
+
+def _seconds(found: re.Match[str]) -> float | None:
+    hour, minute, second = (int(found.group(k) or 0) for k in (1, 2, 3))
+    half = (found.group(5) or "").lower()
+    if hour > 23 or minute > 59 or second > 59 or (half and not 1 <= hour <= 12):
+        return None
+    hour = hour % 12 + 12 * (half == "p") if half else hour
+    return 3600.0 * hour + 60.0 * minute + second + float(f"0.{found.group(4) or 0}")
+
+
+def _numeric_days(text: str) -> dict[Order, datetime]:
+    found = _NUMBERS.search(text)
+    if not found:
+        return {}
+    first, mark, second, third = found.group(1), found.group(2), found.group(3), found.group(4)
+    if len(first) == 4:
+        orders: tuple[Order, ...] = ("ymd",)
+    elif mark == ".":
+        orders = ("dmy",)
+    else:
+        orders = ("dmy", "mdy") if len(third) == 4 else ORDERS
+    made = {order: _day(dict(zip(order, (first, second, third), strict=True))) for order in orders}
+    return {order: day for order, day in made.items() if day is not None}
+
+
+def _day(parts: Mapping[str, str]) -> datetime | None:
+    year = int(parts["y"]) + (2000 if len(parts["y"]) <= 2 else 0)
+    try:
+        return datetime(year, int(parts["m"]), int(parts["d"]))
+    except ValueError:
+        return None
+
+
+def _named_day(text: str) -> dict[Order, datetime]:
+    """Return a date whose month is a word: 12 Dec 2016, Dec 12 2016, 2016-Dec-12, 12. Dezember 2016."""
+    months = [number for word in _WORD.findall(text) if (number := _month(word.lower())) is not None]
+    numbers = re.findall(r"\d+", text)
+    years = [number for number in numbers if len(number) == 4]
+    days = [number for number in numbers if len(number) <= 2]
+    if len(months) != 1 or len(years) != 1 or len(days) != 1 or len(numbers) != 2:
+        return {}
+    day = _day({"y": years[0], "m": str(months[0]), "d": days[0]})
+    return {} if day is None else dict.fromkeys(ORDERS, day)
+
+
+def _month(word: str) -> int | None:
+    if len(word) > 3 and word not in _MONTH_NAMES:
+        return None
+    return _GERMAN.get(word[:3]) or (_MONTHS.index(word[:3]) + 1 if word[:3] in _MONTHS else None)
+
+
+def serial_date(days: float) -> Written | None:
+    """Return the date that a spreadsheet wrote as a number of days; None for a number of no year 2000 to 2099."""
+    if not SERIAL_DAYS[0] <= days < SERIAL_DAYS[1]:
+        return None
+    at = _SERIAL_ZERO + timedelta(seconds=round(86400.0 * days, 3))
+    midnight = at.replace(hour=0, minute=0, second=0, microsecond=0)
+    return Written(f"{days:g}", dict.fromkeys(ORDERS, midnight), (at - midnight).total_seconds(), "")
+
+
+def order_of(dates: Sequence[Written], chosen: Order | None = None) -> Order | None:
+    """Return the order of day, month and year in which all dates of a column can be read, None if it stays open.
+
+    Raises
+    ------
+    InputError
+        for dates of which no order, or not the chosen one, is possible.
+    """
+    open_ones = [date for date in dates if not date.settled]
+    possible = [order for order in ORDERS if all(order in date.days for date in open_ones + _telling(dates))]
+    if chosen is not None and open_ones and chosen not in possible:
+        wrong = next(date for date in [*open_ones, *_telling(dates)] if chosen not in date.days)
+        raise InputError(f"{shown(wrong.text)} is no date in the order {chosen}", field="--dates")
+    if not open_ones:
+        return chosen or "ymd"
+    if not possible:
+        raise InputError(f"dates such as {shown(open_ones[0].text)} do not all fit one order of day, month and year")
+    if chosen is not None:
+        return chosen
+    days = [{date.days[order] for order in possible} for date in open_ones]
+    return possible[0] if all(len(found) == 1 for found in days) else None
+
+
+def _telling(dates: Sequence[Written]) -> list[Written]:
+    """Return the dates that allow one order only, written with the marks of the open ones (a year in front tells nothing)."""
+    marks = {found.group(2) for date in dates if not date.settled and (found := _NUMBERS.search(date.text))}
+    return [
+        date
+        for date in dates
+        if date.settled and (found := _NUMBERS.search(date.text)) and found.group(2) in marks and "ymd" not in date.days
+    ]
+
+
+def moment(date: Written, order: Order) -> datetime:
+    """Return date and time by an order; a date that is settled needs none."""
+    day = date.days.get(order) or next(iter(date.days.values()))
+    return day + timedelta(seconds=date.clock_s or 0.0)
+
+
+def iso(date: Written, order: Order) -> str:
+    """Return a date as ISO 8601 has it, without a time if none was written.
+
+    >>> iso(read_date("13.4.2025 09:05"), "dmy"), iso(read_date("2025-04-13"), "dmy")
+    ('2025-04-13T09:05:00', '2025-04-13')
+    """
+    at = moment(date, order)
+    zone = date.zone if len(date.zone) != 5 else f"{date.zone[:3]}:{date.zone[3:]}"
+    return at.date().isoformat() if date.clock_s is None else f"{at.isoformat(timespec='seconds')}{zone}"
+
+
+def header_date(text: str, chosen: Order | None = None) -> tuple[str | None, str | None]:
+    """Return the ISO form of a date in a header, and what stands against it: (iso, None), (None, why) or (None, None).
+
+    >>> header_date("10/02/2025 12:58:22")[0], header_date("10/02/2025 12:58:22", "dmy")[0]
+    (None, '2025-02-10T12:58:22')
+    """
+    if not text.strip():
+        return None, None
+    found = read_date(text)
+    if found is None or not found.days:
+        return None, f"the date {shown(text)} is not understood and left out"
+    order = order_of([found], chosen)
+    if order is None:
+        days = " or ".join(sorted({day.date().isoformat() for day in found.days.values()}))
+        return None, f"the date {shown(text)} may be {days}: it is left out; say --dates dmy, mdy or ymd to keep it"
+    return iso(found, order), None
