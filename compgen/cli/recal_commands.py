@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,7 +12,8 @@ import click
 from rich import box
 from rich.table import Table
 
-from compgen.cli.common import Command, json_option, print_json, stdout
+from compgen.cli.common import STOPPED, Command, json_option, print_json, stdout
+from compgen.cli.parallel_options import fleet_options, stopped_by_signals
 from compgen.errors import InputError
 
 if TYPE_CHECKING:
@@ -98,23 +100,31 @@ def opened(job: Job, use: Callable[[Store], Any]) -> Any:
 @recal.command("run")
 @click.argument("machines", nargs=-1)
 @job_option
+@fleet_options
 @notify_option
 @json_option
-def run_command(machines: tuple[str, ...], job: Job, command: str | None, as_json: bool) -> int:
+def run_command(
+    machines: tuple[str, ...], job: Job, workers: int, cluster: str | None, command: str | None, as_json: bool
+) -> int:
     """Look once into the inboxes of MACHINES (default all), process what is new, publish the tables.
 
-    The same inbox gives the same state, however often it is run. A machine that fails does not stop the others.
+    The same inbox gives the same state, however often it is run. A machine that fails does not stop the others. On
+    SIGTERM or Ctrl-C the measurements that are being processed are finished; exit code 130.
 
     \b
     Example:
       compgen recal run --job /etc/compgen/recal.toml --json
+      compgen recal run --workers 8
     """
-    from compgen.recal.runner import run_jobs
+    from compgen.recal.fleet import run_fleet
 
-    result = run_jobs(job.with_notify(_words(command)), machines)
+    with stopped_by_signals() as stop:
+        chosen = job.with_notify(_words(command))
+        result = run_fleet(chosen, machines, workers=workers, cluster=cluster, stop=stop.is_set)
+        code = STOPPED if stop.is_set() else result.exit_code
     if as_json:
         print_json(result.summary())
-        return result.exit_code
+        return code
     for item in result.outcomes:
         active = "no tables active" if item.active is None else f"version {item.active} active"
         done = f", processed {', '.join(item.processed)}" if item.processed else ""
@@ -122,7 +132,7 @@ def run_command(machines: tuple[str, ...], job: Job, command: str | None, as_jso
         stdout.print(f"{item.machine}: {item.state}, {active}{waiting}{done}", soft_wrap=True)
         for message in item.messages:
             stdout.print(f"  {message}", soft_wrap=True)
-    return result.exit_code
+    return code
 
 
 def _words(command: str | None) -> tuple[str, ...]:
@@ -142,35 +152,45 @@ def _words(command: str | None) -> tuple[str, ...]:
 @click.option(
     "--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus metrics on 127.0.0.1 at this port."
 )
+@fleet_options
 @notify_option
-def watch_command(job: Job, poll_s: float, metrics_port: int | None, command: str | None) -> int:
+def watch_command(
+    job: Job, poll_s: float, metrics_port: int | None, workers: int, cluster: str | None, command: str | None
+) -> int:
     """Keep running: every machine by its schedule (without one every 5 minutes), until SIGTERM or Ctrl-C.
 
-    Edits of the job file are picked up; a wrong one is reported and the one before stays. On a signal the measurement
-    that is being processed is finished.
+    Edits of the job file are picked up; a wrong one is reported and the one before stays. On a signal the measurements
+    that are being processed are finished.
 
     \b
     Example:
       compgen recal watch --job /etc/compgen/recal.toml
     """
+    from compgen.recal.fleet import open_fleet, work_of
     from compgen.recal.watch import Watch
 
-    words = _words(command)
-    if metrics_port is None:
-        Watch(job.path, poll_s=poll_s, notify=words).run()
-        return 0
+    with contextlib.ExitStack() as left:
+        options: dict[str, Any] = {}
+        fleet = open_fleet(job.store, workers, cluster)
+        if fleet is not None:
+            left.callback(fleet.close)
+            options |= {"work": work_of(fleet), "threads": fleet.size}
+        if metrics_port is not None:
+            options["on_outcome"] = _counted(job, metrics_port, left)
+        Watch(job.path, poll_s=poll_s, notify=_words(command), **options).run()
+    return 0
+
+
+def _counted(job: Job, port: int, left: contextlib.ExitStack) -> Callable[[Any], None]:
+    """Show metrics until ``left`` is; return what counts an outcome."""
     from compgen.recal.store import open_store
     from compgen.serve.metrics import WatchMetrics, start_metrics
 
     store = open_store(job.store)
+    left.callback(store.close)
     metrics = WatchMetrics(store)
-    _, stop = start_metrics(metrics.text, metrics_port)
-    try:
-        Watch(job.path, poll_s=poll_s, notify=words, on_outcome=metrics.count).run()
-    finally:
-        stop()
-        store.close()
-    return 0
+    left.callback(start_metrics(metrics.text, port)[1])
+    return metrics.count
 
 
 @recal.command("status")

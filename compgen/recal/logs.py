@@ -8,6 +8,7 @@ from typing import Any, Literal
 import structlog
 
 Format = Literal["auto", "json", "text"]
+_FORM: list[Format] = []
 
 
 class _Stderr:
@@ -22,6 +23,7 @@ class _Stderr:
 
 def configure(kind: Format = "auto") -> None:
     """Choose the form of the logs; "auto" gives words on a terminal and JSON elsewhere."""
+    _FORM[:] = [kind]
     words = kind == "text" or (kind == "auto" and sys.stderr.isatty())
     last: Any = (
         structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()) if words else structlog.processors.JSONRenderer()
@@ -35,6 +37,11 @@ def configure(kind: Format = "auto") -> None:
         logger_factory=lambda *_: _Stderr(),
         cache_logger_on_first_use=False,
     )
+
+
+def form() -> Format:
+    """Return the form that was chosen, for a process that writes to the same place."""
+    return _FORM[0] if _FORM else "auto"
 
 
 def _logger() -> Any:

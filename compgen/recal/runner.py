@@ -13,6 +13,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from compgen.core.threads import one_thread
 from compgen.errors import CompgenError
 from compgen.recal import claims, inbox, logs
 from compgen.recal.claims import Claim, ClaimLostError
@@ -112,7 +113,8 @@ def run_machine(job: MachineJob, url: str, stop: Stop = lambda: False, clock: Cl
     try:
         store = open_store(url, clock=clock)
         try:
-            outcome = _Pass(store, job, store.add_machine(job.name), stop).run()
+            with one_thread():  # the same bytes however many processors there are
+                outcome = _Pass(store, job, store.add_machine(job.name), stop).run()
         finally:
             store.close()
     except CompgenError as error:

@@ -1,0 +1,286 @@
+"""One function for many items: in processes of this machine or on a cluster; the same results in the same order.
+
+A function and its items are pickled, whatever decides about a result stands in the item (a seed too), and every item is
+computed with one thread of the numerical libraries; so it does not matter where that happens.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import queue
+import signal
+import threading
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotYet
+from dataclasses import dataclass
+from functools import lru_cache
+from multiprocessing import get_context, parent_process
+from multiprocessing.context import SpawnContext
+from typing import Any, Protocol, TypeVar
+
+from compgen.core.threads import one_thread
+from compgen.errors import CompgenError, CompgenWarning
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Stop = Callable[[], bool]
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+#: How often somebody who waits looks whether to stop, s.
+POLL_S = 0.2
+#: Items that are handed out ahead of the first that is not finished, for each call at a time.
+AHEAD = 256
+
+
+class LostError(CompgenError):
+    """The processes that worked on an item ended before they had a result."""
+
+    exit_code = 1
+
+
+class StoppedError(CompgenError):
+    """An item was not begun, because somebody asked to stop."""
+
+    exit_code = 1
+
+
+class RemoteError(CompgenError):
+    """An error of another process that cannot be sent as it is."""
+
+
+class Packed:
+    """Something pickled once; its text names the kind only, because the contents may hold a password."""
+
+    def __init__(self, value: object) -> None:
+        self.kind = type(value).__name__
+        self.content = pickle.dumps(value)
+
+    def __repr__(self) -> str:
+        return f"<packed {self.kind}>"
+
+    def value(self) -> Any:
+        """Return what was packed."""
+        return pickle.loads(self.content)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came of one item: a result or an error, pickled, and the warnings of compgen."""
+
+    content: bytes
+    failed: bool
+    warnings: tuple[str, ...] = ()
+
+    def value(self) -> Any:
+        """Warn as the work did, and return its result or raise its error."""
+        for text in self.warnings:
+            warnings.warn(text, CompgenWarning, stacklevel=2)
+        found = pickle.loads(self.content)
+        if self.failed:
+            raise found
+        return found
+
+
+class Workers(Protocol):
+    """Something that works on ``size`` items at a time; :meth:`call` may be called by as many threads."""
+
+    size: int
+
+    def call(self, function: Packed, item: Packed, stop: Stop) -> Any:
+        """Return ``function(item)``; LostError if the processes that worked on it ended, StoppedError if none did."""
+        ...
+
+    def close(self) -> None:
+        """Begin nothing more, wait for what runs in processes of this machine, and leave."""
+        ...
+
+
+# --- in the process that works -------------------------------------------------------------------------------------
+
+_BUSY = threading.Lock()
+_STOP: list[Any] = []
+
+
+@lru_cache(maxsize=4)
+def _unpacked(content: bytes) -> Any:
+    return pickle.loads(content)
+
+
+def perform(function: Packed, item: Packed) -> Answer:
+    """Compute one item in this process, one at a time, and return what came of it."""
+    with _BUSY, one_thread(), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", CompgenWarning)
+        try:
+            content, failed = pickle.dumps(_unpacked(function.content)(item.value())), False
+        except Exception as error:
+            content, failed = _pickled_error(error), True
+    return Answer(content, failed, tuple(str(w.message) for w in caught if issubclass(w.category, CompgenWarning)))
+
+
+def _pickled_error(error: Exception) -> bytes:
+    """Return the error, or one of its text and exit code where it cannot be sent."""
+    try:
+        content = pickle.dumps(error)
+        pickle.loads(content)
+        return content
+    except Exception:
+        known = isinstance(error, CompgenError)
+        other = RemoteError(str(error) if known else f"{type(error).__name__}: {error}")
+        other.exit_code = error.exit_code if isinstance(error, CompgenError) else 3
+        return pickle.dumps(other)
+
+
+def stopping() -> bool:
+    """Whether this process was asked to stop after what it is doing."""
+    return bool(_STOP and _STOP[0].value)
+
+
+def _begin(stop: Any) -> None:
+    """Make this process leave signals to the one that started it, and end with it."""
+    _STOP[:] = [stop]
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)  # no SIG_IGN, which commands started here would inherit
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+# --- processes of this machine -------------------------------------------------------------------------------------
+
+
+class _Lane:
+    """One process, and a new one when it is killed."""
+
+    def __init__(self, context: SpawnContext, stop: Any) -> None:
+        self._context, self._stop = context, stop
+        self._pool: ProcessPoolExecutor | None = None
+
+    def perform(self, function: Packed, item: Packed) -> Future[Answer]:
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(1, self._context, initializer=_begin, initargs=(self._stop,))
+        return self._pool.submit(perform, function, item)
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool = None
+
+
+class Processes:
+    """Fresh processes of this machine; one that is killed is replaced, and its item tried once more."""
+
+    def __init__(self, count: int) -> None:
+        context = get_context("spawn")
+        self.size = count
+        self._stop = context.RawValue("b", 0)  # without a lock, which a killed process might keep
+        self._lanes = [_Lane(context, self._stop) for _ in range(count)]
+        self._idle: queue.LifoQueue[_Lane] = queue.LifoQueue()
+        for lane in self._lanes:
+            self._idle.put(lane)
+
+    def call(self, function: Packed, item: Packed, stop: Stop) -> Any:
+        """Return ``function(item)``; see :class:`Workers`."""
+        lane = self._idle.get()
+        try:
+            for _ in range(2):
+                if stop() or self._stop.value:
+                    raise StoppedError("not begun: stopped")
+                try:
+                    return self._waited(lane.perform(function, item), stop).value()
+                except BrokenExecutor:
+                    lane.close()
+        finally:
+            self._idle.put(lane)
+        raise LostError("the process that worked on it was killed, twice (out of memory?)")
+
+    def _waited(self, future: Future[Answer], stop: Stop) -> Answer:
+        while True:
+            try:
+                return future.result(POLL_S)
+            except NotYet:
+                if stop():
+                    self._stop.value = 1
+
+    def close(self) -> None:
+        """Begin nothing more, wait for what runs, end the processes."""
+        self._stop.value = 1
+        for lane in self._lanes:
+            lane.close()
+
+
+# --- all items -----------------------------------------------------------------------------------------------------
+
+
+def spread(
+    workers: Workers,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    *,
+    lost: Callable[[Item, CompgenError], Result] | None = None,
+    stop: Stop = lambda: False,
+) -> Iterator[Result]:
+    """Yield ``function(item)`` for each item, in their order; only some of them are under way at a time.
+
+    Parameters
+    ----------
+    workers : that do the work.
+    function : can be pickled; an error that it raises ends everything.
+    items : can be pickled.
+    lost : gives the result of an item whose processes ended, or that was not begun; without it the error is raised.
+    stop : asked now and then; once it is true nothing more is begun.
+    """
+    packed = Packed(function)
+
+    def work(item: Item) -> Result:
+        try:
+            found: Result = workers.call(packed, Packed(item), stop)
+            return found
+        except (LostError, StoppedError) as error:
+            if lost is None:
+                raise
+            return lost(item, error)
+
+    pool = ThreadPoolExecutor(workers.size, thread_name_prefix="compgen")
+    try:
+        yield from _in_order(pool, work, iter(items), AHEAD * workers.size)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _in_order(
+    pool: ThreadPoolExecutor, work: Callable[[Item], Result], items: Iterator[Item], most: int
+) -> Iterator[Result]:
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) >= most:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    except CancelledError as error:
+        raise StoppedError("stopped") from error
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def opened_workers(workers: int, cluster: str | None, *, same_host: Sequence[str] = ()) -> Workers | None:
+    """Return what does the work: None for this process, which is the case for one worker and no cluster.
+
+    ``same_host`` says why every worker of the cluster has to run on this machine; empty: they need not.
+    """
+    if cluster is not None:
+        from compgen.core.cluster import Cluster  # the library is an optional one
+
+        return Cluster(cluster, same_host=" ".join(same_host))
+    return Processes(workers) if workers > 1 else None
