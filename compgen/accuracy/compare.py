@@ -135,9 +135,10 @@ class Comparison:
         }
 
 
-def _pairs(
+def paired_figures(
     before: Mapping[str, Mapping[str, Figure]], after: Mapping[str, Mapping[str, Figure]]
 ) -> dict[str, dict[str, ComparedFigure]]:
+    """Put figures before and after side by side, those that both have."""
     return {
         group: {key: ComparedFigure(item, after[group][key]) for key, item in figures.items() if key in after[group]}
         for group, figures in before.items()
@@ -170,9 +171,9 @@ def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOpti
     statements.append(
         "single errors: AFTER was gauge-aligned to BEFORE (compgen.model.gauge) before they were compared"
     )
-    statements += _of_uncertainty(first.known, second.known)
+    statements += said_of_uncertainty(first.known, second.known)
     decisive = tuple(("volume", key) for key in DECISIVE_VOLUME)
-    return Comparison("errors", _pairs(groups[0], groups[1]), decisive, tuple(statements))
+    return Comparison("errors", paired_figures(groups[0], groups[1]), decisive, tuple(statements))
 
 
 def _known_part(machine: Machine, source: ErrorSource) -> tuple[Machine, list[str]]:
@@ -188,7 +189,8 @@ def _known_part(machine: Machine, source: ErrorSource) -> tuple[Machine, list[st
     return narrowed(machine, lower, upper), ["the curves end within the travel; the volume is the part that they know"]
 
 
-def _of_uncertainty(*known: bool) -> list[str]:
+def said_of_uncertainty(*known: bool) -> list[str]:
+    """Say what the verdicts rest on; ``known``: whether each side has uncertainties."""
     if all(known):
         return [
             f"uncertainties: k = {COVERAGE:g}; 'better' needs bands that separate (then En > 1); what both measurements "
@@ -206,9 +208,9 @@ def compare_fields(
     sides = [_aligned(machine, side, chosen.alignment or "as-given") for side in (first, second)]
     groups = [{"volume": _of_measured(side, first.measured)} for side in sides]
     known = [not math.isnan(side.spread(np.ones_like(side.error_mm))) for side in sides]
-    statements = [text, f"alignment: {sides[0].alignment}", *_components(first.measured), *_of_uncertainty(*known)]
+    statements = [text, f"alignment: {sides[0].alignment}", *_components(first.measured), *said_of_uncertainty(*known)]
     decisive = tuple(("volume", key) for key in DECISIVE_VOLUME)
-    return Comparison("positions", _pairs(groups[0], groups[1]), decisive, tuple(statements))
+    return Comparison("positions", paired_figures(groups[0], groups[1]), decisive, tuple(statements))
 
 
 def _aligned(machine: Machine, side: MeasuredField, alignment: Alignment) -> Field:
@@ -265,10 +267,10 @@ def compare_runs(
         accuracy_of_runs({axis: pair[0] for axis, pair in pairs.items()}, chosen.edition, chosen.budgets),
         accuracy_of_runs({axis: pair[1] for axis, pair in pairs.items()}, chosen.edition, chosen.budgets),
     ]
-    groups = _pairs(sides[0].groups, sides[1].groups)
+    groups = paired_figures(sides[0].groups, sides[1].groups)
     decisive = tuple((axis, next(key for key in DECISIVE_RUNS if key in groups[axis])) for axis in axes)
     known = [not any(math.isnan(item.before.u + item.after.u) for g in groups.values() for item in g.values())]
-    statements = (*(pair[2] for pair in pairs.values()), *sides[0].statements, *_of_uncertainty(*known))
+    statements = (*(pair[2] for pair in pairs.values()), *sides[0].statements, *said_of_uncertainty(*known))
     return Comparison("axis runs", groups, decisive, statements)
 
 

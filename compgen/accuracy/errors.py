@@ -10,12 +10,11 @@ from compgen.accuracy.figure import Figure
 from compgen.accuracy.source import ErrorSource
 from compgen.accuracy.straightness import LINES, slope_weights, straightness
 from compgen.core.csvio import FloatArray
+from compgen.core.diagonals import BODY_DIAGONALS
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.model.volumetric import c_matrix
 
-#: Diagonals of ISO 230-6: directions of X, Y, Z along them.
-BODY_DIAGONALS = {"PPP": (1, 1, 1), "NPP": (-1, 1, 1), "PNP": (1, -1, 1), "NNP": (-1, -1, 1)}
 #: Points along a diagonal.
 ALONG_DIAGONAL = 41
 #: The squareness errors by (axis whose line turns, component, reference axis, its component).
@@ -101,7 +100,7 @@ def axis_figures(source: ErrorSource) -> dict[str, Figure]:
     machine = source.machine
     found = {}
     for k, axis in enumerate(AXES):
-        levels = _levels(source, k)
+        levels = levels_of(source, k)
         points = np.tile(np.array(machine.reference_point_mm), (len(levels), 1))
         points[:, k] = levels
         field = source.field(points)
@@ -113,8 +112,8 @@ def axis_figures(source: ErrorSource) -> dict[str, Figure]:
     return found
 
 
-def _levels(source: ErrorSource, axis: int) -> FloatArray:
-    """Nodes of the curves of one axis within its travel, and the ends of the travel."""
+def levels_of(source: ErrorSource, axis: int) -> FloatArray:
+    """Return the nodes of the curves of one axis within its travel, and the ends of the travel."""
     low, high = source.machine.axes[axis].range_mm
     nodes = [curve.position_mm for name, curve in source.errors.curves.items() if error_named(name).axis == axis]
     levels = np.unique(np.concatenate([np.array([low, high]), *nodes]))

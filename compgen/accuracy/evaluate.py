@@ -19,6 +19,7 @@ from compgen.accuracy.errors import (
 from compgen.accuracy.field import Alignment, Field, aligned, volume_figures
 from compgen.accuracy.figure import Figure
 from compgen.accuracy.iso230_2 import LATEST, positioning_test
+from compgen.accuracy.reversal import KnownReversal, reversal_figures
 from compgen.accuracy.runs import RunStatistics
 from compgen.accuracy.source import ErrorSource, grid_points
 from compgen.accuracy.vdi3441 import vdi_3441
@@ -76,7 +77,9 @@ def volume_fields(
     return found
 
 
-def accuracy_of_errors(source: ErrorSource, alignment: Alignment = "axes", line: str = "ls") -> Accuracy:
+def accuracy_of_errors(
+    source: ErrorSource, alignment: Alignment = "axes", line: str = "ls", reversal: KnownReversal | None = None
+) -> Accuracy:
     """Return the figures of a machine: its volume (ISO 230-1), axes, diagonals (ISO 230-6), and each error.
 
     Parameters
@@ -84,6 +87,7 @@ def accuracy_of_errors(source: ErrorSource, alignment: Alignment = "axes", line:
     source : errors and their uncertainty.
     alignment : how the volume is aligned, see :func:`compgen.accuracy.field.aligned`.
     line : reference line of straightness and squareness: ``"ls"``, ``"end-point"``, ``"minzone"``.
+    reversal : what the axes do differently in their two directions, where it is known.
     """
     ((full, pairs),) = volume_fields(source.machine, (source,), alignment)
     groups = {"volume": volume_figures(full, pairs), **groups_of_errors(source, line)}
@@ -91,7 +95,10 @@ def accuracy_of_errors(source: ErrorSource, alignment: Alignment = "axes", line:
     groups["straightness"] = {
         f"{name} {kind}": item for name, kinds in straight.items() for kind, item in kinds.items()
     }
-    return Accuracy(groups, statements_of(source.machine, full, line))
+    if reversal is not None and reversal.curves is not None:
+        groups["reversal"] = reversal_figures(source, reversal.curves)
+    said = () if reversal is None else (reversal.text,)
+    return Accuracy(groups, (*statements_of(source.machine, full, line), *said))
 
 
 def groups_of_errors(source: ErrorSource, line: str) -> dict[str, dict[str, Figure]]:

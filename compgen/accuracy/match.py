@@ -13,11 +13,14 @@ from compgen.accuracy.compare import (
     compare_errors,
     compare_fields,
     compare_runs,
+    paired_figures,
 )
+from compgen.accuracy.compare_diagonals import compare_diagonals
 from compgen.accuracy.evaluate import volume_fields
 from compgen.accuracy.field import Alignment, Field, aligned
-from compgen.accuracy.figure import ComparedFigure
+from compgen.accuracy.figure import Figure
 from compgen.accuracy.pairing import MeasuredField, check_same_positions
+from compgen.accuracy.reversal import reversal_figures
 from compgen.accuracy.sides import Side
 from compgen.accuracy.source import ErrorSource
 from compgen.core.csvio import FloatArray
@@ -27,7 +30,7 @@ from compgen.verify import ReadTables
 
 
 def compare_sides(before: Side, after: Side, options: CompareOptions) -> Comparison:
-    """Compare two sides of like kind: axis runs, measured positions, or errors (given, or identified first).
+    """Compare two sides of like kind: axis runs, diagonals, measured positions, or errors (given, or identified first).
 
     Raises
     ------
@@ -36,13 +39,16 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
     """
     if before.runs is not None and after.runs is not None:
         return compare_runs(before.runs, after.runs, options)
+    if before.diagonals is not None and after.diagonals is not None:
+        return compare_diagonals(before.machine, before.diagonals, after.diagonals, options)
     if before.predicted is not None or after.predicted is not None:
         side = before if before.predicted is not None else after
         raise InputError(
             "holds predicted errors at points; compare them with a measurement: --predicted", file=side.path
         )
-    if before.runs is not None or after.runs is not None:
-        raise InputError(f"BEFORE holds {before.kind}, AFTER {after.kind}; axis runs compare with axis runs only")
+    for alone, name in (("runs", "axis runs"), ("diagonals", "measured diagonals")):
+        if getattr(before, alone) is not None or getattr(after, alone) is not None:
+            raise InputError(f"BEFORE holds {before.kind}, AFTER {after.kind}; {name} compare with {name} only")
     if options.align != "model":
         if before.deviations is not None and after.deviations is not None:
             return _positions(before, after, options)
@@ -59,10 +65,18 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
         if side.kind not in ("errors",):
             said.append(f"{side.path.name}: errors identified from {side.kind}")
     groups = {name: dict(group) for name, group in found.groups.items()}
-    for key, item in (first.reversal or {}).items():
-        if second.reversal and key in second.reversal:
-            groups["axes"][key] = ComparedFigure(item, second.reversal[key])
+    both = [_reversal_of(side) for side in (first, second)]
+    if both[0] and both[1]:
+        groups |= paired_figures({"reversal": both[0]}, {"reversal": both[1]})
+    else:
+        said += [f"{side.path.name}: {side.reversal.text}" for side in (first, second) if side.reversal.curves is None]
     return replace(found, groups=groups, statements=(*said, *found.statements))
+
+
+def _reversal_of(side: Side) -> dict[str, Figure]:
+    if side.source is None or side.reversal.curves is None:
+        return {}
+    return reversal_figures(side.source, side.reversal.curves)
 
 
 def _positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
@@ -129,8 +143,9 @@ def with_prediction(
 def _both_fields(predicted: Side, measured: Side, options: CompareOptions) -> tuple[Field, Field]:
     """Predicted and measured field at the same points, aligned alike."""
     machine = predicted.machine
-    if measured.runs is not None or predicted.runs is not None:
-        raise InputError("axis runs cannot be compared with a prediction of errors", file=measured.path)
+    for side in (measured, predicted):
+        if side.runs is not None or side.diagonals is not None:
+            raise InputError(f"{side.kind} cannot be compared with a prediction of errors", file=side.path)
     if measured.predicted is not None:
         raise InputError("AFTER is a prediction itself; a measurement is due", file=measured.path)
     alignment: Alignment = options.alignment or ("as-given" if measured.deviations is not None else "axes")

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from compgen.accuracy.diagonals import DiagonalRun, diagonal_runs
 from compgen.accuracy.field import Field
-from compgen.accuracy.figure import Figure
 from compgen.accuracy.pairing import MeasuredField, measured_field
+from compgen.accuracy.reversal import KnownReversal, identified_reversal
 from compgen.accuracy.runs import RunStatistics, axis_statistics
 from compgen.accuracy.source import ErrorSource, error_source
 from compgen.controllers.isg.error_files import read_error_file
@@ -19,11 +20,13 @@ from compgen.controllers.isg.etalon_exchange import is_exchange_text
 from compgen.core.axis_runs import AxisRuns
 from compgen.core.csvio import read_csv
 from compgen.core.deviations import Deviations
+from compgen.core.diagonals import read_diagonals
 from compgen.core.error_table import ERROR_COLUMNS, ErrorTable
 from compgen.core.files import read_bytes, sha256_of
 from compgen.core.lengths import POSITION_COLUMNS, Lengths
 from compgen.core.machine import Machine
-from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.names import MM_PER_UM
+from compgen.core.reversal import read_reversal
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import Identification, IdentifyOptions, identify_measurement, joint_covariance, read_measurement
 from compgen.identify.covariance import Covariance, read_covariance
@@ -34,6 +37,9 @@ _LOOKED_AT = 1_000_000
 #: Reads the files of one measurement, with the constants of a six-DOF instrument.
 Reader = Callable[[Sequence[str | Path], Path | None], Measurement | ErrorTable]
 PREDICTED_COLUMNS = ("ex_um", "ey_um", "ez_um")
+
+
+NOT_KNOWN = KnownReversal(None, "reversal: not known: errors are means of both directions")
 
 
 @dataclass(frozen=True)
@@ -51,8 +57,9 @@ class Side:
     deviations: Deviations | None = None
     lengths: Lengths | None = None
     runs: dict[str, RunStatistics] | None = None
+    diagonals: dict[str, DiagonalRun] | None = None
     predicted: Field | None = None
-    reversal: dict[str, Figure] | None = None
+    reversal: KnownReversal = NOT_KNOWN
     u_um: float | None = None
 
     def errors(self) -> Side:
@@ -64,7 +71,7 @@ class Side:
             raise InputError(f"holds {self.kind}, from which the errors of the machine do not follow", file=self.path)
         chosen = IdentifyOptions(u_deviation_um=self.u_um if self.lengths is None else None)
         found = identify_measurement(self.machine, measurement, chosen)
-        return replace(self, source=_source_of(self.machine, found), reversal=_reversal_figures(found))
+        return replace(self, source=_source_of(self.machine, found), reversal=identified_reversal(found))
 
     def measured(self) -> MeasuredField:
         """Return measured positions as a field."""
@@ -94,9 +101,12 @@ def read_side(
     header = _header(text)
     if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
         errors = read_error_file(source)
-        return Side(machine, source, "errors", source=error_source(machine, errors, covariance_beside(source, errors)))
+        known = error_source(machine, errors, covariance_beside(source, errors))
+        return Side(machine, source, "errors", source=known, reversal=_reversal_beside(source))
     if set(PREDICTED_COLUMNS) <= header:
         return Side(machine, source, "predicted errors at points", predicted=_read_predicted(machine, source))
+    if {"diagonal", "deviation_um"} <= header:
+        return Side(machine, source, "measured diagonals", diagonals=diagonal_runs(machine, read_diagonals(source)))
     holds_sixdof = "y_qd1_mm" in header
     measurement = reader([source], instrument if holds_sixdof else None)
     if isinstance(measurement, ErrorTable):
@@ -134,16 +144,19 @@ def _source_of(machine: Machine, found: Identification) -> ErrorSource:
     return error_source(machine, found.errors, joint_covariance(found) if found.has_covariance else None)
 
 
-def _reversal_figures(found: Identification) -> dict[str, Figure] | None:
-    """Mean reversal of each axis along itself, as the readings show it."""
-    if found.reversal is None:
-        return None
-    figures = {}
-    for name, axis in found.reversal.axes.items():
-        k = AXES.index(name)
-        value, u = float(axis.vector_mm[k]) / MM_PER_UM, float(axis.u_mm[k]) / MM_PER_UM
-        figures[f"B_{name}"] = Figure(value, u, "um", f"mean reversal error of {name} (ISO 230-2), identified")
-    return figures
+def _reversal_beside(path: Path) -> KnownReversal:
+    """Return the reversal file that belongs to an errors file: ``NAME.reversal.csv``, of fitted errors the identified one."""
+    stem = path.name.removesuffix(".errors.csv")
+    names = [f"{stem}.reversal.csv", *(["identified.reversal.csv"] if stem == "fitted" else [])]
+    for name in names:
+        beside = path.parent / name
+        if beside.is_file():
+            return KnownReversal(
+                read_reversal(beside), f"reversal: {name}; an axis that it does not hold counts as zero"
+            )
+    return KnownReversal(
+        None, f"reversal: not known: errors are means of both directions, and {names[-1]} is not there"
+    )
 
 
 def _read_predicted(machine: Machine, path: Path) -> Field:

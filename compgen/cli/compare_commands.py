@@ -15,6 +15,7 @@ from rich.console import Console, RenderableType
 
 from compgen.accuracy.budget import Budget
 from compgen.accuracy.compare import CompareOptions, Comparison
+from compgen.accuracy.diagonals import accuracy_of_diagonals
 from compgen.accuracy.evaluate import accuracy_of_errors, accuracy_of_runs
 from compgen.accuracy.field import Alignment
 from compgen.accuracy.iso230_2 import EDITIONS, LATEST
@@ -145,10 +146,12 @@ def accuracy_command(
         side = read_side(machine, file, instrument, u_deviation_um, open_measurement)
         if side.runs is not None:
             found = accuracy_of_runs(side.runs, int(edition), budgets)
+        elif side.diagonals is not None:
+            found = accuracy_of_diagonals(machine, side.diagonals, int(edition), budgets)
         else:
-            source = side.errors().source
-            assert source is not None
-            found = accuracy_of_errors(source, placed or "axes", line)
+            known = side.errors()
+            assert known.source is not None
+            found = accuracy_of_errors(known.source, placed or "axes", line, known.reversal)
     data = {**found.summary(), "inputs": _inputs(machine, file)}
     files = {"accuracy.json": _json(data), "accuracy.txt": _plain(accuracy_table(found))}
     write_all(out, files)

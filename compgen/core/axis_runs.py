@@ -77,10 +77,10 @@ def read_axis_runs(paths: str | Path | Sequence[str | Path]) -> AxisRuns:
     runs = AxisRuns(
         axis=np.concatenate([_axes(table) for table in tables]),
         position_mm=np.concatenate([table.numbers("position_mm") for table in tables]),
-        direction=np.concatenate([_directions(table) for table in tables]),
+        direction=np.concatenate([directions_of(table) for table in tables]),
         run=np.concatenate([table.labels("run") for table in tables]),
-        deviation_mm=np.concatenate([_deviations(table) for table in tables]) * MM_PER_UM,
-        covariates=_covariates(tables),
+        deviation_mm=np.concatenate([run_deviations_um(table) for table in tables]) * MM_PER_UM,
+        covariates=covariates_beside(tables, AXIS_COLUMNS),
         metadata=common_metadata(tables),
         origin=origins(tables),
     )
@@ -96,22 +96,25 @@ def _axes(table: CsvTable) -> NDArray[np.int64]:
     return np.array([AXES.index(letter) for letter in letters], dtype=np.int64)
 
 
-def _directions(table: CsvTable) -> NDArray[np.int64]:
+def directions_of(table: CsvTable) -> NDArray[np.int64]:
+    """Return the column ``direction`` (rows,): 1 or -1, nothing else."""
     values = table.signs("direction")
     for row in np.flatnonzero(values == 0)[:1].tolist():
         raise table.fail(row, "direction", "0 is not a direction of approach; 1 or -1 is due")
     return values.astype(np.int64)
 
 
-def _deviations(table: CsvTable) -> FloatArray:
+def run_deviations_um(table: CsvTable) -> FloatArray:
+    """Return the column ``deviation_um`` (rows,); one beyond 100 mm is taken for a slip of unit."""
     values = table.numbers("deviation_um")
     for row in np.flatnonzero(np.abs(values) > LARGEST_UM)[:1].tolist():
         raise table.fail(row, "deviation_um", f"{values[row]:g} um is more than 100 mm; is the unit um?")
     return values
 
 
-def _covariates(tables: Sequence[CsvTable]) -> dict[str, FloatArray]:
-    names = dict.fromkeys(name for table in tables for name in table.columns if name not in AXIS_COLUMNS)
+def covariates_beside(tables: Sequence[CsvTable], own: Sequence[str]) -> dict[str, FloatArray]:
+    """Return all columns but ``own`` as numbers of all rows, nan where a file lacks one."""
+    names = dict.fromkeys(name for table in tables for name in table.columns if name not in own)
     return {
         name: np.concatenate(
             [table.numbers(name) if name in table.columns else np.full(len(table), np.nan) for table in tables]
