@@ -5,11 +5,13 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable
-from datetime import datetime
+from contextlib import suppress
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 from apscheduler.executors.pool import ThreadPoolExecutor
+from apscheduler.jobstores.base import JobLookupError
 from apscheduler.schedulers.background import BackgroundScheduler
 from apscheduler.triggers.combining import OrTrigger
 from apscheduler.triggers.cron import CronTrigger
@@ -26,6 +28,8 @@ from compgen.recal.schedule import DAYS, Cron, Every, Schedule
 POLL_S = 2.0
 #: A machine without a schedule is looked at this often.
 UNSCHEDULED = Every(5)
+#: After a trouble that may pass by itself a machine is looked at again after so long, then twice as long, at most, s.
+AGAIN_S, AGAIN_AT_MOST_S = 10.0, 900.0
 
 Work = Callable[[MachineJob, str, Callable[[], bool]], MachineOutcome]
 
@@ -71,6 +75,7 @@ class Watch:
         self.stopped = threading.Event()
         self.job: Job | None = None
         self._content = b""
+        self._troubles: dict[str, int] = {}
         self._scheduler = BackgroundScheduler(
             executors={"default": ThreadPoolExecutor(threads)},
             job_defaults={"coalesce": True, "max_instances": 1, "misfire_grace_time": None},
@@ -137,5 +142,22 @@ class Watch:
             )
 
     def _pass(self, machine: MachineJob, url: str) -> None:
-        if not self.stopped.is_set():
-            self.on_outcome(self.work(machine, url, self.stopped.is_set))
+        if self.stopped.is_set():
+            return
+        outcome = self.work(machine, url, self.stopped.is_set)
+        if outcome.again:
+            self._look_again(machine.name)
+        else:
+            self._troubles.pop(machine.name, None)
+        self.on_outcome(outcome)
+
+    def _look_again(self, name: str) -> None:
+        """Do not wait for the schedule, which may be a week, where something may pass by itself."""
+        count = self._troubles[name] = self._troubles.get(name, 0) + 1
+        wait_s = min(AGAIN_S * 2.0 ** min(count - 1, 60), AGAIN_AT_MOST_S)
+        when = datetime.now().astimezone() + timedelta(seconds=wait_s)
+        with suppress(JobLookupError):  # the machine was taken out of the job file meanwhile
+            planned = self._scheduler.get_job(name)
+            if planned is not None and planned.next_run_time is not None and when < planned.next_run_time:
+                self._scheduler.modify_job(name, next_run_time=when)
+                logs.info("looked at again soon", machine=name, at=when.isoformat(timespec="seconds"))
