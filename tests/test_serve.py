@@ -1,11 +1,9 @@
 """The dashboard: what it shows, and that nobody changes anything without login, token and own page."""
 
-import functools
 import importlib.util
 import json
 import re
 import sys
-import tempfile
 from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,6 +11,7 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
+pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 
 import sqlalchemy as sa
@@ -20,94 +19,39 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from compgen.errors import InputError
 from compgen.recal import decisions
-from compgen.recal.store import open_store
 from compgen.serve import limits, sessions
-from compgen.serve.app import make_app
 from compgen.serve.fleet import fleet
 from compgen.serve.settings import Settings, check_settings, default_users
 from compgen.serve.users import Users
 
 
-def _factory():
-    spec = importlib.util.spec_from_file_location("compgen_serve_factory", Path(__file__).with_name("serve_factory.py"))
+def _helper():
+    spec = importlib.util.spec_from_file_location("compgen_serve_site", Path(__file__).with_name("serve_site.py"))
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
 
 
-factory = _factory()
-OWN = "http://localhost:8765"
-PASSWORD = "correct horse battery"
+helper = _helper()
+factory, Site, Clock = helper.factory, helper.Site, helper.Clock
+OWN, PASSWORD, PAGES, DECISIONS = helper.OWN, helper.PASSWORD, helper.PAGES, helper.DECISIONS
 STYLE = Path(__file__).resolve().parents[1] / "templates" / "_serve" / "style.css"
-PAGES = (
-    "/",
-    "/machines/1",
-    "/machines/1/drift",
-    "/machines/1/tables/3",
-    "/machines/4",
-    "/machines/4/tables/2",
-    "/audit",
-    "/login",
-    "/nowhere",
-)
-DECISIONS = (
-    ("/machines/1/tables/3/approve", {"reason": "fine", "seen": "2"}),
-    ("/machines/1/tables/3/reject", {"reason": "no", "seen": "2"}),
-    ("/machines/1/rollback", {"reason": "worse", "to": "1", "seen": "2"}),
-)
 
 
-@functools.cache
-def prepared():
-    """Contents of a store and of a file of users; made once, as hashes and migrations take their time."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        factory.make_factory(folder / "store.sqlite").close()
-        Users(folder / "users.json").add("meyer", PASSWORD)
-        return {path.name: path.read_bytes() for path in folder.iterdir()}
+@pytest.fixture(autouse=True)
+def _cheap_hashes(request):
+    """All tests but those that say otherwise hash cheaply."""
+    if "real_hashes" in request.fixturenames:
+        yield
+        return
+    with helper.cheap_hashes():
+        yield
 
 
-class Clock:
-    """Seconds that a test moves on."""
-
-    def __init__(self):
-        self.now = 1000.0
-
-    def __call__(self):
-        return self.now
-
-
-class Site:
-    """The dashboard in a test client, as a browser at OWN uses it."""
-
-    def __init__(self, folder, **options):
-        for name, content in prepared().items():
-            (folder / name).write_bytes(content)
-            (folder / name).chmod(0o600)
-        self.store = open_store(str(folder / "store.sqlite"))
-        self.users = Users(folder / "users.json")
-        self.clock = Clock()
-        options = {"decide": True, "users": self.users.path} | options
-        self.settings = Settings(str(folder / "store.sqlite"), **options)
-        self.app = make_app(self.settings, self.store, self.clock)
-        self.client = self.app.test_client()
-
-    def get(self, path, **options):
-        return self.client.get(path, base_url=OWN, **options)
-
-    def post(self, path, data=None, *, headers=None):
-        return self.client.post(path, base_url=OWN, data=data, headers={"Origin": OWN} if headers is None else headers)
-
-    def token(self, path="/"):
-        return re.findall(r'name="csrf" value="([^"]+)"', self.get(path).text)[-1]
-
-    def login(self, name="meyer", password=PASSWORD, **fields):
-        return self.post("/login", {"name": name, "password": password, "csrf": self.token("/login"), **fields})
-
-    def cookie(self, name="session"):
-        found = self.client.get_cookie(f"compgen-8765-{name}", domain="localhost")
-        return None if found is None else found.value
+@pytest.fixture
+def real_hashes():
+    """Hash as outside of tests."""
 
 
 @pytest.fixture
@@ -625,11 +569,11 @@ def test_a_private_dashboard_shows_nothing_without_login(tmp_path):
 # --- users --------------------------------------------------------------------------------------------------------------
 
 
-def test_passwords_are_kept_as_argon2id_and_only_for_the_owner(tmp_path):
+def test_passwords_are_kept_as_argon2id_and_only_for_the_owner(tmp_path, real_hashes):
     users = Users(tmp_path / "users.json")
     assert users.add("meyer", PASSWORD)
     text = users.path.read_text()
-    assert json.loads(text)["users"]["meyer"].startswith("$argon2id$v=19$")
+    assert json.loads(text)["users"]["meyer"].startswith("$argon2id$v=19$m=65536,t=3,p=4$")
     assert PASSWORD not in text
     assert users.path.stat().st_mode & 0o077 == 0
     assert users.verify("meyer", PASSWORD)

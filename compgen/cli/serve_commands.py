@@ -125,8 +125,9 @@ _store_option = click.option("--store", metavar="URL", help="SQLite store; the f
 @_users_option
 @_store_option
 @click.option("--password-stdin", is_flag=True, help="Read the password from the first line of stdin.")
-def add_user(name: str, users: Path | None, store: str | None, password_stdin: bool) -> int:
-    """Add a user, or change the password, which ends the user's sessions.
+@click.option("--reader", is_flag=True, help="The user reads what --private shows, and decides nothing.")
+def add_user(name: str, users: Path | None, store: str | None, password_stdin: bool, reader: bool) -> int:
+    """Add a user, or change password and rights, which ends the user's sessions.
 
     The password is asked for twice and kept as an Argon2id hash only.
 
@@ -142,7 +143,7 @@ def add_user(name: str, users: Path | None, store: str | None, password_stdin: b
         password = sys.stdin.readline().rstrip("\r\n")
     else:
         password = click.prompt("Password", hide_input=True, confirmation_prompt=True, err=True)
-    new = file.add(name, password)
+    new = file.add(name, password, reader=reader)
     stdout.print(f"{name} {'is added' if new else 'has a new password'}: {file.path}", soft_wrap=True)
     return 0
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from compgen.errors import CompgenError
 from compgen.recal import decisions
 from compgen.recal.decisions import DecisionError
 from compgen.recal.job import Job, MachineJob
@@ -14,6 +15,12 @@ from compgen.recal.notify import notify
 from compgen.recal.publish import publish
 from compgen.recal.records import DecisionRecord, MachineRecord
 from compgen.recal.store import Clock, Store, open_store
+
+
+class NotPublishedError(CompgenError):
+    """The decision stands in the store, but the files could not follow; the next run publishes them."""
+
+    exit_code = 1
 
 
 def approve(
@@ -24,39 +31,56 @@ def approve(
     reason: str = "",
     *,
     override: bool = False,
+    seen: int | None = None,
     clock: Clock | None = None,
 ) -> DecisionRecord:
     """Approve a version (None: the only one that is pending) and make its files the active ones.
 
-    Errors as :func:`compgen.recal.decisions.approve` has them, and InputError if the folder cannot be written: the
-    decision stands then, and the next run publishes it.
+    Errors as :func:`compgen.recal.decisions.approve` has them, and NotPublishedError if the folder cannot be written.
+    ``seen`` is the version that the person saw as the active one.
     """
 
     def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
         chosen = _chosen(store, machine, version)
-        return decisions.approve(store, machine, chosen, actor, reason, override=override)
+        return decisions.approve(store, machine, chosen, actor, reason, override=override, seen=seen)
 
     return _done(job.machine(name), job.store, decide, clock)
 
 
 def reject(
-    job: Job, name: str, version: int | None, actor: str, reason: str, *, clock: Clock | None = None
+    job: Job,
+    name: str,
+    version: int | None,
+    actor: str,
+    reason: str,
+    *,
+    seen: int | None = None,
+    clock: Clock | None = None,
 ) -> DecisionRecord:
     """Reject a version (None: the only one that is open)."""
 
     def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
-        return decisions.reject(store, machine, _chosen(store, machine, version), actor, reason)
+        return decisions.reject(store, machine, _chosen(store, machine, version), actor, reason, seen=seen)
 
     return _done(job.machine(name), job.store, decide, clock)
 
 
 def rollback(
-    job: Job, name: str, actor: str, reason: str, *, to: int | None = None, clock: Clock | None = None
+    job: Job,
+    name: str,
+    actor: str,
+    reason: str,
+    *,
+    to: int | None = None,
+    seen: int | None = None,
+    clock: Clock | None = None,
 ) -> DecisionRecord:
     """Make an earlier version active again, byte for byte; ``to`` = 0 leaves none active."""
-    return _done(
-        job.machine(name), job.store, lambda store, m: decisions.rollback(store, m, actor, reason, to=to), clock
-    )
+
+    def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
+        return decisions.rollback(store, machine, actor, reason, to=to, seen=seen)
+
+    return _done(job.machine(name), job.store, decide, clock)
 
 
 def _chosen(store: Store, machine: MachineRecord, version: int | None) -> int:
@@ -81,8 +105,11 @@ def _done(
     try:
         machine = store.machine(machine_job.name)
         decision = decide(store, machine)
-        publish(store, machine, machine_job.out)
-        notify(store, machine, machine_job.notify)
+        try:
+            publish(store, machine, machine_job.out)
+            notify(store, machine, machine_job.notify)
+        except CompgenError as error:
+            raise NotPublishedError(f"The decision stands, but the files could not follow yet: {error}") from error
         return decision
     finally:
         store.close()

@@ -29,7 +29,14 @@ def active_table(store: Store, machine: MachineRecord) -> TableRecord | None:
 
 
 def approve(
-    store: Store, machine: MachineRecord, version: int, actor: str, reason: str = "", *, override: bool = False
+    store: Store,
+    machine: MachineRecord,
+    version: int,
+    actor: str,
+    reason: str = "",
+    *,
+    override: bool = False,
+    seen: int | None = None,
 ) -> DecisionRecord:
     """Make a proposed version active.
 
@@ -39,6 +46,7 @@ def approve(
     actor, reason : who, and why; both are kept.
     override : also for tables that the policy holds back; then a reason is due. Files that the round trip did not
         accept can never be approved.
+    seen : version that was active (0: none) when the person looked; DecisionError if another one is by now.
 
     Raises
     ------
@@ -48,6 +56,7 @@ def approve(
 
     def action(connection: sa.Connection) -> DecisionRecord:
         decisions, table_id, accepted = _open(connection, machine, version)
+        _check_seen(connection, machine, decisions, seen)
         state = state_of(table_id, decisions)
         if not accepted:
             raise DecisionError(
@@ -66,11 +75,17 @@ def approve(
     return store.write(action)
 
 
-def reject(store: Store, machine: MachineRecord, version: int, actor: str, reason: str) -> DecisionRecord:
-    """Refuse a proposed version or one that is held back; DecisionError where it is not open or no reason is given."""
+def reject(
+    store: Store, machine: MachineRecord, version: int, actor: str, reason: str, *, seen: int | None = None
+) -> DecisionRecord:
+    """Refuse a proposed version or one that is held back; DecisionError where it is not open or no reason is given.
+
+    ``seen`` as for :func:`approve`.
+    """
 
     def action(connection: sa.Connection) -> DecisionRecord:
-        _, table_id, _ = _open(connection, machine, version)
+        decisions, table_id, _ = _open(connection, machine, version)
+        _check_seen(connection, machine, decisions, seen)
         if not reason.strip():
             raise DecisionError("to reject tables a reason is due")
         return add_decision(store, connection, machine, "reject", table_id, actor, reason)
@@ -78,12 +93,15 @@ def reject(store: Store, machine: MachineRecord, version: int, actor: str, reaso
     return store.write(action)
 
 
-def rollback(store: Store, machine: MachineRecord, actor: str, reason: str, *, to: int | None = None) -> DecisionRecord:
+def rollback(
+    store: Store, machine: MachineRecord, actor: str, reason: str, *, to: int | None = None, seen: int | None = None
+) -> DecisionRecord:
     """Make an earlier version active again.
 
     Parameters
     ----------
     to : version that was active before; 0 for no tables at all; None for the one that was active before this one.
+    seen : as for :func:`approve`.
 
     Raises
     ------
@@ -93,6 +111,7 @@ def rollback(store: Store, machine: MachineRecord, actor: str, reason: str, *, t
 
     def action(connection: sa.Connection) -> DecisionRecord:
         decisions = locked_decisions(connection, machine)
+        _check_seen(connection, machine, decisions, seen)
         if not reason.strip():
             raise DecisionError("to roll back a reason is due")
         if active_id(decisions) is None and not to:
@@ -113,6 +132,20 @@ def _earlier(
     if state not in WAS_ACTIVE:
         raise DecisionError(f"{_place(machine, version)} is {state}; only a version that was active can come back")
     return table_id
+
+
+def _check_seen(
+    connection: sa.Connection, machine: MachineRecord, decisions: list[DecisionRecord], seen: int | None
+) -> None:
+    """Raise DecisionError unless the version that was seen as the active one still is, under the machine's lock."""
+    if seen is None:
+        return
+    active = active_id(decisions)
+    query = sa.select(schema.tables.c.version).where(schema.tables.c.id == active)
+    if seen != (0 if active is None else connection.execute(query).scalar()):
+        raise DecisionError(
+            f"{machine.name}: other tables became active since you looked; look again before you decide"
+        )
 
 
 def locked_decisions(connection: sa.Connection, machine: MachineRecord) -> list[DecisionRecord]:

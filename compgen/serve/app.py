@@ -20,7 +20,7 @@ from compgen.resources import data_folder
 from compgen.serve import reading, signing
 from compgen.serve.chart import number
 from compgen.serve.fleet import STATUSES
-from compgen.serve.guard import add_headers, check_host, check_origin, cookie_name
+from compgen.serve.guard import add_headers, check_host, check_method, check_origin, cookie_name
 from compgen.serve.service import Service, make_service
 from compgen.serve.sessions import Session, same
 from compgen.serve.settings import Settings, check_settings
@@ -57,6 +57,7 @@ def make_app(settings: Settings, store: Store | None = None, clock: Callable[[],
     app.jinja_env.filters.update(when=_when, figure=_figure, signed=_signed, ago=_ago)
     app.jinja_env.globals.update(STATUSES=STATUSES, page_url=reading.page_url)
     app.extensions["compgen"] = make_service(settings, store or open_store(settings.store_url), clock)
+    app.url_map.converters["number"] = reading.Number
     app.before_request(_begin)
     app.after_request(_finish)
     app.context_processor(_context)
@@ -75,10 +76,11 @@ def service() -> Service:
 
 
 def _begin() -> BaseResponse | None:
-    """Check host, login and, for whatever may change something, origin and token; in this order, before any page."""
+    """Check host, method, login and, for what may change something, origin and token; in this order, before any page."""
     g.began, g.session = time.perf_counter(), None
     own = service()
     check_host(request, own.settings)
+    check_method(request)
     g.session = _session(own)
     if request.method not in SAFE:
         check_origin(request, own.settings)
@@ -116,7 +118,7 @@ def _context() -> dict[str, Any]:
         "user": session.user if session is not None else None,
         "csrf": session.csrf if session is not None else "",
         "messages": messages,
-        "may_decide": own.settings.decide and session is not None,
+        "may_decide": session is not None and own.may_decide(session.user),
     }
 
 

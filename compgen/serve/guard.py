@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 
 from flask import Request, Response
-from werkzeug.exceptions import Forbidden, HTTPException
+from werkzeug.exceptions import Forbidden, HTTPException, MethodNotAllowed
 
 from compgen.serve.settings import Settings
 
 HOST = re.compile(r"(?P<name>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]+)(:(?P<port>[0-9]{1,5}))?")
+METHODS = ("GET", "HEAD", "OPTIONS", "POST")
 #: No script at all, nothing from elsewhere, no frame around the pages.
 POLICY = (
     "default-src 'none'; style-src 'self'; img-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -38,6 +39,12 @@ def check_host(request: Request, settings: Settings) -> None:
     found = HOST.fullmatch(request.headers.get("Host", ""))
     if found is None or found["name"].lower() not in settings.host_names:
         raise Misdirected
+
+
+def check_method(request: Request) -> None:
+    """Refuse methods that no page knows, before anything else of the request is looked at."""
+    if request.method not in METHODS:
+        raise MethodNotAllowed(METHODS)
 
 
 def check_origin(request: Request, settings: Settings) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 from urllib.parse import urlencode
 
 from flask import Blueprint, Response, abort, current_app, render_template, request
+from werkzeug.routing import IntegerConverter
 
 from compgen.errors import CompgenError, InputError
 from compgen.recal.records import MachineRecord
@@ -20,7 +21,13 @@ from compgen.serve.service import Service
 from compgen.serve.sessions import same
 
 pages = Blueprint("reading", __name__)
-NUMBER = "int(max=2147483647)"
+NUMBER = "number(max=2147483647)"
+
+
+class Number(IntegerConverter):
+    """A whole number in ASCII digits without leading zeros: each page has one address."""
+
+    regex = "0|[1-9][0-9]{0,9}"
 
 
 def own() -> Service:

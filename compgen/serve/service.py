@@ -37,6 +37,10 @@ class Service:
     errors_of: ErrorCache
     drift_of: DriftCache
 
+    def may_decide(self, user: str) -> bool:
+        """Whether this user may approve, reject and roll back here."""
+        return self.settings.decide and self.users is not None and self.users.may_decide(user)
+
 
 def make_service(settings: Settings, store: Store, clock: Callable[[], float] = time.monotonic) -> Service:
     """Return a service; ``clock`` (s) is for tests."""
@@ -47,28 +51,38 @@ def make_service(settings: Settings, store: Store, clock: Callable[[], float] = 
     return Service(settings, store, users, *shared)
 
 
-def approve(
-    service: Service, machine: MachineRecord, version: int, actor: str, reason: str, override: bool
-) -> DecisionRecord:
+@dataclass(frozen=True)
+class Wish:
+    """What a person wants and why; ``seen`` is the version that was active on the page, 0 for none."""
+
+    actor: str
+    reason: str
+    seen: int
+
+
+def approve(service: Service, machine: MachineRecord, version: int, wish: Wish, *, override: bool) -> DecisionRecord:
     """Approve as ``compgen recal approve`` does; the files follow where there is a job file."""
     if service.settings.job is not None:
-        job = read_job(service.settings.job)
-        return actions.approve(job, machine.name, version, actor, reason, override=override)
-    return decisions.approve(service.store, machine, version, actor, reason, override=override)
+        job, seen = read_job(service.settings.job), wish.seen
+        return actions.approve(job, machine.name, version, wish.actor, wish.reason, override=override, seen=seen)
+    store = service.store
+    return decisions.approve(store, machine, version, wish.actor, wish.reason, override=override, seen=wish.seen)
 
 
-def reject(service: Service, machine: MachineRecord, version: int, actor: str, reason: str) -> DecisionRecord:
+def reject(service: Service, machine: MachineRecord, version: int, wish: Wish) -> DecisionRecord:
     """Reject as ``compgen recal reject`` does."""
     if service.settings.job is not None:
-        return actions.reject(read_job(service.settings.job), machine.name, version, actor, reason)
-    return decisions.reject(service.store, machine, version, actor, reason)
+        job = read_job(service.settings.job)
+        return actions.reject(job, machine.name, version, wish.actor, wish.reason, seen=wish.seen)
+    return decisions.reject(service.store, machine, version, wish.actor, wish.reason, seen=wish.seen)
 
 
-def rollback(service: Service, machine: MachineRecord, to: int, actor: str, reason: str) -> DecisionRecord:
+def rollback(service: Service, machine: MachineRecord, to: int, wish: Wish) -> DecisionRecord:
     """Roll back as ``compgen recal rollback`` does."""
     if service.settings.job is not None:
-        return actions.rollback(read_job(service.settings.job), machine.name, actor, reason, to=to)
-    return decisions.rollback(service.store, machine, actor, reason, to=to)
+        job = read_job(service.settings.job)
+        return actions.rollback(job, machine.name, wish.actor, wish.reason, to=to, seen=wish.seen)
+    return decisions.rollback(service.store, machine, wish.actor, wish.reason, to=to, seen=wish.seen)
 
 
 def clean_reason(text: str) -> str:
@@ -77,10 +91,3 @@ def clean_reason(text: str) -> str:
     if len(clean) > LONGEST_REASON:
         raise InputError(f"a reason has at most {LONGEST_REASON} characters; this one has {len(clean)}")
     return clean
-
-
-def check_seen(service: Service, machine: MachineRecord, seen: str) -> None:
-    """Raise InputError if other tables became active since the page of the decision was shown."""
-    active = decisions.active_table(service.store, machine)
-    if seen != str(active.version if active is not None else 0):
-        raise InputError("other tables became active since you opened the page; look at it again before you decide")

@@ -9,13 +9,14 @@ from collections.abc import Callable
 from flask import Blueprint, Response, abort, g, make_response, redirect, render_template, request
 from werkzeug.wrappers import Response as BaseResponse
 
-from compgen.errors import CompgenError, InputError
+from compgen.errors import InputError
 from compgen.recal import logs
-from compgen.recal.database import StoreError
+from compgen.recal.actions import NotPublishedError
 from compgen.recal.records import DecisionRecord, MachineRecord
 from compgen.serve import service as deciding
 from compgen.serve.guard import cookie_name, set_cookie
 from compgen.serve.reading import NUMBER, own, the_machine
+from compgen.serve.service import Wish
 from compgen.serve.sessions import LONGEST_S
 
 pages = Blueprint("signing", __name__)
@@ -100,50 +101,51 @@ def log_out() -> BaseResponse:
 @pages.post(f"/machines/<{NUMBER}:machine_id>/tables/<{NUMBER}:version>/<any(approve,reject):kind>")
 def decide(machine_id: int, version: int, kind: str) -> BaseResponse:
     """Approve or reject a set of tables."""
-    machine, service = _allowed(machine_id), own()
-    reason = deciding.clean_reason(request.form.get("reason", ""))
-    deciding.check_seen(service, machine, request.form.get("seen", ""))
+    machine, service, wish = _allowed(machine_id), own(), _wish()
     if kind == "approve":
         override = request.form.get("override") == "yes"
-        return _done(
-            machine, kind, lambda: deciding.approve(service, machine, version, g.session.user, reason, override)
-        )
-    return _done(machine, kind, lambda: deciding.reject(service, machine, version, g.session.user, reason))
+        return _done(machine, kind, lambda: deciding.approve(service, machine, version, wish, override=override))
+    return _done(machine, kind, lambda: deciding.reject(service, machine, version, wish))
 
 
 @pages.post(f"/machines/<{NUMBER}:machine_id>/rollback")
 def roll_back(machine_id: int) -> BaseResponse:
     """Make earlier tables active again, or none."""
-    machine, service = _allowed(machine_id), own()
+    machine, service, wish = _allowed(machine_id), own(), _wish()
+    to = _whole("to", "choose the version that becomes active again")
+    return _done(machine, "rollback", lambda: deciding.rollback(service, machine, to, wish))
+
+
+def _wish() -> Wish:
     reason = deciding.clean_reason(request.form.get("reason", ""))
-    deciding.check_seen(service, machine, request.form.get("seen", ""))
-    to = request.form.get("to", "")
-    if not re.fullmatch(r"[0-9]{1,9}", to):
-        raise InputError("choose the version that becomes active again")
-    return _done(machine, "rollback", lambda: deciding.rollback(service, machine, int(to), g.session.user, reason))
+    return Wish(g.session.user, reason, _whole("seen", "open the page again: the form does not say what was active"))
+
+
+def _whole(field: str, problem: str) -> int:
+    """Return a whole number of the form; InputError with the problem if it is none."""
+    text = request.form.get(field, "")
+    if not re.fullmatch(r"[0-9]{1,9}", text):
+        raise InputError(problem)
+    return int(text)
 
 
 def _allowed(machine_id: int) -> MachineRecord:
     """Return the machine if decisions are allowed here; session, origin and token were checked before."""
     if not own().settings.decide:
         abort(403, "This dashboard only reads.")
+    if not own().may_decide(g.session.user):
+        abort(403, "You may read, but not decide; `compgen serve add-user` without --reader changes that.")
     return the_machine(machine_id)
 
 
 def _done(machine: MachineRecord, kind: str, action: Callable[[], DecisionRecord]) -> BaseResponse:
     """Decide; where the decision stands but the files could not follow, say so."""
     service, user = own(), g.session.user
-    before = len(service.store.decisions(machine))
     try:
         action()
-    except StoreError:
-        raise
-    except CompgenError as error:
-        made = service.store.decisions(machine)[before:]
-        if not any(item.actor == user for item in made):
-            raise
+    except NotPublishedError as error:
         logs.error("files do not follow", machine=machine.name, problem=str(error))
-        g.session.messages.append(f"The decision stands, but the files could not follow yet: {error}")
+        g.session.messages.append(str(error))
     service.metrics.decisions.labels(kind).inc()
     logs.info("decision", machine=machine.name, kind=kind, user=user, address=request.remote_addr)
     g.session.messages.append(f"{machine.name}: {kind} is done and kept in the audit trail.")

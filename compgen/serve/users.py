@@ -41,16 +41,21 @@ class Users:
 
     def names(self) -> list[str]:
         """Return the names of all users."""
-        return sorted(self._read())
+        return sorted(self._read()[0])
 
     def stamp(self, name: str) -> str | None:
         """Return what changes when the user's password does; None for an unknown user."""
-        found = self._read().get(name)
+        found = self._read()[0].get(name)
         return None if found is None else sha256_of(found.encode())
+
+    def may_decide(self, name: str) -> bool:
+        """Whether the user is there and more than a reader."""
+        users, readers = self._read()
+        return name in users and name not in readers
 
     def verify(self, name: str, password: str) -> bool:
         """Whether the password is right; an unknown name takes as long as a wrong password."""
-        found = self._read().get(name)
+        found = self._read()[0].get(name)
         if len(password) > LONGEST:
             return False
         with self._slots:
@@ -60,45 +65,52 @@ class Users:
                 return False
         return right and found is not None
 
-    def add(self, name: str, password: str) -> bool:
-        """Add a user or change the password; return whether the user is new. InputError for what cannot be taken."""
+    def add(self, name: str, password: str, *, reader: bool = False) -> bool:
+        """Add a user or change password and rights; return whether the user is new. InputError for what cannot be taken.
+
+        A ``reader`` sees what needs a login and decides nothing.
+        """
         check_name(name)
         check_password(name, password)
-        users = dict(self._read())
+        users, readers = self._read()
         new = name not in users
         others = {known.lower() for known in users if known != name}
         if name.lower() in others:
             raise InputError(f"{name!r} differs from another user by capital letters only; choose another name")
         users[name] = self._hasher.hash(_normal(password))
-        self._write(users)
+        self._write(users, readers | {name} if reader else readers - {name})
         return new
 
     def remove(self, name: str) -> None:
         """Remove a user, whose sessions end at once; InputError if there is none."""
-        users = dict(self._read())
+        users, readers = self._read()
         if name not in users:
             raise InputError(f"knows no user {name!r}", file=self.path)
         del users[name]
-        self._write(users)
+        self._write(users, readers - {name})
 
-    def _read(self) -> Mapping[str, str]:
+    def _read(self) -> tuple[dict[str, str], frozenset[str]]:
+        """Return the hashes by name, and who only reads."""
         try:
             with self.path.open(encoding="utf-8") as stream:
                 if os.name == "posix" and os.fstat(stream.fileno()).st_mode & 0o022:
                     raise InputError("others may write this file of users; chmod 600 it", file=self.path)
                 data = json.load(stream)
         except FileNotFoundError:
-            return {}
+            return {}, frozenset()
         except (OSError, ValueError) as error:
             raise InputError(f"cannot be read as a file of users: {error}", file=self.path) from error
         users = data.get("users") if isinstance(data, dict) else None
         if not isinstance(users, dict) or not all(isinstance(item, str) for item in users.values()):
             raise InputError("is not a file of users; make one with `compgen serve add-user`", file=self.path)
-        return users
+        readers = data.get("readers", [])
+        if not isinstance(readers, list) or not all(isinstance(item, str) for item in readers):
+            raise InputError("says wrongly who only reads; make it anew with `compgen serve add-user`", file=self.path)
+        return users, frozenset(readers)
 
-    def _write(self, users: Mapping[str, str]) -> None:
+    def _write(self, users: Mapping[str, str], readers: frozenset[str]) -> None:
         """Replace the file in one step; only its owner may read it."""
-        text = json.dumps({"users": dict(sorted(users.items()))}, indent=2) + "\n"
+        text = json.dumps({"users": dict(sorted(users.items())), "readers": sorted(readers)}, indent=2) + "\n"
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             handle, name = tempfile.mkstemp(prefix=".users-", dir=self.path.parent)  # readable by the owner only
