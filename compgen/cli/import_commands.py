@@ -163,18 +163,23 @@ def _lines(facts: Mapping[str, Any], depth: int = 0) -> list[str]:
     found = []
     for key, value in facts.items():
         if isinstance(value, Mapping):
-            found.append(f"{'  ' * depth}{one_line(key)}:")
+            found.append(f"{'  ' * depth}{_printable(key)}:")
             found += _lines(value, depth + 1)
         elif value is not None:
             text = f"{value:.6g}" if isinstance(value, float) else _flat(value)
-            found.append(f"{'  ' * depth}{one_line(key)}: {text}")
+            found.append(f"{'  ' * depth}{_printable(key)}: {text}")
     return found
 
 
 def _flat(value: Any) -> str:
     if isinstance(value, list | tuple):
-        return one_line(", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in value))
-    return one_line(value)
+        return _printable(", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in value))
+    return _printable(value)
+
+
+def _printable(value: Any) -> str:
+    """Return text of a user's file on one line, in its own script, without what steers a terminal."""
+    return "".join(char if char.isprintable() else "?" for char in " ".join(str(value).split()))
 
 
 COMMANDS = (import_command,)

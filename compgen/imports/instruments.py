@@ -27,6 +27,7 @@ from compgen.imports.tables import runs_of
 MOST_EXCHANGE_BYTES = 16_000_000
 #: A slope of readings over targets further from 1 is no error of a machine.
 SLOPE_TOLERANCE = 0.01
+_SIGN_NOTE = "deviations are measured minus target (errors), as the maker's software has them"
 _USER_TEXT = (
     "machine",
     "serial no",
@@ -53,7 +54,7 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
         *found.notes,
         *zero,
         *around.notes,
-        "deviations are measured minus target (errors), as the maker's software has them",
+        _SIGN_NOTE,
     ]
     axis = options.axis or axis_in(found.keys.get("axis", "")) or _axis_of_name(path, notes)
     runs, unit = _scaled(found, options, doubts, notes)
@@ -136,7 +137,7 @@ def _scaled(found: Renishaw, options: ImportOptions, doubts: list[str], notes: l
     judged = unit_of_deviations(found.runs.value, weighed, usual)
     if not given and abs(decades_off(found.runs.value, units[unit], usual)) > ABSURD_DECADES:
         doubts.append(
-            f"such files are in {unit}, but the numbers look like {judged.best}; give --unit value={unit} if it is so"
+            f"such files are in {unit}, but the numbers look like {judged.best}: say --unit value={judged.best} or {unit}"
         )
     elif not given:
         notes.append(f"by the size of the numbers {judged.text()}")

@@ -101,7 +101,8 @@ def read_source(path: Path, encodings: Sequence[str] = ENCODINGS, most: int = MO
     if text.lstrip().lower().startswith(_MARKUP):
         raise InputError("is XML or HTML; export the numbers as text (CSV) or .xlsx", file=path)
     if "\0" in text:
-        raise InputError("holds NUL bytes; it is not a text file", file=path)
+        line = text[: text.index("\0")].count("\n") + 1
+        raise InputError("holds NUL bytes: it is no text, or was not written to its end", file=path, line=line)
     return Text(path, text, encoding)
 
 

@@ -2,7 +2,8 @@
 
 There is no public specification. Programs that read such files take two numbers for each key, at the beginning and at the
 end of the test, and after some of them a third one whose meaning is not known (of the unit, it seems); older descriptions
-have one. So everything is shown, and only temperatures that can be nothing but degC, and dates that can be read in one way, are used.
+have one. So everything is shown, and only temperatures that can be nothing but degC, and dates that can be read in one
+way, are used.
 """
 
 from __future__ import annotations
@@ -47,20 +48,23 @@ def surroundings_of(environment: Mapping[str, str], user_date: str, chosen: Orde
     """
     temperatures: dict[str, float] = {}
     notes: list[str] = []
+    unused = []
     for key, channel in _CHANNELS.items():
         text = environment.get(key, "")
         value = _steady_temperature(text)
         if value is not None:
             temperatures[channel] = value
         elif text:
-            notes.append(f"{key} {shown(text)} is not used: no temperature in degC, or no sensor, or not steady")
+            unused.append(f"{key} {shown(text)}")
+    if unused:
+        notes.append(f"not used (no temperature in degC, no sensor, or not steady): {', '.join(unused)}")
     at, against = _date(environment.get("date time", ""), user_date, chosen)
     if against:
         notes.append(against)
     if environment.get("exp coeff"):
         notes.append(
-            f"its software was given the expansion coefficient {shown(environment['exp coeff'])}: where it compensated the "
-            "material, the readings hold at 20 degC already; nothing is corrected here"
+            f"its software has the expansion coefficient {shown(environment['exp coeff'])}: if it compensated the material, "
+            "the readings hold at 20 degC already; nothing is corrected here"
         )
     return Surroundings(temperatures, at, tuple(notes))
 
