@@ -28,7 +28,8 @@ def who_option(*, reason: bool) -> Callable[[Command], Command]:
     return decorate
 
 
-def _actor(name: str | None) -> str:
+def actor_of(name: str | None) -> str:
+    """Return the name of who decides: the one given, else the login name."""
     try:
         return name or getpass.getuser()
     except (KeyError, OSError) as error:
@@ -55,7 +56,7 @@ def approve_command(
     """
     from compgen.recal.actions import approve
 
-    return _decided(job, machine, approve(job, machine, version, _actor(actor), reason, override=override), as_json)
+    return _decided(job, machine, approve(job, machine, version, actor_of(actor), reason, override=override), as_json)
 
 
 @recal.command("reject")
@@ -73,7 +74,7 @@ def reject_command(machine: str, version: int | None, job: Job, actor: str | Non
     """
     from compgen.recal.actions import reject
 
-    return _decided(job, machine, reject(job, machine, version, _actor(actor), reason), as_json)
+    return _decided(job, machine, reject(job, machine, version, actor_of(actor), reason), as_json)
 
 
 @recal.command("rollback")
@@ -93,7 +94,7 @@ def rollback_command(machine: str, job: Job, to: int | None, actor: str | None, 
     """
     from compgen.recal.actions import rollback
 
-    return _decided(job, machine, rollback(job, machine, _actor(actor), reason, to=to), as_json)
+    return _decided(job, machine, rollback(job, machine, actor_of(actor), reason, to=to), as_json)
 
 
 def _decided(job: Job, machine: str, decision: Any, as_json: bool) -> int:

@@ -1,4 +1,4 @@
-"""``compgen recal history MACHINE --drift`` and ``compgen recal recheck``."""
+"""``compgen recal history MACHINE --drift``, ``compgen recal recheck`` and ``compgen recal exclude``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import click
 
 from compgen.cli.common import json_option, print_json, stdout
 from compgen.cli.recal_commands import job_option, opened, recal
+from compgen.cli.recal_decision_commands import actor_of, who_option
 from compgen.errors import InputError
 
 if TYPE_CHECKING:
@@ -109,6 +110,36 @@ def recheck_command(
         stdout.print("  " + ", ".join(f"{letter} {value:g} mm" for letter, value in zip("XYZ", place, strict=True)))
     for path in paths:
         stdout.print(path, soft_wrap=True, markup=False)
+    return 0
+
+
+@recal.command("exclude")
+@click.argument("machine")
+@click.argument("version", type=click.IntRange(1))
+@job_option
+@click.option("--undo", is_flag=True, help="Take an exclusion back.")
+@who_option(reason=True)
+@json_option
+def exclude_command(
+    machine: str, version: int, job: Job, undo: bool, actor: str | None, reason: str, as_json: bool
+) -> int:
+    """Leave the measurement behind VERSION of MACHINE's tables, which was wrong, out of the drift.
+
+    Nothing is deleted; who, when and why stand in the history. An active version has to be rolled back first.
+
+    \b
+    Example:
+      compgen recal exclude mill-1 5 --reason "the sign of the deviations was wrong"
+    """
+    from compgen.recal.exclude import exclude
+
+    who = actor_of(actor)
+    exclude(job, machine, version, who, reason, undo=undo)
+    what = "counts again" if undo else "is left out of the drift"
+    if as_json:
+        print_json({"accepted": True, "machine": machine, "version": version, "excluded": not undo, "actor": who})
+    else:
+        stdout.print(f"{machine}: the measurement behind version {version} {what}", soft_wrap=True)
     return 0
 
 

@@ -17,6 +17,8 @@ from compgen.recal.drift_data import Aligned, Calibration, Figure, aligned, cali
 from compgen.recal.drift_forecast import Forecast, forecast
 from compgen.recal.drift_trend import Series, Step, Trend, fit_trend, usable_temperature
 from compgen.recal.drift_volume import volume_forecast
+from compgen.recal.drift_words import interval_of, sentences
+from compgen.recal.exclude import excluded
 from compgen.recal.records import MachineRecord
 from compgen.recal.store import Store
 
@@ -82,21 +84,7 @@ class Drift:
 
     def sentences(self) -> list[str]:
         """Say what matters in words."""
-        level = 1.0 - self.settings.confidence
-        told = []
-        for after, steps in self.gaps.items():
-            listed = ", ".join(f"{figure.name} {_shown(figure, step.size)}" for figure, step in steps)
-            told.append(f"step between {self.times[after - 1]} and {self.times[after]}: {listed}")
-        for item in self.figures:
-            if item.trend is not None and item.adjusted < level:
-                value, u = item.trend.slope
-                pm = f"{_shown(item.figure, 30.4375 * value)} +- {_shown(item.figure, 30.4375 * u, sign='')}"
-                told.append(f"{item.figure.name} drifts by {pm} per month")
-            if item.forecast is not None:
-                told.append(item.forecast.words(item.figure.name))
-        if self.volume_forecast is not None:
-            told.append(self.volume_forecast.words("the volume"))
-        return told + list(self.notes)
+        return sentences(self)
 
     def summary(self) -> dict[str, Any]:
         """Return all figures for JSON, in um, urad, days."""
@@ -114,16 +102,13 @@ class Drift:
                 "expected_rms_um": [expected for _, expected in self.volume_um],
                 "forecast": None if self.volume_forecast is None else self.volume_forecast.summary(),
             },
-            "figures": [_figure_summary(item, self.times) for item in self.figures],
+            "confidence": self.settings.confidence,
+            "figures": [_figure_summary(item, self.times, self.settings.confidence) for item in self.figures],
             "sentences": self.sentences(),
         }
 
 
-def _shown(figure: Figure, value: float, sign: str = "+") -> str:
-    return f"{value / error_named(figure.error).si_per_unit:{sign}.2f} {figure.unit}"
-
-
-def _figure_summary(item: FigureDrift, times: Sequence[str]) -> dict[str, Any]:
+def _figure_summary(item: FigureDrift, times: Sequence[str], confidence: float) -> dict[str, Any]:
     scale = 1.0 / error_named(item.figure.error).si_per_unit
     found: dict[str, Any] = {
         "figure": item.figure.name,
@@ -137,21 +122,28 @@ def _figure_summary(item: FigureDrift, times: Sequence[str]) -> dict[str, Any]:
         "forecast": None if item.forecast is None else item.forecast.summary(),
         "trend": None,
     }
+
+    def interval(value: float, u: float) -> list[float]:
+        return [end * scale for end in interval_of(value, u, confidence)]
+
     if item.trend is not None:
         slope, kelvin = item.trend.slope, item.trend.per_kelvin
         found["trend"] = {
             "per_day": slope[0] * scale,
             "u_per_day": slope[1] * scale,
+            "interval_per_day": interval(*slope),
             "p_value": item.trend.p_value,
             "adjusted_p_value": item.adjusted,
             "random_walk_probability": item.trend.walk_share,
             "per_kelvin": None if kelvin is None else kelvin[0] * scale,
             "u_per_kelvin": None if kelvin is None else kelvin[1] * scale,
+            "interval_per_kelvin": None if kelvin is None else interval(*kelvin),
             "steps": [
                 {
                     "between": [times[step.after - 1], times[step.after]],
                     "size": step.size * scale,
                     "u": step.u * scale,
+                    "interval": interval(step.size, step.u),
                     "p_value": step.p_value,
                 }
                 for step in item.trend.steps
@@ -166,7 +158,8 @@ def drift_of_store(store: Store, machine: MachineRecord, settings: DriftSettings
     active = next((table for table in store.tables(machine, figures=False) if table.state == "active"), None)
     known = active is not None and active.identification_id in ids
     reference = ids.index(active.identification_id) if known and active is not None else 0
-    return drift_report(model, history, replace(settings, reference=reference), name=machine.name)
+    found = drift_report(model, history, replace(settings, reference=reference), name=machine.name)
+    return replace(found, notes=(*found.notes, *excluded(store, machine).values()))
 
 
 def drift_report(

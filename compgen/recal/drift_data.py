@@ -26,6 +26,7 @@ from compgen.identify.covariance import Covariance
 from compgen.model.basis import hat_matrix
 from compgen.model.gauge import LEVER_MM, gauge_directions
 from compgen.recal.change import spread_of
+from compgen.recal.exclude import excluded
 from compgen.recal.records import MachineRecord
 from compgen.recal.store import Store
 
@@ -103,14 +104,15 @@ class Aligned:
 def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibration], list[int], Machine]:
     """Return the calibrations of a machine with known uncertainty, their identification ids, and the newest machine file.
 
-    InputError if there is none.
+    Those that a person excluded are left out. InputError if there is none.
     """
+    left_out = excluded(store, machine)
     measured = {item.id: item for item in store.measurements(machine)}
     found, ids = [], []
     for record in store.identifications(machine):
         errors = store.errors_of(record)
         covariance = spread_of(errors, store.covariance_of(record))
-        if covariance is not None:
+        if covariance is not None and record.id not in left_out:
             logged = measured[record.measurement_id].temperatures_c
             means = {name: float(figures["mean"]) for name, figures in logged.items()}
             found.append(Calibration(record.measured_at, errors, covariance, means))

@@ -63,11 +63,12 @@ def _temperature(window_c: tuple[float, float], channels: Mapping[str, Mapping[s
     low, high = window_c
     if not channels:
         return [f"no temperature was logged, but {low:g} to {high:g} degC are asked for"]
-    return [
-        f"{name} went from {figures['low']:.2f} to {figures['high']:.2f} degC; {low:g} to {high:g} degC are allowed"
-        for name, figures in channels.items()
-        if figures["low"] < low or figures["high"] > high
-    ]
+    outside: dict[str, list[str]] = {}
+    for name, figures in channels.items():
+        if figures["low"] < low or figures["high"] > high:
+            outside.setdefault(f"went from {figures['low']:.2f} to {figures['high']:.2f} degC", []).append(name)
+    allowed = f"{low:g} to {high:g} degC are allowed"
+    return [f"{', '.join(names)} {went}; {allowed}" for went, names in outside.items()]
 
 
 def _day(time: datetime) -> str:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, TypeVar
 
+from compgen.recal import exclude
 from compgen.recal.job import Job
 from compgen.recal.records import AttemptRecord, MachineRecord, TableRecord
 from compgen.recal.schedule import Cron, Schedule
@@ -132,13 +133,18 @@ def history(store: Store, machine: MachineRecord | None = None) -> list[Entry]:
         add(item.received_at, 0, item, "measurement", None, "", text)
     for attempt in store.attempts(machine):
         if attempt.outcome == "failed":
-            text = f"{named.get(attempt.measurement_id, '')}: {attempt.message}"
+            name = f"{named.get(attempt.measurement_id, '')}: "
+            text = attempt.message if attempt.message.startswith(name[:-1]) else name + attempt.message
             add(attempt.at, 1, attempt, "failed", None, "", text)
     for decision in store.decisions(machine):
         version = None if decision.table_id is None else versions[decision.table_id]
         add(decision.at, 2, decision, decision.kind, version, decision.actor, decision.reason)
     for event in store.events(machine):
-        if event.kind != "notified":
+        if event.kind == exclude.KIND:
+            what, actor, reason = exclude.said_of(event)
+            version = int(event.subject.removeprefix("version "))
+            add(event.at, 3, event, event.kind, version, actor, f"measurement {what}: {reason}")
+        elif event.kind != "notified":
             add(event.at, 3, event, event.kind, None, "", f"{event.subject}: {event.message}")
     return [entry for _, _, entry in sorted(entries, key=lambda item: (item[0], item[1], item[2].number))]
 
