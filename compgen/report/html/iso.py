@@ -94,6 +94,7 @@ def comparison_groups(source: ResultFolder) -> dict[str, Any]:
     if not data:
         return {}
     return {
+        "kind": str(data.get("kind", "")),
         "verdict": str(data.get("verdict", "")),
         "improved": bool(data.get("improved")),
         "decided_by": [str(item) for item in data.get("decided_by", [])],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from compgen.report.html.volume import draw_slices, draw_space, grid_of
 
 #: The files of a report.
 FILES = ("report.html", "report.json", "dossier.md", "dossier.json", "calibration.json")
+Further = Callable[[Mapping[str, Any]], Mapping[str, bytes]]
 
 
 @dataclass(frozen=True)
@@ -58,12 +59,20 @@ def build_report(folder: str | Path) -> Report:
     )
 
 
-def write_report(folder: str | Path, out: str | Path | None = None) -> tuple[Report, dict[str, Path]]:
-    """Make the report of ``folder`` and write its files there, or to ``out``: all or none."""
+def write_report(
+    folder: str | Path, out: str | Path | None = None, also: Further | None = None
+) -> tuple[Report, dict[str, Path]]:
+    """Make the report of ``folder`` and write its files there, or to ``out``: all or none.
+
+    ``also`` makes further files, by name, from the numbers of the report.
+    """
     target = OutputFolder(out if out is not None else folder)
     report = build_report(folder)
+    further = also(report.data) if also is not None else {}
     for name, text in report.files.items():
         target.add(name, text)
+    for name, document in further.items():
+        target.add(name, document)
     return report, target.commit()
 
 
