@@ -13,7 +13,8 @@ from compgen.core.lengths import Lengths, format_lengths
 from compgen.core.machine import load_machine, read_machine
 from compgen.core.threads import one_thread
 from compgen.diagnose import DiagnoseOptions, diagnose
-from compgen.diagnose.base import fit_base, fit_chosen_base, least_norm
+from compgen.diagnose.base import fit_base, least_norm
+from compgen.diagnose.base_choice import fit_smooth
 from compgen.diagnose.basis import first_basis
 from compgen.diagnose.diagnose import observed_of
 from compgen.diagnose.noise import difference_matrix, fit_reml, kernels, reml_problem, rotation
@@ -133,7 +134,7 @@ def test_repeats_are_found_and_their_differences_hold_no_static_effect(gantry):
 
 def test_the_gradient_of_the_restricted_likelihood_agrees_with_finite_differences(gantry):
     observed = observed_of(gantry, session(3, lines=8))
-    fit = fit_chosen_base(observed)
+    fit = fit_smooth(observed)
     time = observed.layout.time[observed.layout.stop]
     fixed = np.column_stack([time, np.where(observed.lengths.station == 1, time, 0.0)])
     problem = reml_problem(observed.layout, fit.residual_mm, fixed)
@@ -149,7 +150,7 @@ def test_the_gradient_of_the_restricted_likelihood_agrees_with_finite_difference
 
 def test_the_restricted_likelihood_finds_the_noise_of_the_readings(gantry):
     observed = observed_of(gantry, session(4, lines=20))
-    fit = fit_chosen_base(observed)
+    fit = fit_smooth(observed)
     problem = reml_problem(observed.layout, fit.residual_mm, np.zeros((len(observed), 0)))
     variances, quadratic, _, freedom = fit_reml(problem)
     assert np.sqrt(variances.white) / MICROMETRE == pytest.approx(SIGMA_UM, rel=0.12)
@@ -159,7 +160,7 @@ def test_the_restricted_likelihood_finds_the_noise_of_the_readings(gantry):
 
 def test_whitening_turns_the_covariance_into_the_identity(gantry):
     observed = observed_of(gantry, session(5, lines=4))
-    noise = noise_of(fit_chosen_base(observed), [])
+    noise = noise_of(fit_smooth(observed), [])
     variances = replace(noise.variances, own=np.full(7, 2e-8), common=np.full(7, 3e-8))
     layout = observed.layout
     white = whitener(layout, replace(noise, variances=variances))

@@ -9,6 +9,7 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.diagnose.base import BaseFit
+from compgen.diagnose.base_choice import Wider, widened, wider_of
 from compgen.diagnose.evidence import Evidence, evidence_of
 from compgen.diagnose.generic import base_groups, generic_groups
 from compgen.diagnose.groups import Group, named_groups
@@ -52,9 +53,26 @@ def analyse(
     sigma_mm : standard uncertainty of each reading, (n,), if one is given.
     show : receives the stage in words.
     """
+    wider = wider_of(fit)
+    found = _analysed(fit, wider, most_named, only, sigma_mm, show)
+    chosen = {found.scene.groups[g].name for g in found.chosen.members}
+    taken = [item for item in wider if item.group.name in chosen]
+    return _analysed(widened(fit, taken), (), most_named, only, sigma_mm, show) if taken else found
+
+
+def _analysed(
+    fit: BaseFit,
+    wider: Sequence[Wider],
+    most_named: int,
+    only: Sequence[str],
+    sigma_mm: FloatArray | None,
+    show: Show,
+) -> Analysis:
+    """Analyse the residuals of a base fit, with wider curves among the groups."""
     show("building the catalogue")
     named, missing = named_groups(fit.readings, only)
-    groups = [*base_groups(fit.readings), *named, *generic_groups(fit.readings, fit.observed.layout)]
+    groups = [*base_groups(fit.readings), *(item.group for item in wider), *named]
+    groups += generic_groups(fit.readings, fit.observed.layout)
     fixed = [group for group in named if group.scans == 1 or fit.readings.kind == "axis"]
     show("fitting the noise")
     noise = noise_of(fit, fixed if _repeats(fit) else [], sigma_mm=sigma_mm)

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from compgen.core.csvio import FloatArray
+from compgen.core.names import error_named
 from compgen.diagnose.basis import (
     CurveBasis,
     Part,
-    first_basis,
     names_of,
-    richer,
     size_of,
     tip_columns,
     values_of,
@@ -34,6 +33,10 @@ STEPS = 12
 LEAST_SINGULAR = 1e-9
 #: A step that changes the readings by less than this, mm, ends the iteration.
 SMALL_MM = 1e-8
+#: Curves are taken to be about this small, mm and rad, against readings good to ``READING_MM``: far too loose to matter
+#: where the data say anything, but what they hardly determine stays put instead of running away.
+LIKELY, READING_MM = 0.1, 1e-3
+LIKELY_RAD = 1e-4
 
 
 @dataclass(frozen=True)
@@ -114,13 +117,14 @@ def fit_base(
     counts: list[int] = [0] * len(effects)
     now = _linearise(observed, parts, unknowns, effects, counts)
     unknowns = np.concatenate([unknowns, np.zeros(sum(counts))])
+    hold = _hold(parts)
     for _ in range(steps):
         residual = observed.value_mm - now.model
         design, target = now.jacobian, residual
         if whiten is not None:
             both = whiten(np.column_stack([design, target]))
             design, target = both[:, :-1], both[:, -1]
-        step = least_norm(design, target)
+        step = _step(design, target, unknowns, hold if whiten is None else hold / READING_MM)
         unknowns = unknowns + step
         change = now.jacobian @ step
         now = _linearise(observed, parts, unknowns, effects, counts)
@@ -131,6 +135,21 @@ def fit_base(
     taken = tuple(zip(effects, counts, strict=True))
     residual = observed.value_mm - now.model
     return BaseFit(observed, basis, unknowns, residual, now.jacobian, tuple(names), now.readings, taken)
+
+
+def _hold(parts: Sequence[Part]) -> FloatArray:
+    """Weight that holds each coefficient of the curves near zero, (k,): accuracy of a reading over its likely size."""
+    found = np.empty(size_of(parts))
+    for part in parts:
+        found[part.place] = READING_MM / (LIKELY if error_named(part.name).kind == "linear" else LIKELY_RAD)
+    return found
+
+
+def _step(design: FloatArray, target: FloatArray, unknowns: FloatArray, hold: FloatArray) -> FloatArray:
+    """Least-squares step with the first unknowns held near zero by weights ``hold`` (k,)."""
+    held = np.zeros((len(hold), design.shape[1]))
+    held[:, : len(hold)] = np.diag(hold)
+    return least_norm(np.vstack([design, held]), np.concatenate([target, -hold * unknowns[: len(hold)]]))
 
 
 def _linearise(
@@ -165,46 +184,7 @@ def _columns(effect: Effect, readings: Readings) -> FloatArray:
     return change
 
 
-def fit_chosen_base(observed: Observed) -> BaseFit:
-    """Fit the smooth base model, with the nodes of the machine file on the axes whose readings ask for them (BIC)."""
-    poses = observed.poses
-    basis = first_basis(observed.machine, poses.position_mm, len(observed), len(poses.position_mm))
-    fit = fit_base(observed, basis)
-    for axis in range(3):
-        wider = richer(basis, axis)
-        if wider is None:
-            continue
-        start = _extended(fit, wider)
-        gain, added = _gain(fit, wider, start)
-        if added and gain > added * np.log(len(observed)):
-            basis = wider
-            fit = fit_base(observed, basis, start=start)
-    return fit
-
-
-def _gain(fit: BaseFit, wider: CurveBasis, start: FloatArray) -> tuple[float, int]:
-    """chi-square that a wider basis gains at the present linearisation, and the columns that it adds."""
-    parts = wider.parts(fit.observed.poses.position_mm)
-    extra = _linearise(fit.observed, parts, start, (), []).jacobian[:, : size_of(parts)]
-    extra = extra / np.maximum(np.linalg.norm(extra, axis=0), 1e-300)
-    q = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))[0]
-    left = extra - q @ (q.T @ extra)
-    left -= q @ (q.T @ left)
-    square, vectors = np.linalg.eigh(left.T @ left)
-    kept = square > 1e-6
-    new = left @ (vectors[:, kept] / np.sqrt(square[kept]))
-    explained = float(np.sum((new.T @ fit.residual_mm) ** 2))
-    freedom = len(fit.observed) - fit.jacobian.shape[1] - new.shape[1]
-    left_over = float(np.sum(fit.residual_mm**2)) - explained
-    return explained / max(left_over / max(freedom, 1), 1e-300), new.shape[1]
-
-
-def _extended(fit: BaseFit, wider: CurveBasis) -> FloatArray:
-    """Start values for a wider basis: the present ones, zero for what is new."""
-    position_mm = fit.observed.poses.position_mm[:1]
-    old, new = fit.basis.parts(position_mm), wider.parts(position_mm)
-    values = np.zeros(size_of(new))
-    for before, after in zip(old, new, strict=True):
-        count = before.basis.shape[1]
-        values[after.place.start : after.place.start + count] = fit.unknowns[before.place]
-    return np.concatenate([values, fit.unknowns[size_of(old) :]])
+def error_columns(observed: Observed, basis: CurveBasis, unknowns: FloatArray) -> FloatArray:
+    """Derivative of the readings by the coefficients of the curves alone, (n, k), at ``unknowns``."""
+    parts = basis.parts(observed.poses.position_mm)
+    return _linearise(observed, parts, unknowns, (), []).jacobian[:, : size_of(parts)]

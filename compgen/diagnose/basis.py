@@ -1,13 +1,14 @@
 """The base model of a diagnosis: smooth curves for the errors of the machine file, rich enough for the data.
 
-Legendre polynomials, because the positions of lines and diagonals form no grid; where the data ask for more (BIC),
-the curves of the machine file between its nodes are added. What cannot be told apart is left to the rank.
+Legendre polynomials, because the positions of lines and diagonals form no grid; where the data ask for more, higher
+degrees or the curves of the machine file between its nodes are added. What cannot be told apart is left to the rank.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,8 +18,12 @@ from compgen.core.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
 from compgen.model.basis import hat_matrix, spline_matrix
 from compgen.model.observability import modelled_errors
 
-#: Degree of the curves, if there are enough levels.
-DEGREE = 7
+T = TypeVar("T")
+
+#: Degree of the curves, if there are enough levels; and of those of an axis that asks for more.
+DEGREE, HIGHER_DEGREE = 7, 11
+#: Readings at distinct poses for each unknown of the curves; a smaller degree would leave errors of the machine over.
+READINGS_PER_UNKNOWN = 2
 #: A position this near a node is at it, mm.
 SAME_MM = 1e-3
 #: Nodes beyond this are not tried as a richer basis.
@@ -32,17 +37,31 @@ def legendre(s: FloatArray, degree: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class CurveBasis:
-    """Basis of the curves of the three axes: ``degree`` of the polynomials, ``nodal`` where nodes are added."""
+    """Basis of the curves of the three axes: ``degree`` of the polynomials, ``nodal`` where nodes are added.
+
+    ``span_mm``: lowest and highest position of each axis over which the polynomials run; default its travel. Over a part
+    of the travel, those of the whole would be nearly alike.
+    """
 
     machine: Machine
     errors: tuple[str, ...]
     degree: tuple[int, int, int]
     nodal: tuple[bool, bool, bool] = (False, False, False)
+    span_mm: tuple[tuple[float, float], ...] = ()
+
+    def _span(self, axis: int) -> tuple[float, float]:
+        return self.span_mm[axis] if self.span_mm else self.machine.axes[axis].range_mm
+
+    def with_axis(self, axis: int, other: CurveBasis) -> CurveBasis:
+        """Return the basis with the curves of one axis as in another basis."""
+        degree = _with(self.degree, axis, other.degree[axis])
+        return replace(self, degree=degree, nodal=_with(self.nodal, axis, other.nodal[axis]))
 
     def of_axis(self, axis: int, position_mm: FloatArray) -> FloatArray:
         """Basis of an axis at positions (m,): polynomials P1, P2 ..., then nodal curves, (m, k)."""
         item = self.machine.axes[axis]
-        s = (2.0 * position_mm - sum(item.range_mm)) / item.length_mm
+        low, high = self._span(axis)
+        s = (2.0 * position_mm - low - high) / (high - low)
         columns = legendre(s, self.degree[axis])[:, 1:]
         if not self.nodal[axis]:
             return columns
@@ -50,12 +69,12 @@ class CurveBasis:
         return np.hstack([columns, build(item.nodes_mm, position_mm)])
 
     def _zeroed(self, axis: int, position_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Bases of an axis zero at the reference point, and zero at both ends of the travel, each (m, k)."""
-        item = self.machine.axes[axis]
-        fixed = np.array([self.machine.reference_point_mm[axis], *item.range_mm])
+        """Bases of an axis zero at the reference point, and zero at both ends of the span, each (m, k)."""
+        start, end = self._span(axis)
+        fixed = np.array([np.clip(self.machine.reference_point_mm[axis], start, end), start, end])
         whole = self.of_axis(axis, np.concatenate([fixed, position_mm]))
         reference, low, high, columns = whole[0], whole[1], whole[2], whole[3:]
-        share = ((position_mm - item.range_mm[0]) / item.length_mm)[:, None]
+        share = ((position_mm - start) / (end - start))[:, None]
         return columns - reference, (columns - (1.0 - share) * low - share * high)[:, 1:]
 
     def parts(self, position_mm: FloatArray) -> list[Part]:
@@ -120,13 +139,15 @@ def first_basis(machine: Machine, position_mm: FloatArray, readings: int, poses:
     """Return the smooth basis that ``readings`` at ``poses`` distinct positions can carry."""
     errors = base_errors(machine)
     curves = sum(name not in SQUARENESS_NAMES for name in errors)
-    most = max(2, int(min(readings, 3 * poses) / 4 / max(curves, 1)))
-    degree, nodal = [], []
+    most = max(2, int(min(readings, 3 * poses) / READINGS_PER_UNKNOWN / max(curves, 1)))
+    degree, nodal, span = [], [], []
     for axis in range(3):
         levels = np.unique(np.round(position_mm[:, axis], 3))
         degree.append(max(1, min(DEGREE, len(levels) - 1, most)))
         nodal.append(len(levels) <= min(most, MOST_NODES) and _at_nodes(machine, axis, levels))
-    return CurveBasis(machine, errors, (degree[0], degree[1], degree[2]), (nodal[0], nodal[1], nodal[2]))
+        moved = len(levels) > 1
+        span.append((float(levels[0]), float(levels[-1])) if moved else machine.axes[axis].range_mm)
+    return CurveBasis(machine, errors, (degree[0], degree[1], degree[2]), (nodal[0], nodal[1], nodal[2]), tuple(span))
 
 
 def _at_nodes(machine: Machine, axis: int, levels_mm: FloatArray) -> bool:
@@ -135,10 +156,24 @@ def _at_nodes(machine: Machine, axis: int, levels_mm: FloatArray) -> bool:
     return len(levels_mm) > 2 and bool(np.all(np.abs(levels_mm[:, None] - nodes).min(axis=1) < SAME_MM))
 
 
-def richer(basis: CurveBasis, axis: int) -> CurveBasis | None:
-    """Return the basis with the nodes of the machine file on one axis, or None if that adds nothing."""
+def wider_bases(basis: CurveBasis, axis: int, position_mm: FloatArray, readings: int) -> list[CurveBasis]:
+    """Return wider bases of one axis that ``readings`` can carry: of higher degree, with the nodes of the machine file."""
+    if basis.nodal[axis]:
+        return []
+    levels = len(np.unique(np.round(position_mm[:, axis], 3)))
+    curves = sum(name not in SQUARENESS_NAMES for name in basis.errors)
+    most = int(min(readings, 3 * len(position_mm)) / READINGS_PER_UNKNOWN / max(curves, 1))
+    found = []
+    if basis.degree[axis] == DEGREE and levels > HIGHER_DEGREE and most >= HIGHER_DEGREE:
+        found.append(replace(basis, degree=_with(basis.degree, axis, HIGHER_DEGREE)))
     nodes = len(basis.machine.axes[axis].nodes_mm)
-    if basis.nodal[axis] or not basis.degree[axis] + 1 < nodes <= MOST_NODES:
-        return None
-    nodal = [flag or k == axis for k, flag in enumerate(basis.nodal)]
-    return CurveBasis(basis.machine, basis.errors, basis.degree, (nodal[0], nodal[1], nodal[2]))
+    if basis.degree[axis] + 1 < nodes <= MOST_NODES:
+        found.append(replace(basis, nodal=_with(basis.nodal, axis, True)))
+    return found
+
+
+def _with(values: tuple[T, T, T], axis: int, value: T) -> tuple[T, T, T]:
+    """Return three values with that of one axis changed."""
+    changed = list(values)
+    changed[axis] = value
+    return changed[0], changed[1], changed[2]

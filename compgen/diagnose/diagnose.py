@@ -19,7 +19,8 @@ from compgen.diagnose.advice import advice_of
 from compgen.diagnose.against import compared
 from compgen.diagnose.analysis import Analysis, analyse
 from compgen.diagnose.axis_figures import WARM_UP_NOTE, figures_before_after
-from compgen.diagnose.base import BaseFit, fit_chosen_base
+from compgen.diagnose.base import BaseFit
+from compgen.diagnose.base_choice import fit_smooth
 from compgen.diagnose.classes import classes_of, gross_readings
 from compgen.diagnose.evidence import contribution
 from compgen.diagnose.gap import gap_of
@@ -102,25 +103,26 @@ def diagnose(
                 "a diagnosis needs at least 20: measure more lines"
             )
         analysis = _analysed(measurement, observed, fit, chosen, show)
+        before = analysis.fit if before is fit else before
         gross = gross_readings(analysis)
         if len(gross):
             show(f"leaving out {len(gross)} gross readings")
             observed = observed.part(np.setdiff1d(np.arange(len(observed)), gross))
-            fit = _base(observed)
-            before = fit if before is analysis.fit else before
-            analysis = _analysed(measurement, observed, fit, chosen, show)
+            plain = before is analysis.fit
+            analysis = _analysed(measurement, observed, _base(observed), chosen, show)
+            before = analysis.fit if plain else before
         return _completed(machine, analysis, chosen, show, before, classed, len(gross))
 
 
 def _base(observed: Observed) -> BaseFit:
     """Fit the base model, with what the machine file switches on taken off the readings."""
-    fit = fit_axis(observed) if isinstance(observed, ObservedAxis) else fit_chosen_base(observed)
+    fit = fit_axis(observed) if isinstance(observed, ObservedAxis) else fit_smooth(observed)
     known = [effect.change_mm(fit.readings) for effect in active_effects(observed.machine)]
     present = [change for change in known if change is not None]
     if not present:
         return fit
     observed.value_mm = observed.value_mm - sum(present)
-    return fit_axis(observed) if isinstance(observed, ObservedAxis) else fit_chosen_base(observed)
+    return fit_axis(observed) if isinstance(observed, ObservedAxis) else fit_smooth(observed)
 
 
 def _analysed(

@@ -34,12 +34,12 @@ class ThermalScale(DisplacementEffect):
         )
 
     def positions(self, readings: Readings) -> Sequence[float]:
-        """Where scales are fixed: at the reference point, in the middle, at either end."""
+        """Where scales are fixed: at the reference point, in the middle, at either end, at zero of the axis."""
         if "fixed_mm" in self.settings:
             return ()
         low, high = readings.machine.axes[self.axis].range_mm
         reference = readings.machine.reference_point_mm[self.axis]
-        return list(dict.fromkeys((reference, 0.5 * (low + high), low, high)))
+        return list(dict.fromkeys((reference, 0.5 * (low + high), low, high, 0.0)))
 
     def used(self, readings: Readings) -> dict[str, float]:
         """The fixed point and the reference temperature."""
