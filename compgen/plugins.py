@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 from compgen.controllers import CONTROLLERS
-from compgen.core.plugins import Kind, load_entry_points, load_file
+from compgen.core.plugins import PATH_ORIGIN, Kind, load_entry_points, load_file
 from compgen.effects import FAMILIES
 from compgen.effects.registration import check_family
 from compgen.export.registration import check_control
@@ -41,3 +44,27 @@ def load_plugins(paths: Sequence[str | Path] = (), *, installed: bool = True) ->
         load_entry_points(KINDS)
     for path in paths:
         load_file(path, KINDS)
+
+
+@dataclass(frozen=True)
+class WithPlugins:
+    """A function that another process calls with the plug-ins of this one."""
+
+    function: Callable[[Any], Any]
+    paths: tuple[str, ...]
+
+    def __call__(self, item: Any) -> Any:
+        """Load the plug-ins, unless they are, and call the function."""
+        _load_once(self.paths)
+        return self.function(item)
+
+
+@cache
+def _load_once(paths: tuple[str, ...]) -> None:
+    load_plugins(paths)
+
+
+def with_plugins(function: Callable[[Any], Any]) -> WithPlugins:
+    """Return the function with the plug-ins that were loaded from paths."""
+    origins = {origin for kind in KINDS for origin in kind.origins.values() if origin.startswith(PATH_ORIGIN)}
+    return WithPlugins(function, tuple(sorted(origin.removeprefix(PATH_ORIGIN) for origin in origins)))

@@ -11,6 +11,7 @@ import click
 
 from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.cli.fit_options import covariance_of, covariance_options, fitting_options
+from compgen.cli.parallel_options import fleet_options, mapper
 from compgen.cli.safety_options import active_options
 from compgen.core.files import OutputFolder
 from compgen.core.lengths import Lengths
@@ -135,6 +136,7 @@ def identify_options(
     metavar="N",
     help="Identify N simulated sets of readings as well and compare their scatter with the stated uncertainties.",
 )
+@fleet_options
 @json_option
 def identify_command(
     machine: Machine,
@@ -148,6 +150,8 @@ def identify_command(
     choices: Mapping[str, Any],
     active: ActiveTables | None,
     replicates: int | None,
+    workers: int,
+    cluster: str | None,
     as_json: bool,
 ) -> int:
     """Identify error curves, squareness and stations from tracer lengths, or errors from measured positions.
@@ -163,12 +167,14 @@ def identify_command(
 
     *.sixdof.csv files hold raw readings of a six-DOF laser instrument (mm); --instrument describes it. All 21 errors come
     from them, without stations.csv. Beside lengths or deviations of the same machine both are compared and averaged; exit
-    code 1 and a warning name the errors that disagree.
+    code 1 and a warning name the errors that disagree. --workers and --cluster share out the replicates of --self-check.
 
     \b
     Example:
       compgen identify zha-gantry examples/zha-gantry.lengths.csv --out identified/
     """
+    if replicates is None and (workers > 1 or cluster is not None):
+        raise InputError("--workers and --cluster share out the replicates of --self-check, which is not given")
     OutputFolder(out)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
@@ -181,13 +187,15 @@ def identify_command(
         if replicates is not None:
             if active is not None or not isinstance(measurement, Lengths):
                 raise InputError("--self-check belongs to tracer lengths that were taken without active tables")
-            checked = self_check(
-                machine,
-                measurement,
-                result,
-                replicates,
-                progress=lambda k: show(f"self-check: {k} of {replicates} replicates"),
-            )
+            with mapper(workers, cluster) as spread:
+                checked = self_check(
+                    machine,
+                    measurement,
+                    result,
+                    replicates,
+                    progress=lambda k: show(f"self-check: {k} of {replicates} replicates"),
+                    mapper=spread,
+                )
     files = identification_files(result, provenance_of(machine.source, *measurements, instrument), checked)
     write_all(out, {**files, **evidence_files(machine, measurement, result)})
     if as_json:

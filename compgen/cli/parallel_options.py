@@ -5,14 +5,16 @@ from __future__ import annotations
 import functools
 import signal
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
 from typing import Any
 
 import click
 
 from compgen.cli.common import Command
+from compgen.core.parallel import Map, opened_workers, spread
 from compgen.errors import InputError
+from compgen.plugins import with_plugins
 
 
 def fleet_options(command: Command) -> Command:
@@ -29,6 +31,21 @@ def fleet_options(command: Command) -> Command:
     decorated = click.option("--workers", type=click.IntRange(1, 256), metavar="N", help=text)(decorated)
     text = "Scheduler of an existing Dask cluster that does the work, e.g. tcp://10.0.0.5:8786; needs compgen[cluster]."
     return click.option("--cluster", metavar="ADDRESS", help=text)(decorated)  # type: ignore[no-any-return]
+
+
+@contextmanager
+def mapper(workers: int, cluster: str | None) -> Iterator[Map]:
+    """Yield a ``map`` over so many processes of this machine, or over a cluster; ``map`` itself for one."""
+    found = opened_workers(workers, cluster)
+    if found is None:
+        yield map
+        return
+
+    def spread_out(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        return spread(found, with_plugins(function), items)
+
+    with closing(found):
+        yield spread_out
 
 
 @contextmanager

@@ -29,6 +29,8 @@ from compgen.errors import CompgenWarning, InputError
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 #: What a fault in the code of a plug-in may raise while it is imported; ``sys.exit`` in it must not end the program.
 _FAULTS = (Exception, SystemExit)
+#: How the origin of a plug-in from a path begins.
+PATH_ORIGIN = "plug-in "
 #: Why an entry point of an installed distribution is not available, by word of its kind and name.
 _BROKEN: dict[tuple[str, str], str] = {}
 
@@ -110,7 +112,7 @@ def load_file(path: str | Path, kinds: Sequence[Kind]) -> None:
         raise InputError("no such plug-in; give a .py file or a folder with an __init__.py", file=file)
     if file.suffix != ".py":
         raise InputError("is no Python file; a plug-in is a .py file or a folder with an __init__.py", file=file)
-    origin = f"plug-in {source}"
+    origin = f"{PATH_ORIGIN}{source}"
     if any(origin in kind.origins.values() for kind in kinds):
         return
     name = f"compgen_plugin_{hashlib.sha256(str(file).encode()).hexdigest()[:12]}"

@@ -15,6 +15,8 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
+from compgen.core.parallel import Map
+from compgen.core.threads import one_thread
 from compgen.errors import InputError
 from compgen.identify.covariance import Covariance
 from compgen.identify.identify import identify
@@ -66,6 +68,7 @@ def self_check(
     replicates: int = 50,
     seed: int = 0,
     progress: Callable[[int], None] = lambda _: None,
+    mapper: Map = map,
 ) -> SelfCheck:
     """Identify again from simulated readings: the model's own with new noise of the stated size.
 
@@ -73,8 +76,9 @@ def self_check(
     ----------
     machine, lengths, result : what was identified, by the joint method, and the outcome.
     replicates : at least 10.
-    seed : of the noise.
+    seed : of the noise; each replicate draws from a generator of its own, by this seed and its number.
     progress : is told the number of finished replicates.
+    mapper : may spread the replicates over processes; the outcome is the same.
     """
     adjustment = result.adjustment
     if replicates < 10 or adjustment is None or result.method != "joint":
@@ -86,11 +90,10 @@ def self_check(
     options = IdentifyOptions(
         u_length_um=result.u_length_um, u_length_um_per_m=result.u_length_um_per_m, reject=False, temperature=False
     )
-    rng = np.random.default_rng(seed)
+    replicate = _Replicate(machine, plain, model_mm, sigma_mm, options)
     values = []
-    for k in range(replicates):
-        readings = replace(plain, length_mm=model_mm + sigma_mm * rng.standard_normal(len(used)))
-        values.append(_values(identify(machine, readings, options)))
+    for k, found in enumerate(mapper(replicate, ((seed, k) for k in range(replicates)))):
+        values.append(found)
         progress(k + 1)
     u = _uncertainties(result)
     spread = np.std(values, axis=0, ddof=1)
@@ -103,6 +106,23 @@ def self_check(
         ratio_max=float(ratio.max()),
         expected_spread=float(1.0 / np.sqrt(2.0 * (replicates - 1))),
     )
+
+
+@dataclass(frozen=True)
+class _Replicate:
+    """The identified values of one simulated set of readings, as a function of its seed; can be sent to a process."""
+
+    machine: Machine
+    lengths: Lengths
+    model_mm: FloatArray
+    sigma_mm: FloatArray
+    options: IdentifyOptions
+
+    def __call__(self, seed: tuple[int, int]) -> FloatArray:
+        noise = np.random.default_rng(seed).standard_normal(len(self.model_mm))
+        readings = replace(self.lengths, length_mm=self.model_mm + self.sigma_mm * noise)
+        with one_thread():  # the same bits however many processors there are
+            return _values(identify(self.machine, readings, self.options))
 
 
 def _rows(lengths: Lengths, rows: np.ndarray[Any, Any]) -> Lengths:

@@ -10,7 +10,7 @@ import sqlalchemy as sa
 
 from compgen.core.parallel import LostError, Packed, Stop, StoppedError, Workers, opened_workers, spread, stopping
 from compgen.errors import CompgenError
-from compgen.plugins import KINDS, load_plugins
+from compgen.plugins import WithPlugins, with_plugins
 from compgen.recal import logs
 from compgen.recal.job import Job, MachineJob
 from compgen.recal.runner import MachineOutcome, RunOutcome, run_jobs, run_machine
@@ -21,11 +21,10 @@ LOCAL_STORE = "the store is an SQLite file, which only processes of one machine 
 
 @dataclass(frozen=True)
 class Pass:
-    """One pass over a machine as another process makes it; it brings logs and plug-ins along."""
+    """One pass over a machine as another process makes it; it brings the form of the logs along."""
 
     url: str
     log: logs.Format
-    plugins: tuple[str, ...]
 
     def __repr__(self) -> str:
         return "Pass()"  # the URL may hold a password
@@ -33,14 +32,12 @@ class Pass:
     def __call__(self, job: MachineJob) -> MachineOutcome:
         """Make the pass."""
         logs.configure(self.log)
-        load_plugins(self.plugins)
         return run_machine(job, self.url, stopping)
 
 
-def pass_of(url: str) -> Pass:
+def pass_of(url: str) -> WithPlugins:
     """Return the pass on the store ``url`` with this process's logs and plug-ins."""
-    origins = {origin for kind in KINDS for origin in kind.origins.values() if origin.startswith("plug-in ")}
-    return Pass(url, logs.form(), tuple(sorted(origin.removeprefix("plug-in ") for origin in origins)))
+    return with_plugins(Pass(url, logs.form()))
 
 
 def open_fleet(url: str, workers: int, cluster: str | None) -> Workers | None:
