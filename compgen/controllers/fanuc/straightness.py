@@ -24,6 +24,7 @@ from compgen.controllers.fanuc.straightness_tables import (
 )
 from compgen.controllers.grids import curve_nodes_mm
 from compgen.controllers.terms import one_dimensional_name, one_dimensional_terms
+from compgen.controllers.transfer_plan import check_plans
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -78,8 +79,15 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         return straightness_context(machine, settings, tables)
 
     def parse(self, machine: Machine, settings: StraightnessSettings, files: Sequence[SourceFile]) -> StraightTables:
-        """Read parameters 5711 ... 5784 and the points of the moving axes; a ``.json`` plan is passed over."""
-        return parse_straightness(settings, files)
+        """Read parameters 5711 ... 5784 and the points of the moving axes; a ``.json`` plan must hold the same."""
+        tables = parse_straightness(settings, files)
+        check_plans(files, lambda: self._plan(machine, settings, tables))
+        return tables
+
+    def _plan(self, machine: Machine, settings: StraightnessSettings, tables: StraightTables) -> dict[str, Any]:
+        plan = self.context(machine, settings, tables)["plan"]
+        same = {key: plan[key] for key in ("stores", "detection_unit_um")}
+        return {**same, "axis_parameters": plan["axes"], "parameters": plan["common"]}
 
     def emulate(
         self, machine: Machine, settings: StraightnessSettings, tables: StraightTables, points: Points

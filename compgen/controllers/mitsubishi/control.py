@@ -31,6 +31,7 @@ from compgen.controllers.mitsubishi.tables import (
     values_of,
 )
 from compgen.controllers.terms import one_dimensional_name, one_dimensional_terms
+from compgen.controllers.transfer_plan import check_plans
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -79,8 +80,10 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return sheet_context(machine, settings, tables)
 
     def parse(self, machine: Machine, settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
-        """Read the set sheet; a ``.json`` plan among the files is passed over."""
-        return parse_sheet(settings, files)
+        """Read the set sheet; a ``.json`` plan must hold the same."""
+        tables = parse_sheet(settings, files)
+        check_plans(files, lambda: self.context(machine, settings, tables)["plan"])
+        return tables
 
     def emulate(
         self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables, points: Points
