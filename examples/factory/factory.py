@@ -128,16 +128,32 @@ def _month(year: Year, name: str, month: int) -> Iterator[Row]:
     """One machine in one month: what is special, then the usual measurement."""
     at = day_of(month)
     if name == "mill-a" and month == STALE:
-        path = year.factory.measure(year.job, name, at - timedelta(days=50), part="-found-on-a-stick")
+        path = year.factory.measure(year.job, name, at - timedelta(days=50), bare=True, part="-found-on-a-stick")
         yield _processed(year, name, path, at - HOUR)
     if name == "mill-b" and month == EXCHANGED:
-        path = year.factory.measure(year.job, name, at - HOUR, part="-exchanged")
-        path.write_text(path.read_text().replace(",x_mm,y_mm,", ",y_mm,x_mm,"))
-        yield _processed(year, name, path, at)
-        path.unlink()
+        for part, wrong in (("-exchanged", exchanged), ("-wrong-sign", wrong_sign)):
+            path = year.factory.measure(year.job, name, at - 24 * HOUR, part=part)
+            path.write_text(wrong(path.read_text()))
+            yield _processed(year, name, path, at - 23 * HOUR)
+            path.unlink()
     if name == "mill-b" and month == WRONG_SIGN:
-        yield _wrong_sign(year, name, at - 24 * HOUR)
+        yield _undone(year, name, at - 24 * HOUR)
     yield _processed(year, name, year.factory.measure(year.job, name, at), at + 2 * HOUR)
+
+
+def exchanged(text: str) -> str:
+    """A measurement file whose columns X and Y are exchanged."""
+    return text.replace(",x_mm,y_mm,", ",y_mm,x_mm,")
+
+
+def wrong_sign(text: str) -> str:
+    """A measurement file whose lengths have the wrong sign."""
+    lines = text.splitlines()
+    head = next(k for k, line in enumerate(lines) if line.startswith("station,"))
+    column = lines[head].split(",").index("length_mm")
+    cells = [line.split(",") for line in lines[head + 1 :]]
+    turned = [[*row[:column], str(-float(row[column])), *row[column + 1 :]] for row in cells]
+    return "\n".join([*lines[: head + 1], *map(",".join, turned)]) + "\n"
 
 
 def _processed(year: Year, name: str, path: Path, now: datetime) -> Row:
@@ -175,7 +191,7 @@ def _row(
     )
 
 
-def _wrong_sign(year: Year, name: str, at: datetime) -> Row:
+def _undone(year: Year, name: str, at: datetime) -> Row:
     """A program writes deviations with the wrong sign. Ben makes the tables active all the same; Ada undoes it."""
     year.now = at
     path = year.factory.measure_deviations(year.job, name, at, sign=-1.0)
