@@ -21,6 +21,7 @@ from compgen.model import predict
 from compgen.simulate import (
     AxisLaser,
     AxisSimulation,
+    DiagonalLaser,
     SimulatedSixDof,
     Simulation,
     SixDofSimulation,
@@ -43,7 +44,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
     """Simulate a machine and its measurement: writes *.lengths.csv (mm) and truth.errors.csv (um, urad) to DIR.
 
     A scenario whose instrument has type = "sixdof" writes *.sixdof.csv in place of lengths, one with "axis-laser"
-    *.axis.csv (um).
+    *.axis.csv, with "diagonal-laser" *.diagonals.csv (um).
 
     \b
     Example:
@@ -53,7 +54,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
         show("simulating")
         planned = read_scenario(scenario)
         simulation: Simulation | SixDofSimulation | AxisSimulation
-        if isinstance(planned.instrument, AxisLaser):
+        if isinstance(planned.instrument, AxisLaser | DiagonalLaser):
             simulation = simulate_axis_runs(machine, planned, seed)
         elif isinstance(planned.instrument, SimulatedSixDof):
             simulation = simulate_sixdof(machine, planned, seed)

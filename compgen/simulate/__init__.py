@@ -1,6 +1,7 @@
 """A virtual machine and virtual instruments: measurement files whose truth is known."""
 
 from compgen.simulate.axis_runs import AxisLaser
+from compgen.simulate.diagonals import DiagonalLaser
 from compgen.simulate.effects import EFFECTS, Effect
 from compgen.simulate.laser_tracer import LaserTracer, Station
 from compgen.simulate.run import (
@@ -22,6 +23,7 @@ __all__ = [
     "EFFECTS",
     "INSTRUMENTS",
     "AxisLaser",
+    "DiagonalLaser",
     "AxisSimulation",
     "Effect",
     "Instrument",

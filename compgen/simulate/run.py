@@ -10,16 +10,16 @@ import numpy as np
 
 from compgen.core.axis_runs import AxisRuns, format_axis_runs
 from compgen.core.csvio import FloatArray
+from compgen.core.diagonals import Diagonals, format_diagonals
 from compgen.core.error_table import ErrorTable, format_errors
 from compgen.core.files import OutputFolder
 from compgen.core.lengths import Lengths, format_lengths
 from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.model.exact import tip_position
-from compgen.simulate.axis_runs import AxisLaser
 from compgen.simulate.effects import Effect, LengthEffect, RunEffect, Sights
 from compgen.simulate.laser_tracer import LaserTracer, Station
-from compgen.simulate.scenario import Scenario
+from compgen.simulate.scenario import LineLaser, Scenario
 from compgen.simulate.session import plan_session, with_temperatures
 from compgen.simulate.sixdof_measurement import SimulatedSixDof
 from compgen.simulate.trajectory import Stops, plan_stops
@@ -50,10 +50,10 @@ class Simulation:
 
 @dataclass(frozen=True)
 class AxisSimulation:
-    """The axis runs of a virtual machine, and its true errors in mm and rad; ``name`` begins the file names."""
+    """Runs of a virtual machine along axes or diagonals, and its true errors in mm and rad; ``name`` begins the file names."""
 
     name: str
-    readings: AxisRuns
+    readings: AxisRuns | Diagonals
     truth: ErrorTable
 
 
@@ -111,8 +111,8 @@ def simulate(
     instrument = scenario.instrument
     if isinstance(instrument, SimulatedSixDof):
         raise InputError("is a six-DOF instrument, which has no lengths; call simulate_sixdof", file=scenario.source)
-    if isinstance(instrument, AxisLaser):
-        raise InputError("runs along axes and has no lengths; call simulate_axis_runs", file=scenario.source)
+    if isinstance(instrument, LineLaser):
+        raise InputError("runs along lines and has no lengths; call simulate_axis_runs", file=scenario.source)
     for effect in scenario.effects:
         if isinstance(effect, RunEffect):
             message = f"{effect.name} acts on axis runs only; their instrument has type = 'axis-laser'"
@@ -175,11 +175,13 @@ def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = Non
 
 
 def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = None) -> AxisSimulation:
-    """Measure a virtual machine with the laser along axes of the scenario; InputError for another instrument."""
+    """Measure a virtual machine with the scenario's laser along axes or diagonals; InputError for another instrument."""
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
-    if not isinstance(scenario.instrument, AxisLaser):
-        raise InputError("is no laser along axes; call simulate", file=scenario.source, field="[instrument] type")
+    if not isinstance(scenario.instrument, LineLaser):
+        raise InputError(
+            "is no laser along axes or diagonals; call simulate", file=scenario.source, field="[instrument] type"
+        )
     truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
     moving = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect | RunEffect)]
     readings = scenario.instrument.measure(
@@ -206,11 +208,13 @@ def _described(machine: Machine, truth: ErrorTable, seed: int) -> ErrorTable:
 def write_simulation(simulation: Simulation | SixDofSimulation | AxisSimulation, folder: str | Path) -> dict[str, Path]:
     """Write the readings, e.g. ``<name>.lengths.csv``, and ``truth.errors.csv``; return paths by file name."""
     output = OutputFolder(folder)
-    if isinstance(simulation, AxisSimulation):
+    if isinstance(simulation, AxisSimulation) and isinstance(simulation.readings, Diagonals):
+        output.add(f"{simulation.name}.diagonals.csv", format_diagonals(simulation.readings))
+    elif isinstance(simulation, AxisSimulation) and isinstance(simulation.readings, AxisRuns):
         output.add(f"{simulation.name}.axis.csv", format_axis_runs(simulation.readings))
     elif isinstance(simulation, SixDofSimulation):
         output.add(f"{simulation.name}.sixdof.csv", format_sixdof(simulation.readings))
-    else:
+    elif isinstance(simulation, Simulation):
         output.add(f"{simulation.name}.lengths.csv", format_lengths(simulation.lengths))
     output.add("truth.errors.csv", format_errors(simulation.truth))
     return output.commit()

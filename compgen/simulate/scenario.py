@@ -14,6 +14,7 @@ from compgen.core import tomlio
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.simulate.axis_runs import AxisLaser, read_axis_laser
+from compgen.simulate.diagonals import DiagonalLaser, read_diagonal_laser
 from compgen.simulate.effects import SimulatedEffect, read_effects
 from compgen.simulate.laser_tracer import read_laser_tracer
 from compgen.simulate.registration import instrument_problems
@@ -34,12 +35,14 @@ class Instrument(Protocol):
         """Return the readings at stops whose true tips are ``tip_mm`` (n, 3) in the workpiece frame."""
 
 
-AnyInstrument = Instrument | SimulatedSixDof | AxisLaser
+LineLaser = AxisLaser | DiagonalLaser
+AnyInstrument = Instrument | SimulatedSixDof | LineLaser
 #: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
 INSTRUMENTS: dict[str, Callable[[tomlio.Section], AnyInstrument]] = {
     "laser-tracer": read_laser_tracer,
     "sixdof": read_sixdof_measurement,
     "axis-laser": read_axis_laser,
+    "diagonal-laser": read_diagonal_laser,
 }
 
 
@@ -89,16 +92,18 @@ def read_scenario(path: str | Path) -> Scenario:
         for key in ("trajectory", "effects", "session", "temperatures"):
             if key in root.data:
                 raise root.fail(key, "belongs to other instruments; a six-DOF instrument runs along the axes")
-    if isinstance(scenario.instrument, AxisLaser):
+    if isinstance(scenario.instrument, LineLaser):
         for key in ("trajectory", "session"):
             if key in root.data:
-                raise root.fail(key, "belongs to other instruments; a laser along axes runs to and fro along each")
+                raise root.fail(
+                    key, "belongs to other instruments; a laser along axes or diagonals runs to and fro along each"
+                )
     return scenario
 
 
 def _instrument(kind: str, section: tomlio.Section) -> AnyInstrument:
     made = INSTRUMENTS[kind](section)
-    if isinstance(made, SimulatedSixDof | AxisLaser):
+    if isinstance(made, SimulatedSixDof | LineLaser):
         return made
     problems = instrument_problems(made)
     if problems:
