@@ -260,7 +260,7 @@ def test_styles_show_in_the_text(tmp_path):
     assert ";" not in text and " " not in text and text.isascii()
 
 
-def test_the_plan_holds_number_and_value_of_every_point_and_parse_passes_over_it(tmp_path):
+def test_the_plan_holds_number_and_value_of_every_point_and_is_no_table_by_itself(tmp_path):
     machine = machine_of(tmp_path)
     chosen, _, tables = natural_tables(machine, asymmetric_errors(machine))
     texts = texts_of(machine, chosen, tables)
@@ -269,7 +269,7 @@ def test_the_plan_holds_number_and_value_of_every_point_and_parse_passes_over_it
     assert {int(number): value for number, value in plan["points"].items()} == in_text
     assert plan["machine"] == 'mill "7"' and plan["stores"] == "correction" and plan["detection_unit_um"] == 1.0
     assert plan["parameters"]["3620"]["1"] == str(tables.blocks[0].reference)
-    assert read_all(machine, {"PITCH.plan.json": "not even JSON", "PITCH.TXT": texts["PITCH.TXT"]}) == tables
+    assert read_all(machine, {name: texts[name] for name in ("PITCH.plan.json", "PITCH.TXT")}) == tables
     with pytest.raises(InputError, match=r"PITCH\.TXT"):
         read_all(machine, {"PITCH.plan.json": texts["PITCH.plan.json"]})
 
