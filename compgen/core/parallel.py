@@ -1,7 +1,7 @@
 """One function for many items: in processes of this machine or on a cluster; the same results in the same order.
 
 A function and its items are pickled, whatever decides about a result stands in the item (a seed too), and every item is
-computed with one thread of the numerical libraries; so it does not matter where that happens.
+computed steadily (:mod:`compgen.core.steady`); so it does not matter where that happens.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.context import SpawnContext
 from typing import Any, Protocol, TypeVar
 
-from compgen.core.threads import one_thread
+from compgen.core.steady import steady
 from compgen.errors import CompgenError, CompgenWarning
 
 Item = TypeVar("Item")
@@ -111,7 +111,7 @@ def _unpacked(content: bytes) -> Any:
 
 def perform(function: Packed, item: Packed) -> Answer:
     """Compute one item in this process, one at a time, and return what came of it."""
-    with _BUSY, one_thread(), warnings.catch_warnings(record=True) as caught:
+    with _BUSY, steady(), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
         try:

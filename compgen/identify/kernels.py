@@ -10,9 +10,11 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
+from compgen.core.steady import is_steady
+
 #: Readings from which the compiled loops pay at once.
 LARGE = 100_000
-_state: dict[str, int] = {"calls": 0, "allowed": 1}
+_state: dict[str, int] = {"calls": 0, "allowed": 1, "large": 0}
 _loaded: dict[str, ModuleType | None] = {}
 
 
@@ -24,13 +26,18 @@ def allow(compiled: bool) -> None:
 def count_identification() -> None:
     """Say that an identification begins; from the second of a process on the compiled loops are loaded."""
     _state["calls"] += 1
+    _state["large"] = 0
 
 
 def compiled_loops(readings: int = 0) -> ModuleType | None:
-    """Return the compiled module, or None where numpy serves; it is loaded where so many ``readings`` come at once."""
-    if not _state["allowed"]:
+    """Return the compiled module, or None where numpy serves; it is loaded where so many ``readings`` come at once.
+
+    In a steady block (:func:`compgen.core.steady.steady`) the readings of this identification alone count.
+    """
+    _state["large"] |= int(readings >= LARGE)
+    if not _state["allowed"] or (is_steady() and not _state["large"]):
         return None
-    if "module" not in _loaded and (_state["calls"] > 1 or readings >= LARGE):
+    if "module" not in _loaded and (_state["calls"] > 1 or _state["large"]):
         try:
             _loaded["module"] = importlib.import_module("compgen.identify.compiled")
         except ImportError:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from compgen.core.csvio import FloatArray
+from compgen.core.steady import is_steady
 from compgen.model.tables import COORDINATES, AxisTable, AxisTables
 
 _COMPILED = "compgen.model.compiled"
@@ -23,7 +24,12 @@ _ROW = 8  # numbers per group and interval
 
 
 def ready(load: bool = False) -> bool:
-    """Whether the kernels are loaded; with ``load`` they are loaded first, if numba is installed."""
+    """Whether the kernels are loaded; with ``load`` they are loaded first, if numba is installed.
+
+    Never in a steady block, :func:`compgen.core.steady.steady`: that may not depend on what was loaded before.
+    """
+    if is_steady():
+        return False
     if load and _COMPILED not in sys.modules:
         try:
             importlib.import_module(_COMPILED)

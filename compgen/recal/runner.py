@@ -13,7 +13,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from compgen.core.threads import one_thread
+from compgen.core.steady import steady
 from compgen.errors import CompgenError
 from compgen.recal import claims, inbox, logs
 from compgen.recal.claims import Claim, ClaimLostError
@@ -113,7 +113,7 @@ def run_machine(job: MachineJob, url: str, stop: Stop = lambda: False, clock: Cl
     try:
         store = open_store(url, clock=clock)
         try:
-            with one_thread():  # the same bytes however many processors there are
+            with steady():
                 outcome = _Pass(store, job, store.add_machine(job.name), stop).run()
         finally:
             store.close()
