@@ -21,7 +21,8 @@ def who_option(*, reason: bool) -> Callable[[Command], Command]:
 
     def decorate(command: Command) -> Command:
         text = "Why; kept in the history." if reason else "Why; kept in the history, due with --override."
-        why = click.option("--reason", required=reason, default=None if reason else "", metavar="TEXT", help=text)
+        given = {"required": True} if reason else {"default": ""}  # a default of None would count as given
+        why = click.option("--reason", metavar="TEXT", help=text, **given)
         who = click.option("--actor", default=None, metavar="NAME", help="Who decides; default: your login name.")
         return who(why(command))
 

@@ -53,14 +53,20 @@ def owner_name() -> str:
     return f"{socket.gethostname()}/{_process_space()}/{pid}/{_start_of(pid)}"
 
 
-def take(store: Store, measurement: MeasurementRecord, owner: str, lease_s: float | None = None) -> Claim | None:
-    """Claim a measurement for ``lease_s`` (None: :data:`LEASE_S`); None if somebody works on it or it is done."""
+def take(
+    store: Store, measurement: MeasurementRecord, owner: str, lease_s: float | None = None, *, again: bool = False
+) -> Claim | None:
+    """Claim a measurement for ``lease_s`` (None: :data:`LEASE_S`); None if somebody works on it or it is done.
+
+    With ``again`` one that is done may be claimed too.
+    """
     key = (owner, store.url, measurement.id)
 
     def action(connection: sa.Connection) -> Claim | None:
         now = store.now(connection)
         last = _last(connection, measurement.id)
-        if _done(connection, measurement.id) or (last is not None and last.owner != owner and _held(last, now)):
+        done = not again and _done(connection, measurement.id)
+        if done or (last is not None and last.owner != owner and _held(last, now)):
             return None
         return _add(connection, measurement.id, 1 if last is None else last.sequence + 1, "take", owner, now, lease_s)
 

@@ -26,6 +26,7 @@ from compgen.identify.covariance import Covariance
 from compgen.model.basis import hat_matrix
 from compgen.model.gauge import LEVER_MM, gauge_directions
 from compgen.recal.change import spread_of
+from compgen.recal.counting import counting
 from compgen.recal.exclude import excluded
 from compgen.recal.records import MachineRecord
 from compgen.recal.store import Store
@@ -106,10 +107,10 @@ def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibrat
 
     Those that a person excluded are left out. InputError if there is none.
     """
-    left_out = excluded(store, machine)
+    left_out, records = excluded(store, machine), counting(store, machine)
     measured = {item.id: item for item in store.measurements(machine)}
     found, ids = [], []
-    for record in store.identifications(machine):
+    for record in records:
         errors = store.errors_of(record)
         covariance = spread_of(errors, store.covariance_of(record))
         if covariance is not None and record.id not in left_out:
@@ -121,7 +122,7 @@ def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibrat
         raise InputError(
             f"the store holds no identified errors of {machine.name!r} with uncertainties; measure it first"
         )
-    newest = next(item for item in reversed(store.identifications(machine)) if item.id == ids[-1])
+    newest = next(item for item in records if item.id == ids[-1])
     return found, ids, store.machine_of(newest)
 
 

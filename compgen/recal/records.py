@@ -62,7 +62,8 @@ class AttemptRecord:
 class IdentificationRecord:
     """Errors of the bare machine from one measurement; contents through ``Store.errors_of`` and ``covariance_of``.
 
-    ``active_table_id`` is the set of tables that was active while the machine was measured and was taken out.
+    ``active_table_id`` is the set of tables that was active while the machine was measured and was taken out;
+    ``revision`` counts how often the measurement was identified.
     """
 
     id: int
@@ -77,6 +78,7 @@ class IdentificationRecord:
     program: str
     at: datetime
     measured_at: datetime
+    revision: int = 1
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,8 @@ class NewResult:
     """What processing a measurement gave, kept in one transaction.
 
     ``hold`` lists why the policy holds the tables back; with ``approve`` they become active at once unless held or not
-    accepted.
+    accepted. ``revision`` counts how often the measurement is identified; from the second time on ``actor`` and
+    ``reason`` say who wanted it and why.
     """
 
     machine_text: bytes
@@ -169,3 +172,6 @@ class NewResult:
     approve: bool
     settings_sha256: str
     seconds: float
+    revision: int = 1
+    actor: str = ""
+    reason: str = ""

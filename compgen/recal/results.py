@@ -52,7 +52,7 @@ def keep_result(
     try:
         table_id = store.write(action)
     except claims.ClaimLostError:
-        found = _own_result(store, claim)
+        found = _own_result(store, claim, new.revision)
         if found is None:
             raise
         table_id = found
@@ -60,27 +60,27 @@ def keep_result(
     return next(table for table in store.tables(machine) if table.id == table_id)
 
 
-def _own_result(store: Store, claim: Claim) -> int | None:
+def _own_result(store: Store, claim: Claim, revision: int) -> int | None:
     """Return the tables that this claim led to: the store may have kept a result and gone away before it said so."""
     kept, tried = schema.identifications, schema.attempts
     query = (
         sa.select(schema.tables.c.id)
         .join(kept, kept.c.id == schema.tables.c.identification_id)
         .join(tried, tried.c.measurement_id == kept.c.measurement_id)
-        .where(kept.c.measurement_id == claim.measurement_id)
+        .where(kept.c.measurement_id == claim.measurement_id, kept.c.revision == revision)
         .where(tried.c.outcome == "done", tried.c.owner == claim.owner)
     )
     return store.read(lambda connection: connection.execute(query).scalar())
 
 
 def _decide(store: Store, connection: sa.Connection, machine: MachineRecord, table_id: int, new: NewResult) -> None:
-    reason = "; ".join(new.hold)
+    reason, actor = "; ".join(filter(None, [new.reason, *new.hold])), new.actor or AUTOMATIC
     if not new.accepted:
-        add_decision(store, connection, machine, "refuse", table_id, AUTOMATIC, reason or "not accepted")
+        add_decision(store, connection, machine, "refuse", table_id, actor, reason or "not accepted")
     elif new.hold:
-        add_decision(store, connection, machine, "hold", table_id, AUTOMATIC, reason)
+        add_decision(store, connection, machine, "hold", table_id, actor, reason)
     else:
-        add_decision(store, connection, machine, "propose", table_id, AUTOMATIC, "")
+        add_decision(store, connection, machine, "propose", table_id, actor, reason)
         if new.approve:
             add_decision(store, connection, machine, "approve", table_id, AUTOMATIC, "approval = auto")
 
@@ -103,6 +103,7 @@ def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, cla
         "summary": clean(new.summary),
         "program": new.program,
         "at": now,
+        "revision": new.revision,
     }
     identification_id = _added(connection, schema.identifications, identification)
     own = schema.tables.c.machine_id == machine.id

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 import sqlalchemy as sa
 
 #: Newest revision of ``migrations/versions``.
-HEAD = "0002"
+HEAD = "0003"
 
 
 class UtcTime(sa.types.TypeDecorator[datetime]):
@@ -150,7 +150,8 @@ identifications = sa.Table(
     _json("summary"),
     _text("program"),
     _at(),
-    sa.UniqueConstraint("measurement_id"),
+    sa.Column("revision", sa.Integer, nullable=False, server_default="1"),  # counts how often it was identified
+    sa.UniqueConstraint("measurement_id", "revision"),
 )
 tables = sa.Table(
     "tables",

@@ -12,6 +12,7 @@ import numpy as np
 
 from compgen.core.error_table import ErrorTable
 from compgen.core.names import error_named
+from compgen.recal.counting import counting
 from compgen.recal.records import (
     AttemptRecord,
     DecisionRecord,
@@ -94,7 +95,7 @@ def history(store: Store, errors_of: ErrorCache, machine: MachineRecord) -> Hist
         store.decisions(machine)[::-1][:LISTED],
         failures[::-1][:20],
         store.events(machine)[::-1][:20],
-        trends(errors_of, store.identifications(machine)[-CHARTED:]),
+        trends(errors_of, counting(store, machine)[-CHARTED:]),
         _temperatures(measurements[-CHARTED:]),
         {table.id: table.version for table in tables},
     )

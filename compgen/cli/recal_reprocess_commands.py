@@ -1,0 +1,56 @@
+"""``compgen recal reprocess``: identify and export again from a stored measurement."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from compgen.cli.common import json_option, print_json, stdout
+from compgen.cli.recal_commands import job_option, recal
+from compgen.cli.recal_decision_commands import actor_of, who_option
+
+if TYPE_CHECKING:
+    from compgen.recal.job import Job
+
+
+@recal.command("reprocess")
+@click.argument("machine")
+@click.option(
+    "--measurement",
+    default=None,
+    metavar="ID",
+    help="Its number in `history --json`, or the beginning of its SHA-256; default: the newest.",
+)
+@job_option
+@who_option(reason=True)
+@json_option
+def reprocess_command(
+    machine: str, measurement: str | None, job: Job, actor: str | None, reason: str, as_json: bool
+) -> int:
+    """Identify and export again from a stored measurement of MACHINE, as job, machine and instrument files say now.
+
+    What was there stays: a new version is proposed and judged as any other. Exit code 1 if it is held back or refused.
+
+    \b
+    Example:
+      compgen recal reprocess mill-1 --reason "pitch of X corrected in the machine file"
+    """
+    from compgen.recal.reprocess import Wish, reprocess
+
+    done = reprocess(job, machine, Wish(measurement, actor_of(actor), reason))
+    table = done.table
+    if as_json:
+        facts = {"id": done.measurement.id, "name": done.measurement.name, "sha256": done.measurement.sha256}
+        made = {"version": table.version, "state": table.state, "reasons": list(table.reasons)}
+        accepted = done.exit_code == 0
+        print_json({"accepted": accepted, "machine": machine, "measurement": facts, "revision": done.revision, **made})
+        return done.exit_code
+    stdout.print(f"{machine}: version {table.version} from {done.measurement.name} is {table.state}", soft_wrap=True)
+    for text in table.reasons:
+        stdout.print(f"  {text}", soft_wrap=True, markup=False)
+    return done.exit_code
+
+
+#: Its commands belong to the group ``recal``.
+COMMANDS: tuple[click.Command, ...] = ()
