@@ -4,7 +4,10 @@ import importlib.util
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from compgen.imports import ImportOptions, import_file
 
 PATH = Path(__file__).resolve().parents[1] / "benchmarks" / "public_iso230.py"
 
@@ -128,3 +131,22 @@ def test_reports_alone_are_evaluated_from_their_rounded_readings(benchmark, fold
     text = capsys.readouterr().out
     assert "1 sets compared" in text
     assert float(lines_of(text, "A")[1]) == pytest.approx(19.0, abs=1e-4)
+
+
+def test_a_gear_ratio_that_was_fitted_before_is_noticed_in_the_readings_alone(tmp_path):
+    """What remains of a least-squares fit of targets by readings has no mean and does not follow the readings."""
+    plain = tmp_path / "plain.dat"
+    plain.write_text(data_text())
+    rows = {"FWD": readings(UP), "BWD": readings(DOWN)}
+    raw = np.array([value for table in rows.values() for row in table for value in row]) * -1.0004 + 17.0
+    target = np.tile(np.repeat(100.0 * np.arange(5), 5), 2)
+    corrected = iter(np.polyval(np.polyfit(raw, target, 1), raw))
+    lines = [
+        f"REF_DATA_{name}[{i},{j}]={next(corrected):.12f}" for name in rows for i in range(1, 6) for j in range(1, 6)
+    ]
+    fitted = tmp_path / "fitted.dat"
+    fitted.write_text(
+        "\n".join([*(line for line in data_text().splitlines() if "REF_DATA" not in line), *lines]) + "\n"
+    )
+    notes = [" ".join(import_file(path, ImportOptions(axis="X")).notes) for path in (plain, fitted)]
+    assert ["gear ratio was fitted" in text for text in notes] == [False, True]

@@ -462,7 +462,7 @@ def test_compensating_positioning_alone_is_not_adverse_in_the_example(gantry):
         (BASE.replace("seed = 7", "seed = 7\nname = '../x'"), r":3: name: a file name of letters"),
         (
             BASE.replace('"laser-tracer"', '"laser-tracker"'),
-            "type: one of 'laser-tracer', 'sixdof', 'axis-laser' is expected",
+            "type: one of 'laser-tracer', 'sixdof', 'axis-laser', 'diagonal-laser' is expected",
         ),
         (BASE.replace('"laser-tracer"\n', '"laser-tracer"\nnoise_nm = 1\n'), "did you mean 'noise_um'"),
         (BASE.replace('"laser-tracer"\n', '"laser-tracer"\nnoise_um = -1\n'), "not negative"),

@@ -91,12 +91,12 @@ def read_side(
     Parameters
     ----------
     machine : the machine.
-    path : the file; its columns tell what it is.
+    path : the file; its columns tell what it is. A folder stands for the errors that were identified there.
     instrument : constants of a six-DOF instrument, for ``*.sixdof.csv``.
     u_um : standard uncertainty of measured deviations, um; default the file's own.
     reader : of measurements; that of :mod:`compgen.imports` takes foreign files as well.
     """
-    source = Path(path)
+    source = _errors_in(Path(path))
     text = read_bytes(source, _LOOKED_AT).decode("utf-8-sig", errors="replace")  # to tell the kind; readers are strict
     header = _header(text)
     if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
@@ -119,6 +119,16 @@ def read_side(
         return Side(machine, source, "tracer lengths", lengths=measurement)
     found = identify_measurement(machine, measurement)
     return Side(machine, source, "six-DOF readings", source=_source_of(machine, found))
+
+
+def _errors_in(path: Path) -> Path:
+    """Return the file of a folder that a command wrote; a file as it is."""
+    if not path.is_dir():
+        return path
+    found = path / "identified.errors.csv"
+    if not found.is_file():
+        raise InputError("is a folder without identified.errors.csv; give the file that is meant", file=path)
+    return found
 
 
 def _header(text: str) -> set[str]:

@@ -100,7 +100,12 @@ def evaluation_options(command: Command) -> Command:
         "--instrument", metavar="FILE", type=kind, help="Constants of a six-DOF instrument (TOML)."
     )
     u_um = click.option("--u-deviation-um", type=float, help="Standard uncertainty of measured deviations, um.")
-    return edition(line(placed(rigid(constants(u_um(command))))))
+    axis = click.option(
+        "--axis",
+        type=click.Choice(AXES, case_sensitive=False),
+        help="Axis of an instrument's file that does not say it.",
+    )
+    return edition(line(placed(rigid(constants(u_um(axis(command)))))))
 
 
 def _alignment(given: str | None, *, rigid: bool) -> Alignment | None:
@@ -125,13 +130,15 @@ def accuracy_command(
     remove_rigid_motion: bool,
     instrument: Path | None,
     u_deviation_um: float | None,
+    axis: str | None,
     budgets: Mapping[str, Budget],
     out: Path,
     as_json: bool,
 ) -> int:
     """Evaluate one measurement or error file by the standards, each figure with its uncertainty.
 
-    FILE: *.axis.csv gives ISO 230-2 and VDI/DGQ 3441; errors, tracer lengths, measured positions and six-DOF readings
+    FILE: *.axis.csv gives ISO 230-2 and VDI/DGQ 3441, *.diagonals.csv ISO 230-6; errors (reversal from NAME.reversal.csv
+    beside them, or a folder that identify or run wrote), tracer lengths, measured positions and six-DOF readings
     (identified first) give ISO 230-1 volumetric ranges, ISO 230-6 diagonals, straightness, squareness. Values in um and
     urad. Writes accuracy.json and accuracy.txt to DIR.
 
@@ -143,7 +150,7 @@ def accuracy_command(
     placed = _alignment(alignment, rigid=remove_rigid_motion)
     with progress(quiet=as_json) as show:
         show("reading and evaluating")
-        side = read_side(machine, file, instrument, u_deviation_um, open_measurement)
+        side = read_side(machine, file, instrument, u_deviation_um, functools.partial(open_measurement, axis=axis))
         if side.runs is not None:
             found = accuracy_of_runs(side.runs, int(edition), budgets)
         elif side.diagonals is not None:
@@ -152,7 +159,7 @@ def accuracy_command(
             known = side.errors()
             assert known.source is not None
             found = accuracy_of_errors(known.source, placed or "axes", line, known.reversal)
-    data = {**found.summary(), "inputs": _inputs(machine, file)}
+    data = {**found.summary(), "inputs": _inputs(machine, side.path)}
     files = {"accuracy.json": _json(data), "accuracy.txt": _plain(accuracy_table(found))}
     write_all(out, files)
     if as_json:
@@ -203,6 +210,7 @@ def compare_command(
     remove_rigid_motion: bool,
     instrument: Path | None,
     u_deviation_um: float | None,
+    axis: str | None,
     budgets: Mapping[str, Budget],
     out: Path,
     as_json: bool,
@@ -210,8 +218,8 @@ def compare_command(
     """Compare before and after: improvement factors with uncertainty, per volume, axis and error.
 
     BEFORE and AFTER are two error files (*.errors.csv, um and urad), or two measurements of a kind: *.axis.csv,
-    *.deviations.csv, *.lengths.csv or *.sixdof.csv (the last two are identified first). Both need the same points.
-    A figure is "better" only where the bands value +/- U (k = 2) separate (then En > 1).
+    *.diagonals.csv, *.deviations.csv, *.lengths.csv or *.sixdof.csv (the last two are identified first). Both need the
+    same points. A figure is "better" only where the bands value +/- U (k = 2) separate (then En > 1).
 
     Exit code 0: better (or smaller, where no uncertainty is known), and a prediction agrees; else 1. Writes compare.json
     and compare.txt to DIR.
@@ -229,11 +237,12 @@ def compare_command(
     options = CompareOptions(align, placed, line, int(edition), budgets)
     with progress(quiet=as_json) as show:
         show("reading BEFORE and AFTER")
-        sides = [read_side(machine, path, instrument, u_deviation_um, open_measurement) for path in (before, after)]
+        reader = functools.partial(open_measurement, axis=axis)
+        sides = [read_side(machine, path, instrument, u_deviation_um, reader) for path in (before, after)]
         show("comparing")
         found = _compared(machine, sides[0], sides[1], options, predicted, tables, controller)
     accepted = _accepted(found, expect)
-    inputs = _inputs(machine, before, after, *tables)
+    inputs = _inputs(machine, *(side.path for side in sides), *tables)
     data = {"accepted": accepted, **found.summary(), "machine": machine.name, "inputs": inputs}
     text = comparison_table(found)
     write_all(out, {"compare.json": _json(data), "compare.txt": _plain(text)})

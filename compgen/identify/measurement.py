@@ -9,6 +9,7 @@ from typing import overload
 
 from compgen.core.axis_runs import AxisRuns, holds_axis_runs, read_axis_runs
 from compgen.core.deviations import Deviations, holds_deviations, read_deviations
+from compgen.core.diagonals import holds_diagonals
 from compgen.core.error_table import ErrorTable
 from compgen.core.lengths import Lengths, read_lengths
 from compgen.core.machine import Machine
@@ -77,6 +78,10 @@ def _beside(other: Lengths | Deviations | AxisRuns, path: str | Path) -> Lengths
 
 
 def _read_others(paths: Sequence[str | Path]) -> Lengths | Deviations | AxisRuns:
+    for path in paths:
+        if holds_diagonals(path):
+            text = "holds measured diagonals, from which no errors are identified; accuracy and compare evaluate them"
+            raise InputError(text, file=path)
     along = [holds_axis_runs(path) for path in paths]
     if any(along) and not all(along):
         message = "holds no axis runs, and another file does; identify them one after the other"

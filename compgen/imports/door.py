@@ -20,7 +20,7 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.identify.axis_runs import positioning_errors
 from compgen.identify.measurement import Measurement, read_measurement
 from compgen.imports.recognise import import_file, own_kind
-from compgen.imports.result import Imported
+from compgen.imports.result import Imported, ImportOptions
 
 Plain = Lengths | Deviations | AxisRuns
 _OWN_READERS: dict[str | None, Callable[[Path], Plain]] = {
@@ -30,13 +30,16 @@ _OWN_READERS: dict[str | None, Callable[[Path], Plain]] = {
 }
 
 
-def open_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement | ErrorTable:
+def open_measurement(
+    paths: Sequence[str | Path], instrument: str | Path | None = None, axis: str | None = None
+) -> Measurement | ErrorTable:
     """Read measurement files, the project's own and foreign ones; a foreign file of errors gives those.
 
     Parameters
     ----------
     paths : files of one kind (lengths, deviations, axis runs); six-DOF readings as ``read_measurement`` takes them.
     instrument : the instrument TOML of six-DOF readings.
+    axis : the axis of foreign files that measure along one and do not say which; files of the project's own do.
 
     Raises
     ------
@@ -44,21 +47,24 @@ def open_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
         for a foreign file that leaves something open (unit, sign, axis, direction), with what ``compgen import`` needs.
     """
     kinds = [own_kind(Path(path)) for path in paths]
+    if axis is not None and any(kinds):
+        known = paths[[kind is not None for kind in kinds].index(True)]
+        raise InputError("says itself what it holds; --axis is for files of instruments", file=known, field="--axis")
     if not paths or all(kinds) or "sixdof" in kinds or instrument is not None:
         return read_measurement(paths, instrument)
     if len(paths) == 1 and kinds == [None] and _is_unknown_csv(Path(paths[0])):
         return read_measurement(paths, instrument)
     if len(paths) == 1:
-        return _measured_or_errors(Path(paths[0]))
-    parts: list[Plain] = [_measured(Path(path), kind) for path, kind in zip(paths, kinds, strict=True)]
+        return _measured_or_errors(Path(paths[0]), axis)
+    parts: list[Plain] = [_measured(Path(path), kind, axis) for path, kind in zip(paths, kinds, strict=True)]
     if len({type(part) for part in parts}) > 1:
         raise InputError("holds another kind of measurement than the first file; identify them one after the other",
                          file=paths[-1])  # fmt: skip
     return _joined(parts)
 
 
-def _measured_or_errors(path: Path) -> Plain | ErrorTable:
-    data = _settled(path).data
+def _measured_or_errors(path: Path, axis: str | None) -> Plain | ErrorTable:
+    data = _settled(path, axis).data
     if isinstance(data, Lengths | Deviations | AxisRuns | ErrorTable):
         return data
     raise InputError("holds a capture over time, from which no errors are identified", file=path)
@@ -70,18 +76,18 @@ def _is_unknown_csv(path: Path) -> bool:
     return path.name.lower().endswith(own)
 
 
-def _measured(path: Path, kind: str | None) -> Plain:
+def _measured(path: Path, kind: str | None, axis: str | None) -> Plain:
     if kind in _OWN_READERS:
         return _OWN_READERS[kind](path)
-    item = _settled(path)
+    item = _settled(path, axis)
     if not isinstance(item.data, Lengths | Deviations | AxisRuns):
         hint = "; errors go to fit, export and verify" if isinstance(item.data, ErrorTable) else ""
         raise InputError(f"holds {item.kind}, no measurement that errors are identified from{hint}", file=path)
     return item.data
 
 
-def _settled(path: Path) -> Imported:
-    item = import_file(path)
+def _settled(path: Path, axis: str | None = None) -> Imported:
+    item = import_file(path, ImportOptions(axis=axis))
     item.check_settled()
     facts = "; ".join([f"{item.format}, {item.kind}", *item.notes])
     warnings.warn(f"{path} was taken as: {facts} ('compgen import' shows all)", CompgenWarning, stacklevel=3)

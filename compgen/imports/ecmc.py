@@ -17,6 +17,8 @@ from compgen.imports.one_axis import OneAxis
 from compgen.imports.source import Text, parse_number, read_source, shown
 
 MOST_BYTES = 64_000_000
+#: Correlation below which readings are taken to have been fitted; by chance it is a few percent.
+FITTED = 1e-4
 MM_PER = {"mm": 1.0, "um": 1e-3, "m": 1e3, "nm": 1e-6}
 _ASSIGNMENT = re.compile(r"\s{0,20}([A-Za-z_][A-Za-z0-9_]{0,40})(?:\[\s*(\d{1,6})\s*(?:,\s*(\d{1,6})\s*)?\])?\s*=(.*)")
 _ARRAYS = {"TGT_DATA": 1, "REF_DATA_FWD": 2, "REF_DATA_BWD": 2}
@@ -31,6 +33,18 @@ class Ecmc:
     keys: Mapping[str, str]
     slope: float
     offset_mm: float
+
+    @property
+    def fitted(self) -> bool:
+        """Whether a line from readings to targets was fitted to these very readings and taken out of them.
+
+        Then the deviations have no mean and do not follow the readings (the normal equations of that fit).
+        """
+        deviation, actual = self.runs.value, self.runs.position_mm + self.runs.value
+        sizes = np.linalg.norm(deviation), np.linalg.norm(actual - actual.mean())
+        along = abs(float(deviation @ (actual - actual.mean())))
+        level = abs(float(deviation.sum())) / np.sqrt(len(deviation))
+        return bool(sizes[0] > 0.0 and along <= FITTED * sizes[0] * sizes[1] and level <= FITTED * sizes[0])
 
 
 @dataclass(frozen=True)

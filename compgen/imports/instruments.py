@@ -169,7 +169,9 @@ def _facts(runs: OneAxis, *, angular: bool) -> dict[str, object]:
 def import_ecmc(path: Path, options: ImportOptions) -> Imported:
     """Import an ISO 230-2 input file of the ecmc tools; it does not say which axis it is."""
     found = read_ecmc(path)
-    doubts, notes = [], ["deviations are reading minus target; nothing was taken out of them"]
+    doubts, notes = [], ["deviations are reading minus target; nothing is taken out of them here"]
+    if found.fitted:
+        notes.append("a gear ratio was fitted to these readings before: the scale error of the axis is not in them")
     axis = options.axis or _axis_of_name(path, notes)
     if axis is None and options.error is None:
         doubts.append("the file does not say X, Y or Z; give --axis")

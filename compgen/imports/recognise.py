@@ -24,6 +24,7 @@ from compgen.imports.tables import import_table, merged_sheets
 OWN = {
     "lengths": {"station", "point", "x_mm", "y_mm", "z_mm", "length_mm"},
     "axis": {"axis", "position_mm", "direction", "run", "deviation_um"},
+    "diagonals": {"diagonal", "x_mm", "y_mm", "z_mm", "deviation_um"},
     "errors": {"error", "position_mm", "value"},
     "sixdof": {"axis", "position_mm", "displacement_mm"},
     "deviations": {"x_mm", "y_mm", "z_mm"},

@@ -35,7 +35,7 @@ def accuracy_table(found: Accuracy) -> Group:
             continue
         table = Table("figure", "value +/- U (k = 2)", "unit", title=name, title_justify="left", box=box.SIMPLE)
         for key, item in group.items():
-            table.add_row(key, _with_u(item), item.unit)
+            table.add_row(key, _with_u(item) + (", U not known" if math.isnan(item.u) else ""), item.unit)
         parts.append(table)
     return Group(*parts, Text("\n".join(found.statements)))
 
