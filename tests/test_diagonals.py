@@ -492,3 +492,60 @@ def test_the_command_says_where_the_reversal_comes_from_or_that_it_is_not_known(
     data = json.loads((out / "accuracy.json").read_text())
     assert data["figures"]["reversal"]["Bd"]["value"] == pytest.approx(REVERSAL_UM, abs=1e-5)
     assert any("reversal: m.reversal.csv" in text for text in data["statements"])
+
+
+def test_a_folder_of_identified_errors_stands_for_its_errors_and_their_reversal(machine, tmp_path):
+    folder, out = tmp_path / "identified", tmp_path / "out"
+    folder.mkdir()
+    words = ["accuracy", str(machine.source), str(folder), "--out", str(out)]
+    assert run_command(cli, words) == 2
+    (folder / "identified.errors.csv").write_text(format_errors(box_source(machine).errors))
+    (folder / "identified.reversal.csv").write_text(format_reversal(constant_reversal()))
+    assert run_command(cli, words) == 0
+    data = json.loads((out / "accuracy.json").read_text())
+    assert {"B_X", "E_Z", "Bd", "Ed"} <= data["figures"]["reversal"].keys()
+    assert "identified.errors.csv" in [item["name"] for item in data["inputs"]]
+
+
+def test_the_reversal_before_and_after_is_compared_where_both_know_it(machine, tmp_path):
+    paths = []
+    for name, factor in (("before", 1.0), ("after", 0.1)):
+        path = tmp_path / f"{name}.errors.csv"
+        path.write_text(format_errors(box_source(machine).errors))
+        curves = {k: Curve(c.position_mm, factor * c.value, c.u) for k, c in constant_reversal().curves.items()}
+        (tmp_path / f"{name}.reversal.csv").write_text(format_reversal(ReversalCurves(curves)))
+        paths.append(path)
+    found = compared(machine, *paths)
+    assert found.groups["reversal"]["B_X"].factor == pytest.approx(10.0, rel=1e-9)
+    assert found.groups["reversal"]["Bd"].verdict == "better"
+    (tmp_path / "after.reversal.csv").unlink()
+    found = compared(machine, *paths)
+    assert "reversal" not in found.groups
+    assert any(text.startswith("after.errors.csv: reversal: not known") for text in found.statements)
+
+
+def test_no_other_command_identifies_from_diagonals(machine, tmp_path, capsys):
+    path = box_file(tmp_path / "b.diagonals.csv")
+    assert run_command(cli, ["identify", str(machine.source), str(path), "--out", str(tmp_path / "out")]) == 2
+    assert "holds measured diagonals" in " ".join(capsys.readouterr().err.split())
+    assert run_command(cli, ["import", str(path)]) == 2
+    assert "compgen's own format (diagonals)" in " ".join(capsys.readouterr().err.split())
+
+
+def test_axis_names_the_axis_of_an_instrument_file_and_no_other(machine, tmp_path):
+    names = product(("FWD", "BWD"), (1, 2, 3), (1, 2))
+    rows = [f"REF_DATA_{way}[{i},{j}]={100 * (i - 1) + 0.001 * i * j}" for way, i, j in names]
+    path = tmp_path / "run7.dat"
+    path.write_text("\n".join([*(f"TGT_DATA[{i}]={100 * (i - 1)}" for i in (1, 2, 3)), *rows]) + "\n")
+    words = ["accuracy", str(machine.source), str(path), "--out", str(tmp_path / "out")]
+    assert run_command(cli, words) == 2
+    assert run_command(cli, [*words, "--axis", "y"]) == 0
+    figures = json.loads((tmp_path / "out" / "accuracy.json").read_text())["figures"]
+    assert list(figures) == ["Y"]
+    assert figures["Y"]["M"]["value"] == pytest.approx(3.0, abs=EXACT)  # mean of 1 and 2 um per target number
+    own = golden_file(tmp_path / "g.diagonals.csv")
+    known = tmp_path / "x.axis.csv"
+    known.write_text("axis,position_mm,direction,run,deviation_um\nX,0,1,1,1\nX,100,1,1,2\n")
+    for file in (known, own):
+        wrong = ["accuracy", str(machine.source), str(file), "--axis", "Y", "--out", str(tmp_path / "out")]
+        assert run_command(cli, wrong) == 2

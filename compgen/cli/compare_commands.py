@@ -21,14 +21,14 @@ from compgen.accuracy.field import Alignment
 from compgen.accuracy.iso230_2 import EDITIONS, LATEST
 from compgen.accuracy.match import compare_prediction, compare_sides, with_prediction
 from compgen.accuracy.pairing import ALIGN
-from compgen.accuracy.sides import Side, read_side
+from compgen.accuracy.sides import Reader, Side, read_side
 from compgen.accuracy.straightness import LINES
 from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.errors import InputError
-from compgen.imports import open_measurement
+from compgen.imports import open_measurement, own_kind
 from compgen.pipeline import provenance_of, write_all
 from compgen.report.accuracy_text import accuracy_table, comparison_table
 from compgen.verify import read_tables
@@ -108,6 +108,14 @@ def evaluation_options(command: Command) -> Command:
     return edition(line(placed(rigid(constants(u_um(axis(command)))))))
 
 
+def _reader(axis: str | None, *paths: Path) -> Reader:
+    """Reader of measurements; InputError for an axis beside files that say themselves what they hold."""
+    for path in paths if axis is not None else ():
+        if path.is_dir() or own_kind(path) is not None:
+            raise InputError("says itself what it holds; --axis is for files of instruments", file=path, field="--axis")
+    return functools.partial(open_measurement, axis=axis)
+
+
 def _alignment(given: str | None, *, rigid: bool) -> Alignment | None:
     if rigid and given is not None:
         raise InputError(f"--alignment {given} and --remove-rigid-motion exclude each other; give one of them")
@@ -150,7 +158,7 @@ def accuracy_command(
     placed = _alignment(alignment, rigid=remove_rigid_motion)
     with progress(quiet=as_json) as show:
         show("reading and evaluating")
-        side = read_side(machine, file, instrument, u_deviation_um, functools.partial(open_measurement, axis=axis))
+        side = read_side(machine, file, instrument, u_deviation_um, _reader(axis, file))
         if side.runs is not None:
             found = accuracy_of_runs(side.runs, int(edition), budgets)
         elif side.diagonals is not None:
@@ -237,7 +245,7 @@ def compare_command(
     options = CompareOptions(align, placed, line, int(edition), budgets)
     with progress(quiet=as_json) as show:
         show("reading BEFORE and AFTER")
-        reader = functools.partial(open_measurement, axis=axis)
+        reader = _reader(axis, before, after)
         sides = [read_side(machine, path, instrument, u_deviation_um, reader) for path in (before, after)]
         show("comparing")
         found = _compared(machine, sides[0], sides[1], options, predicted, tables, controller)
