@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 def show_drift(store: Store, job: Job, machine: str | None, report: Path | None, *, as_json: bool) -> int:
     """Print the drift of one machine and write its page; the exit code is 0."""
     from compgen.recal.drift import DriftSettings, drift_of_store
+    from compgen.recal.drift_words import moment_of
 
     if machine is None:
         raise InputError("--drift and --report are for one machine; name it")
@@ -29,7 +30,10 @@ def show_drift(store: Store, job: Job, machine: str | None, report: Path | None,
     if as_json:
         print_json({"accepted": True, "paths": paths, "drift": found.summary()})
         return 0
-    stdout.print(f"{machine}: {len(found.times)} calibrations, {found.times[0]} to {found.times[-1]}", soft_wrap=True)
+    stdout.print(
+        f"{machine}: {len(found.times)} calibrations, {moment_of(found.times[0])} to {moment_of(found.times[-1])}",
+        soft_wrap=True,
+    )
     for title, change, errors in (
         ("last", found.volume_since_last, found.since_last),
         ("first", found.volume_since_first, found.since_first),

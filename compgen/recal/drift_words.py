@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from scipy.stats import norm
@@ -20,6 +21,11 @@ def interval_of(value: float, u: float, confidence: float) -> tuple[float, float
     """Return the ends of the interval that holds the truth with this confidence."""
     reach = float(norm.ppf(0.5 + 0.5 * confidence)) * u
     return value - reach, value + reach
+
+
+def moment_of(iso: str) -> str:
+    """Return a time as people read it, e.g. ``2026-07-05 06:00 UTC``."""
+    return f"{datetime.fromisoformat(iso).astimezone(UTC):%Y-%m-%d %H:%M} UTC"
 
 
 def sentences(drift: Drift) -> list[str]:
@@ -58,7 +64,8 @@ def _steps(drift: Drift) -> list[str]:
     told = []
     for after, steps in drift.gaps.items():
         listed = "; ".join(f"{f.name} {_with_interval(drift, f, step.size, step.u)}" for f, step in steps)
-        told.append(f"step between {drift.times[after - 1]} and {drift.times[after]}: {listed}")
+        before, since = (moment_of(drift.times[k]) for k in (after - 1, after))
+        told.append(f"step between {before} and {since}: {listed}")
     return told
 
 

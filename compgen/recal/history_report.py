@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.files import OutputFolder
 from compgen.core.names import error_named
 from compgen.recal.drift import Drift, FigureDrift
+from compgen.recal.drift_words import following_temperature, moment_of
 from compgen.report.html.curves import COVERAGE, LABEL, Picture, describe_error
 from compgen.report.html.page import number
 from compgen.report.html.svg import colour, drawing, new_figure, to_svg
@@ -35,13 +36,19 @@ def history_page(drift: Drift) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["number"] = number
+    environment.filters |= {"number": number, "probability": probability, "moment": moment_of, "zip": zip}
     assert environment.loader is not None
     style = environment.loader.get_source(environment, "style.css")[0]
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
     return environment.get_template("history.html.j2").render(
         drift=drift.summary(), pictures=draw_history(drift), style=Markup(style), policy=policy
     )
+
+
+def probability(value: float, level: float) -> Markup:
+    """An error probability; bold below ``level``."""
+    text = "&lt; 0.0001" if value < 1e-4 else f"{value:.4f}" if value < 0.1 else f"{value:.2f}"
+    return Markup(f"<strong>{text}</strong>" if value < level else text)
 
 
 def write_history_report(path: Path, drift: Drift) -> Path:
@@ -57,7 +64,8 @@ def draw_history(drift: Drift) -> list[Picture]:
         pictures = [_volume(drift)]
         if drift.temperature_c is not None:
             pictures.append(_temperature(drift))
-        return pictures + [_figure(drift, item) for item in sorted(drift.figures, key=_importance)]
+        warm = following_temperature(drift)
+        return pictures + [_figure(item, warm) for item in sorted(drift.figures, key=_importance)]
 
 
 def _importance(item: FigureDrift) -> tuple[bool, float]:
@@ -97,13 +105,15 @@ def _temperature(drift: Drift) -> Picture:
     return Picture("temperature", "Temperature", to_svg(figure, "temperature", f"Temperature: {note}"), {}, note)
 
 
-def _figure(drift: Drift, item: FigureDrift) -> Picture:
+def _figure(item: FigureDrift, warm: Collection[str]) -> Picture:
     error = error_named(item.figure.error)
     scale, series = 1.0 / error.si_per_unit, item.series
     figure, axes = _axes(LABEL[error.unit])
     style = {"color": colour("line"), "marker": "o", "markersize": 3, "linestyle": "none", "capsize": 2}
     axes.errorbar(series.days, series.value * scale, yerr=COVERAGE * series.u * scale, **style)  # type: ignore[arg-type]
     if item.trend is not None:
+        if item.figure.name in warm:
+            _at_mean_temperature(axes, item, scale)
         _line(axes, item, scale)
     if item.tolerance is not None:
         for sign in (-1.0, 1.0):
@@ -112,6 +122,14 @@ def _figure(drift: Drift, item: FigureDrift) -> Picture:
     note = describe_error(item.figure.error)
     title = f"{item.figure.name}: {note}, {LABEL[error.unit]} over days"
     return Picture(key, item.figure.name, to_svg(figure, key, title), {}, note)
+
+
+def _at_mean_temperature(axes: Axes, item: FigureDrift, scale: float) -> None:
+    """Draw the points without the part of the temperature."""
+    assert item.trend is not None and item.trend.per_kelvin is not None and item.series.temperature_k is not None
+    value = item.series.value - item.trend.per_kelvin[0] * item.series.temperature_k
+    style = {"markerfacecolor": "none", "markeredgecolor": colour("fit"), "markersize": 4, "linestyle": "none"}
+    axes.plot(item.series.days, value * scale, marker="o", **style)  # type: ignore[arg-type]
 
 
 def _line(axes: Axes, item: FigureDrift, scale: float) -> None:
@@ -126,13 +144,18 @@ def _line(axes: Axes, item: FigureDrift, scale: float) -> None:
         axes.axvline(middle, color=colour("before"), linewidth=0.9, linestyle=(0, (1, 2)))
     axes.plot(days, level * scale, color=colour("fit"), linestyle=(0, (4, 2)))
     if item.forecast is not None:
-        _exit(axes, item, days)
+        reach = _exit(axes, item, days)
+        if reach > 0.0:
+            ahead = np.array([0.0, reach])
+            axes.plot(days[-1] + ahead, (state + slope * ahead) * scale, color=colour("fit"), linestyle=(0, (1, 2)))
 
 
-def _exit(axes: Axes, item: FigureDrift, days: Sequence[float] | FloatArray) -> None:
-    """Shade the interval of the forecast as far as the picture should reach."""
+def _exit(axes: Axes, item: FigureDrift, days: Sequence[float] | FloatArray) -> float:
+    """Shade the interval of the forecast as far as the picture should reach; return how many days that is ahead."""
     assert item.forecast is not None
     low, high = item.forecast.low_days, item.forecast.high_days
     reach = max(float(days[-1] - days[0]), 1.0)
-    if low < reach:
-        axes.axvspan(days[-1] + low, days[-1] + min(high, reach), color=colour("band"), linewidth=0)
+    if low >= reach:
+        return 0.0
+    axes.axvspan(days[-1] + low, days[-1] + min(high, reach), color=colour("band"), linewidth=0)
+    return min(high, reach)
