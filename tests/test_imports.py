@@ -449,7 +449,7 @@ def test_files_of_500_megabytes_are_refused_within_a_second(tmp_path):
         stream.truncate(500_000_000)
     started = time.monotonic()
     for call in (import_file, open_errors, lambda p: open_measurement([p])):
-        with pytest.raises(InputError, match="500 MB; at most 256 MB"):
+        with pytest.raises(InputError, match="500 MB; at most 128 MB"):
             call(path)
     assert time.monotonic() - started < 1.0
 

@@ -11,6 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from functools import lru_cache
 from typing import Literal
 
 from compgen.errors import InputError
@@ -60,12 +61,16 @@ _MONTH_NAMES = frozenset(
 
 @dataclass(frozen=True)
 class Written:
-    """One date as it stands: what each possible order makes of it (at midnight), seconds of the day, and the zone."""
+    """One date as it stands: what each possible order makes of it (at midnight), seconds of the day, and the zone.
+
+    ``day_text`` is what is left of the text without the time of the day.
+    """
 
     text: str
     days: Mapping[Order, datetime]
     clock_s: float | None
     zone: str
+    day_text: str = ""
 
     @property
     def settled(self) -> bool:
@@ -90,10 +95,15 @@ def read_date(text: str) -> Written | None:
     rest = content if found is None else f"{content[: found.start()]} {content[found.end() :]}"
     if zone:
         rest = rest[: len(rest) - len(zone.group(0))]
-    days = _numeric_days(rest) or _named_day(rest)
+    days = _days(rest)
     if not days and (clock_s is None or re.search(r"\d", rest)):
         return None
-    return Written(content, days, clock_s, zone.group(1) if zone else "")
+    return Written(content, days, clock_s, zone.group(1) if zone else "", rest)
+
+
+@lru_cache(maxsize=4096)
+def _days(text: str) -> Mapping[Order, datetime]:
+    return _numeric_days(text) or _named_day(text)
 
 
 def _seconds(found: re.Match[str]) -> float | None:
@@ -163,6 +173,7 @@ def order_of(dates: Sequence[Written], chosen: Order | None = None) -> Order | N
     InputError
         for dates of which no order, or not the chosen one, is possible.
     """
+    dates = list({date.day_text or date.text: date for date in dates}.values())
     open_ones = [date for date in dates if not date.settled]
     possible = [order for order in ORDERS if all(order in date.days for date in open_ones + _telling(dates))]
     if chosen is not None and open_ones and chosen not in possible:

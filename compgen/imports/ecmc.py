@@ -16,7 +16,7 @@ import numpy as np
 from compgen.imports.one_axis import OneAxis
 from compgen.imports.source import Text, parse_number, read_source, shown
 
-MOST_BYTES = 64_000_000
+MOST_BYTES = 16_000_000
 #: Correlation below which readings are taken to have been fitted; by chance it is a few percent.
 FITTED = 1e-4
 MM_PER = {"mm": 1.0, "um": 1e-3, "m": 1e3, "nm": 1e-6}

@@ -12,7 +12,10 @@ from pathlib import Path
 from compgen.errors import InputError
 from compgen.imports.source import LARGEST, Text, parse_number, shown
 
-MOST_ROWS, MOST_COLUMNS, MOST_CELL = 2_000_000, 500, 2_000
+#: The rows of the largest sheet there is.
+MOST_ROWS, MOST_COLUMNS, MOST_CELL = 1_048_576, 500, 2_000
+#: Cells of a table; each takes some sixty bytes of memory.
+MOST_CELLS = 10_000_000
 #: So many lines are looked at for the separator, and for the header.
 _SAMPLE_LINES, _HEADER_LINES = 200, 200
 #: Letters of words that Python takes for numbers (inf, nan), and a comma: a column without them is converted at once.
@@ -75,15 +78,19 @@ class Table:
 
 def grid_of_text(source: Text) -> Grid:
     """Split a text file into cells: finds the separator, and decimal commas."""
-    content = [(k, line) for k, line in enumerate(source.text.split("\n"), start=1) if line.strip()]
-    if len(content) > MOST_ROWS:
-        raise source.fail(f"has {len(content)} lines; at most {MOST_ROWS} are read")
-    separator = _separator([line for _, line in content[:_SAMPLE_LINES]])
+    count = source.text.count("\n")
+    if count > MOST_ROWS:
+        raise source.fail(f"has {count} lines; at most {MOST_ROWS} are read: thin it out or split it")
+    content, numbers = _filled_lines(source.text)
+    separator = _separator(content[:_SAMPLE_LINES])
+    cells = len(content) * (1 + max((line.count(separator or " ") for line in content[:_SAMPLE_LINES]), default=0))
+    if cells > MOST_CELLS:
+        raise source.fail(f"has about {cells} cells; at most {MOST_CELLS} are read: leave out columns or rows")
     if separator is None:
-        rows = [line.split() for _, line in content]
+        rows = [line.split() for line in content]
     else:
         try:
-            rows = [[cell.strip() for cell in row] for row in csv.reader((c for _, c in content), delimiter=separator)]
+            rows = [[cell.strip() for cell in row] for row in csv.reader(content, delimiter=separator)]
         except csv.Error as error:
             raise source.fail(f"is not readable as a table: {error}") from error
         if len(rows) != len(content):
@@ -92,12 +99,17 @@ def grid_of_text(source: Text) -> Grid:
     notes = [f"columns are separated by {names[separator]}"]
     if source.encoding not in ("utf-8", "utf-8-sig"):
         notes.append(f"is not UTF-8; it was read as {source.encoding}")
-    grid = Grid(source.path, rows, [k for k, _ in content], tuple(notes))
+    grid = Grid(source.path, rows, numbers, tuple(notes))
     if not source.ended and len(rows) > 2 and len(rows[-1]) < len(rows[-2]):
-        raise source.fail(
-            "the last line has no line end and fewer cells than the one before: it was cut", content[-1][0]
-        )
+        raise source.fail("the last line has no line end and fewer cells than the one before: it was cut", numbers[-1])
     return grid
+
+
+def _filled_lines(text: str) -> tuple[list[str], list[int]]:
+    """Return the lines that are not blank, and their numbers from 1."""
+    lines = text.split("\n")
+    numbers = [k for k, line in enumerate(lines, start=1) if line and not line.isspace()]
+    return ([lines[k - 1] for k in numbers] if len(numbers) < len(lines) else lines), numbers
 
 
 def _separator(lines: Sequence[str]) -> str | None:
@@ -217,7 +229,7 @@ def _table(grid: Grid, k: int, metadata: dict[str, str]) -> Table:
         raise grid.fail(f"the header names {shown(doubled)} twice; give each column a name of its own", grid.lines[k])
     rows, lines = [], []
     for row, line in zip(grid.rows[first:], grid.lines[first:], strict=True):
-        if not _filled(row) or row[0].startswith("#"):
+        if not any(row) or row[0].startswith("#"):
             continue
         rows.append(_fitted(grid, names, row, line))
         lines.append(line)
@@ -230,6 +242,10 @@ def _table(grid: Grid, k: int, metadata: dict[str, str]) -> Table:
 
 
 def _fitted(grid: Grid, names: Sequence[str], row: Sequence[str], line: int) -> list[str]:
+    if len(row) == len(names):
+        if max(map(len, row)) > MOST_CELL:
+            raise grid.fail(f"a cell has more than {MOST_CELL} characters", line)
+        return row  # type: ignore[return-value]
     if len(_filled(row[len(names) :])):
         hint = ""
         if len(row) >= 2 * len(names) - 1:

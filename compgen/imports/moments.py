@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 
@@ -34,7 +33,6 @@ _DATE_KEYS = (
     "created",
 )
 _CLOCK_KEYS = ("time", "zeit", "uhrzeit", "messzeit")
-_read = lru_cache(maxsize=65536)(read_date)
 
 
 def times_of(findings: Findings, time: Column | None, date: Column | None) -> tuple[FloatArray | None, str | None]:
@@ -57,7 +55,7 @@ def times_of(findings: Findings, time: Column | None, date: Column | None) -> tu
     numbers = [parse_number(cell) for cell in cells]
     if all(value is not None for value in numbers):
         return _of_numbers(findings, column, np.array(numbers, dtype=np.float64), dated=time is None)
-    written = [_read(cell) for cell in cells]
+    written = [read_date(cell) for cell in cells]
     wrong = next((k for k, item in enumerate(written) if item is None), None)
     if wrong is not None:
         line = findings.table.lines[wrong]

@@ -17,7 +17,7 @@ from compgen.imports.instruments import import_capture, import_ecmc, import_exch
 from compgen.imports.renishaw import REFUSED, is_renishaw_text
 from compgen.imports.result import Imported, ImportOptions
 from compgen.imports.sheet import chosen_sheet, read_sheets
-from compgen.imports.source import MOST_BYTES, check_size, decode_head, read_head, read_source, shown
+from compgen.imports.source import MOST_BYTES, MOST_OWN_BYTES, check_size, decode_head, read_head, read_source, shown
 from compgen.imports.tables import import_table, merged_sheets
 
 #: Columns that make a file one of the project's own.
@@ -66,6 +66,7 @@ def own_kind(path: Path) -> str | None:
         return "sixdof"
     for kind, needed in OWN.items():
         if needed <= names and (kind != "deviations" or names & _DEVIATIONS):
+            check_size(path, MOST_OWN_BYTES)
             return kind
     return None
 

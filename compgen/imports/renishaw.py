@@ -26,7 +26,8 @@ REFUSED = {
     ".rtp": "squareness",
     ".rtr": "a rotary axis",
 }
-MOST_BYTES = 64_000_000
+#: Fifty runs of 10000 targets.
+MOST_BYTES = 16_000_000
 MOST_TARGETS, MOST_RUNS = 100_000, 1_000
 _SECTION = re.compile(r"\s{0,20}([A-Za-z][A-Za-z0-9 _\-]{0,40})::\s*")
 _KEY = re.compile(r"\s{0,40}([A-Za-z][^:]{0,60}?)\s{0,40}:(.*)")

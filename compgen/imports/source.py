@@ -13,7 +13,9 @@ from compgen.errors import InputError
 
 MEGABYTE = 1_000_000
 #: Larger files are no measurement in text form: a million tracer lengths have 80 MB.
-MOST_BYTES = 256 * MEGABYTE
+MOST_BYTES = 128 * MEGABYTE
+#: The project's own files are read faster, but they too fit into the memory of a workstation.
+MOST_OWN_BYTES = 256 * MEGABYTE
 #: Larger numbers are none (a number of 400 digits becomes infinite).
 LARGEST = 1e300
 #: So much of a file says what it is.
@@ -137,6 +139,12 @@ def parse_number(word: str) -> float | None:
     >>> parse_number("-.0033"), parse_number("1,25"), parse_number("1_0"), parse_number("inf")
     (-0.0033, 1.25, None, None)
     """
+    try:
+        plain = float(word)
+    except ValueError:
+        plain = LARGEST
+    if abs(plain) < LARGEST and word.isascii() and "_" not in word:
+        return plain
     text = word.strip().replace("\u2212", "-")
     if text.count(",") == 1 and "." not in text:
         text = text.replace(",", ".")
