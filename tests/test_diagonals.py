@@ -549,3 +549,24 @@ def test_axis_names_the_axis_of_an_instrument_file_and_no_other(machine, tmp_pat
     for file in (known, own):
         wrong = ["accuracy", str(machine.source), str(file), "--axis", "Y", "--out", str(tmp_path / "out")]
         assert run_command(cli, wrong) == 2
+
+
+def test_a_reversal_that_is_not_worth_a_table_is_taken_from_the_summary_of_the_identification(machine, tmp_path):
+    errors = tmp_path / "identified.errors.csv"
+    errors.write_text(format_errors(box_source(machine).errors))
+    summary = {"reversal": {"axes": {"X": {"vector_um": [-0.04, 0.0, 0.01], "u_um": [0.03, 0.02, 0.02]}}}}
+    (tmp_path / "identify.json").write_text(json.dumps(summary))
+    side = read_side(machine, errors)
+    found = accuracy_of_errors(side.source, reversal=side.reversal).groups["reversal"]
+    assert found["B_mean_X"].value == pytest.approx(-0.04, abs=EXACT)
+    assert found["B_X"].u == pytest.approx(0.03, abs=EXACT)
+    assert found["B PPP"].value == pytest.approx(abs(-0.04 * 300.0 + 0.01 * 1200.0) / LENGTH_MM, abs=EXACT)
+    assert found["B NPP"].value == pytest.approx((0.04 * 300.0 + 0.01 * 1200.0) / LENGTH_MM, abs=EXACT)
+    (tmp_path / "identified.reversal.csv").write_text(format_reversal(constant_reversal()))
+    side = read_side(machine, errors)
+    found = accuracy_of_errors(side.source, reversal=side.reversal).groups["reversal"]
+    assert found["B_mean_X"].value == pytest.approx(2.0 * BACKLASH_UM["X"], abs=1e-6)
+    for text in ("[1]", "{", '{"reversal": {"axes": {"Q": 1}}}', '{"reversal": null}'):
+        (tmp_path / "identify.json").write_text(text)
+        (tmp_path / "identified.reversal.csv").unlink(missing_ok=True)
+        assert read_side(machine, errors).reversal.curves is None

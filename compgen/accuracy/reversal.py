@@ -7,9 +7,11 @@ axis that moves adds its own reversal: B(p) = u . sum_k s_k B_k(p).
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -20,8 +22,9 @@ from compgen.accuracy.source import ErrorSource
 from compgen.core.csvio import FloatArray
 from compgen.core.diagonals import BODY_DIAGONALS
 from compgen.core.error_table import Curve
+from compgen.core.files import read_text
 from compgen.core.names import AXES, MM_PER_UM
-from compgen.core.reversal import ReversalCurves
+from compgen.core.reversal import ReversalCurves, read_reversal
 from compgen.identify import Identification
 from compgen.model.basis import hat_matrix
 
@@ -50,6 +53,41 @@ def identified_reversal(found: Identification) -> KnownReversal:
         for component, (value, u) in enumerate(zip(axis.vector_mm, axis.u_mm, strict=True)):
             curves[AXES.index(name), component] = Curve(np.zeros(1), np.array([value]), np.array([u]))
     return KnownReversal(ReversalCurves(curves), "reversal: identified, one mean for each axis")
+
+
+def reversal_beside(path: Path) -> KnownReversal:
+    """Return the reversal that belongs to an errors file.
+
+    It stands in ``NAME.reversal.csv``, of fitted errors in the identified one; what is not worth a table there, in
+    ``identify.json`` beside it.
+    """
+    stem = path.name.removesuffix(".errors.csv")
+    names = [f"{stem}.reversal.csv", *(["identified.reversal.csv"] if stem == "fitted" else [])]
+    named = next((path.parent / name for name in names if (path.parent / name).is_file()), None)
+    summed = _summed_up(path.parent / "identify.json") if stem in ("identified", "fitted") else {}
+    if named is None and not summed:
+        return KnownReversal(
+            None, f"reversal: not known: errors are means of both directions, {names[-1]} is not there"
+        )
+    curves = {**summed, **({} if named is None else read_reversal(named).curves)}
+    where = " and ".join([*([named.name] if named else []), *(["identify.json"] if summed else [])])
+    return KnownReversal(ReversalCurves(curves), f"reversal: {where}; a direction that is not there counts as zero")
+
+
+def _summed_up(path: Path) -> dict[tuple[int, int], Curve]:
+    """Mean reversals of ``identify.json`` with their uncertainties; none if it holds none or is another file."""
+    if not path.is_file():
+        return {}
+    curves = {}
+    try:
+        axes = (json.loads(read_text(path)).get("reversal") or {}).get("axes", {})
+        for name, item in axes.items():
+            for component, (value, u) in enumerate(zip(item["vector_um"], item["u_um"], strict=True)):
+                parts = np.array([float(value)]) * MM_PER_UM, np.array([float(u)]) * MM_PER_UM
+                curves[AXES.index(name), component] = Curve(np.zeros(1), *parts)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return {}
+    return curves
 
 
 def reversal_figures(source: ErrorSource, reversal: ReversalCurves) -> dict[str, Figure]:

@@ -12,7 +12,7 @@ import numpy as np
 from compgen.accuracy.diagonals import DiagonalRun, diagonal_runs
 from compgen.accuracy.field import Field
 from compgen.accuracy.pairing import MeasuredField, measured_field
-from compgen.accuracy.reversal import KnownReversal, identified_reversal
+from compgen.accuracy.reversal import KnownReversal, identified_reversal, reversal_beside
 from compgen.accuracy.runs import RunStatistics, axis_statistics
 from compgen.accuracy.source import ErrorSource, error_source
 from compgen.controllers.isg.error_files import read_error_file
@@ -26,7 +26,6 @@ from compgen.core.files import read_bytes, sha256_of
 from compgen.core.lengths import POSITION_COLUMNS, Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
-from compgen.core.reversal import read_reversal
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import Identification, IdentifyOptions, identify_measurement, joint_covariance, read_measurement
 from compgen.identify.covariance import Covariance, read_covariance
@@ -102,7 +101,7 @@ def read_side(
     if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
         errors = read_error_file(source)
         known = error_source(machine, errors, covariance_beside(source, errors))
-        return Side(machine, source, "errors", source=known, reversal=_reversal_beside(source))
+        return Side(machine, source, "errors", source=known, reversal=reversal_beside(source))
     if set(PREDICTED_COLUMNS) <= header:
         return Side(machine, source, "predicted errors at points", predicted=_read_predicted(machine, source))
     if {"diagonal", "deviation_um"} <= header:
@@ -118,7 +117,8 @@ def read_side(
     if isinstance(measurement, Lengths):
         return Side(machine, source, "tracer lengths", lengths=measurement)
     found = identify_measurement(machine, measurement)
-    return Side(machine, source, "six-DOF readings", source=_source_of(machine, found))
+    known = _source_of(machine, found)
+    return Side(machine, source, "six-DOF readings", source=known, reversal=identified_reversal(found))
 
 
 def _errors_in(path: Path) -> Path:
@@ -152,21 +152,6 @@ def covariance_beside(path: Path, errors: ErrorTable) -> Covariance | None:
 
 def _source_of(machine: Machine, found: Identification) -> ErrorSource:
     return error_source(machine, found.errors, joint_covariance(found) if found.has_covariance else None)
-
-
-def _reversal_beside(path: Path) -> KnownReversal:
-    """Return the reversal file that belongs to an errors file: ``NAME.reversal.csv``, of fitted errors the identified one."""
-    stem = path.name.removesuffix(".errors.csv")
-    names = [f"{stem}.reversal.csv", *(["identified.reversal.csv"] if stem == "fitted" else [])]
-    for name in names:
-        beside = path.parent / name
-        if beside.is_file():
-            return KnownReversal(
-                read_reversal(beside), f"reversal: {name}; an axis that it does not hold counts as zero"
-            )
-    return KnownReversal(
-        None, f"reversal: not known: errors are means of both directions, and {names[-1]} is not there"
-    )
 
 
 def _read_predicted(machine: Machine, path: Path) -> Field:
