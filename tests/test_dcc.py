@@ -105,6 +105,11 @@ def floats(element, path):
     return [float(word) for word in text.split(" ")]
 
 
+def halved_errors(text):
+    """An errors file with half of every value."""
+    return re.sub(r"(?m)^(E\w\w\w?,[^,]*,)([^,]+)", lambda row: f"{row[1]}{float(row[2]) / 2:.9f}", text)
+
+
 @pytest.fixture(scope="module")
 def folders(small_machine_file, small_lengths_file, tmp_path_factory):
     """Results of run (two controls), identify, accuracy, compare, compare --predicted and verify."""
@@ -116,8 +121,10 @@ def folders(small_machine_file, small_lengths_file, tmp_path_factory):
     assert call("identify", small_machine_file, small_lengths_file, "--out", identify) == 0
     errors = identify / "identified.errors.csv"
     assert call("accuracy", small_machine_file, errors, "--out", accuracy) == 0
-    call("compare", small_machine_file, errors, errors, "--out", compare)
-    call("compare", small_machine_file, errors, errors, "--predicted", "--out", predicted)
+    halved = base / "after.errors.csv"
+    halved.write_text(halved_errors(errors.read_text()))
+    assert call("compare", small_machine_file, errors, halved, "--out", compare) == 0
+    assert call("compare", small_machine_file, errors, errors, "--predicted", "--out", predicted) == 0
     files = [
         run / "isg-csv" / item["name"] for item in json.loads((run / "isg-csv" / "result.json").read_text())["files"]
     ]
@@ -289,6 +296,7 @@ def test_before_and_after_of_a_comparison_have_their_own_values(numbers, options
         quantities = named(root, f"Volume (ISO 230-1), {when}").findall(".//dcc:quantity", N)
         found = {q.findtext("dcc:name/dcc:content", "", N): floats(q, ".//si:value")[0] for q in quantities}
         assert found == {key: row[when] for key, row in rows.items()}
+    assert rows["V_X"]["after"] == pytest.approx(0.5 * rows["V_X"]["before"], rel=1e-3)
 
 
 def test_what_is_computed_says_so_and_carries_no_uncertainty(root):
