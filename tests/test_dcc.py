@@ -319,6 +319,15 @@ def test_input_files_stand_there_with_their_hashes(root, numbers):
     assert all(f"{item['name']}, SHA-256 {item['sha256']}" in texts for item in inputs)
 
 
+@pytest.mark.parametrize(
+    "method", ["joint", "two-step", "deviations", "axis-runs", "sixdof", "merged", "given", "new", None]
+)
+def test_the_method_of_the_identification_is_named(numbers, options, method):
+    data = {**numbers["identify"], "measurement": {"method": method}}
+    text = parsed(certificate_xml(data, options)).findtext(".//dcc:usedMethod/dcc:description/dcc:content", "", N)
+    assert (text.startswith("Method ") and (method or "not stated") in text) == (method in ("new", None))
+
+
 # --- what the laboratory stated ----------------------------------------------------------------------------------
 
 

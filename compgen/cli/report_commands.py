@@ -45,7 +45,6 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
 
     \b
     Example:
-      compgen report tables/
       compgen report tables/ --dcc certificate.toml --dcc-schema dcc.xsd
     """
     from compgen.report.html import write_report

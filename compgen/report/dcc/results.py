@@ -14,11 +14,13 @@ from compgen.report.html.certificate import PROBABILITY, UNITS
 from compgen.report.html.curves import COVERAGE
 
 METHODS = {
-    "joint": "Lengths from several tracer stations: stations, dead lengths and errors in one least-squares adjustment",
+    "joint": "Lengths from tracer stations: the errors, and what is not known of the stations, in one least-squares adjustment",
     "two-step": "Lengths from several tracer stations: points located first, errors fitted to their deviations",
     "deviations": "Errors fitted to deviations of the tool tip by least squares",
     "axis-runs": "Errors of single axes, each measured along a line",
+    "sixdof": "Errors from readings of a six-degree-of-freedom laser instrument, axis by axis",
     "merged": "Errors of several measurements merged by their uncertainties",
+    "given": "Errors as they were given in a file",
 }
 
 
@@ -78,7 +80,7 @@ class Results:
     def _errors(self, errors: Mapping[str, Any]) -> Iterator[Element]:
         if not errors["results"]:
             return
-        text = METHODS.get(str(errors["usedMethod"]), "Errors as they stand in the file of the errors")
+        text = METHODS.get(str(errors["usedMethod"]), f"Method {errors['usedMethod'] or 'not stated'}")
         method = _method("Identification of geometric errors", text, ("ISO 230-1",))
         results = [self._error(item) for item in errors["results"]]
         yield self._result("Geometric errors of the machine", method, results, self._evidence())
