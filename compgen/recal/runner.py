@@ -147,11 +147,7 @@ class _Pass:
         self._check_clock()
         self._take()
         settings = self.job.settings_sha256()  # a machine file that is missing ends here; what came in is kept
-        for measurement in self._waiting(settings):
-            if self.stop():
-                self.messages.append("stopped; the rest is processed by the next run")
-                break
-            self._process(measurement, settings)
+        self._process_all(settings)
         active = publish(self.store, self.machine, self.job.out)
         problems = notify(self.store, self.machine, self.job.notify)
         self.messages += problems
@@ -202,30 +198,42 @@ class _Pass:
         }
         return [item for item in self.store.measurements(self.machine) if item.id not in done | failed]
 
-    def _process(self, measurement: MeasurementRecord, settings: str) -> None:
+    def _process_all(self, settings: str) -> None:
+        """Process in the order of measurement; where another runner has one, the later ones are left to it as well."""
+        seen: set[int] = set()
+        while waiting := [item for item in self._waiting(settings) if item.id not in seen]:
+            for measurement in waiting:
+                if self.stop():
+                    self.messages.append("stopped; the rest is processed by the next run")
+                    return
+                seen.add(measurement.id)
+                if not self._process(measurement, settings):
+                    return
+
+    def _process(self, measurement: MeasurementRecord, settings: str) -> bool:
+        """Process one measurement; return whether the next one may follow."""
         for _ in range(JUDGED_AT_MOST):
             claim = claims.take(self.store, measurement, claims.owner_name())
             if claim is None:
-                self._leave(measurement, "another runner has it")
-                return
+                return self._leave(measurement, "another runner has it")
             try:
                 self._keep(measurement, claim, settings)
-                return
+                return True
             except ChangedMeanwhileError:
                 claims.give_back(self.store, claim)
             except (ClaimLostError, sa.exc.IntegrityError):
                 claims.forget(self.store, claim)
-                self._leave(measurement, "another runner took it over")
-                return
+                return self._leave(measurement, "another runner took it over")
             except BaseException:
                 _give_back_quietly(self.store, claim)
                 raise
-        self._leave(measurement, "other tables became active again and again; it is judged by the next run")
+        return self._leave(measurement, "other tables became active again and again; it is judged by the next run")
 
-    def _leave(self, measurement: MeasurementRecord, why: str) -> None:
+    def _leave(self, measurement: MeasurementRecord, why: str) -> bool:
         """Say why a measurement is not processed now."""
         self.messages.append(f"{measurement.name}: {why}")
         self.again = True
+        return False
 
     def _keep(self, measurement: MeasurementRecord, claim: Claim, settings: str) -> None:
         started = time.monotonic()
