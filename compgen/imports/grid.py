@@ -28,12 +28,13 @@ _POINT = re.compile(r"[+-]?\d*\.\d+([eE][+-]?\d+)?")
 
 @dataclass(frozen=True)
 class Grid:
-    """Rows of cells with their line numbers; how they were read stands in ``notes``."""
+    """Rows of cells with their line numbers; how they were read stands in ``notes``, why cells may be empty in ``empty``."""
 
     path: Path
     rows: Sequence[Sequence[str]]
     lines: Sequence[int]
     notes: tuple[str, ...] = ()
+    empty: str = ""
 
     def fail(self, message: str, line: int | None = None, column: str | None = None) -> InputError:
         """Return the error that points at a row, and a column."""
@@ -70,7 +71,7 @@ class Table:
         for cell, line in zip(cells, self.lines, strict=True):
             value = parse_number(cell)
             if value is None and not (empty and not cell):
-                what = "is empty" if not cell else f"{shown(cell)} is not a number"
+                what = f"is empty{self.grid.empty}" if not cell else f"{shown(cell)} is not a number"
                 raise self.grid.fail(f"{what}; a number is due", line, name)
             found.append(float("nan") if value is None else value)
         return found
@@ -227,18 +228,39 @@ def _table(grid: Grid, k: int, metadata: dict[str, str]) -> Table:
     doubled = next((name for name, times in Counter(names).items() if times > 1), None)
     if doubled:
         raise grid.fail(f"the header names {shown(doubled)} twice; give each column a name of its own", grid.lines[k])
-    rows, lines = [], []
-    for row, line in zip(grid.rows[first:], grid.lines[first:], strict=True):
-        if not any(row) or row[0].startswith("#"):
-            continue
-        rows.append(_fitted(grid, names, row, line))
-        lines.append(line)
+    rows, lines, below = _rows_below(grid, names, first)
     if not rows:
         raise grid.fail("has a header but no rows", grid.lines[k])
+    if below:
+        grid = replace(
+            grid, notes=(*grid.notes, f"what stands from line {below} on is no row of the table and was left out")
+        )
     plain, commas = _plain_decimals(grid, rows, lines)
     if commas:
         grid = replace(grid, notes=(*grid.notes, "decimal commas were read as decimal points"))
     return Table(grid, names, grid.lines[k], plain, lines, metadata)
+
+
+def _rows_below(grid: Grid, names: Sequence[str], first: int) -> tuple[list[list[str]], list[int], int]:
+    """Return rows, their lines, and the line (or 0) where remarks below the table begin, after a blank line.
+
+    Raises InputError if rows of numbers follow once more below the remarks: there is a second table.
+    """
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    below = 0
+    for row, line in zip(grid.rows[first:], grid.lines[first:], strict=True):
+        if not any(row) or row[0].startswith("#"):
+            continue
+        if below or (lines and line > lines[-1] + 1 and not _like(names, row, MOST_COLUMNS)):
+            if below and _like(names, row, MOST_COLUMNS) and len(_filled(row)) >= len(names):
+                message = f"rows of numbers follow again, below line {below} where the table ended: put each table into a file"
+                raise grid.fail(f"{message} or sheet of its own", line)
+            below = below or line
+            continue
+        rows.append(_fitted(grid, names, row, line))
+        lines.append(line)
+    return rows, lines, below
 
 
 def _fitted(grid: Grid, names: Sequence[str], row: Sequence[str], line: int) -> list[str]:

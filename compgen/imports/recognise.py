@@ -125,10 +125,12 @@ def _import_text(path: Path, options: ImportOptions) -> Imported:
 
 
 def _import_workbook(path: Path, options: ImportOptions) -> Imported:
-    sheets = read_sheets(path)
+    sheets, hidden = read_sheets(path, options.sheet)
+    aside = tuple(f"sheet {shown(name)} is hidden and was left out; --sheet takes it" for name in hidden)
     one = chosen_sheet(path, sheets, options.sheet)
     if one is not None:
-        return _of_sheet(import_table(one[1], options, "xlsx"), one[0])
+        item = _of_sheet(import_table(one[1], options, "xlsx"), one[0])
+        return replace(item, notes=(*item.notes, *aside))
     read, reasons = [], []
     for name, grid in sheets:
         try:
@@ -138,7 +140,7 @@ def _import_workbook(path: Path, options: ImportOptions) -> Imported:
     if not read:
         raise InputError(f"no sheet holds a table that can be read: {'; '.join(reasons)}"[:1000], file=path)
     item = merged_sheets(read)
-    return replace(item, notes=(*item.notes, *(f"sheet left out: {reason}" for reason in reasons)))
+    return replace(item, notes=(*item.notes, *aside, *(f"sheet left out: {reason}" for reason in reasons)))
 
 
 def _of_sheet(item: Imported, name: str) -> Imported:

@@ -23,10 +23,13 @@ MOST_PACKED, MOST_UNPACKED, MOST_MEMBERS = 64 * MEGABYTE, 256 * MEGABYTE, 2_000
 MOST_RATIO = 300
 _FORBIDDEN = (b"<!DOCTYPE", b"<!ENTITY", "<!DOCTYPE".encode("utf-16-le"), "<!DOCTYPE".encode("utf-16-be"))
 _BLOCK = 1 << 20
+_EMPTY = " (of merged cells only the first is filled; a formula that was never calculated is empty: open and save the workbook)"
 
 
-def read_sheets(path: Path) -> list[tuple[str, Grid]]:
-    """Return name and cells of every sheet that holds any; InputError for what is no workbook, or unsafe.
+def read_sheets(path: Path, name: str | None = None) -> tuple[list[tuple[str, Grid]], list[str]]:
+    """Return name and cells of every sheet that holds any, and the names of hidden ones, which are left out.
+
+    ``name`` is a sheet that is wanted though it be hidden. InputError for what is no workbook, or unsafe.
 
     Cells hold text; numbers have all their digits, whatever the format of the cell shows; formulas count with the value
     that was stored with them.
@@ -34,11 +37,14 @@ def read_sheets(path: Path) -> list[tuple[str, Grid]]:
     check_size(path, MOST_PACKED)
     _check_archive(path)
     with _opened(path) as book:
-        found = [(sheet.title, _grid(path, sheet)) for sheet in book.worksheets]
+        hidden = [sheet.title for sheet in book.worksheets if sheet.sheet_state != "visible" and sheet.title != name]
+        if len(hidden) == len(book.worksheets):
+            hidden = []
+        found = [(sheet.title, _grid(path, sheet)) for sheet in book.worksheets if sheet.title not in hidden]
     filled = [(name, grid) for name, grid in found if grid.rows]
     if not filled:
         raise InputError("is a workbook without any filled cell", file=path)
-    return filled
+    return filled, hidden
 
 
 def chosen_sheet(path: Path, sheets: list[tuple[str, Grid]], name: str | None) -> tuple[str, Grid] | None:
@@ -119,7 +125,7 @@ def _grid(path: Path, sheet: Any) -> Grid:
         if any(cells):
             rows.append(cells)
             lines.append(number)
-    return Grid(path, rows, lines, (f"sheet {shown(sheet.title)}",))
+    return Grid(path, rows, lines, (f"sheet {shown(sheet.title)}",), _EMPTY)
 
 
 def _cell(value: object) -> str:

@@ -82,7 +82,8 @@ def _labels(findings: Findings) -> IntArray:
     for cell, line in zip(findings.table.column(name), findings.table.lines, strict=True):
         one = way(cell)
         if one is None:
-            raise findings.table.grid.fail(f"{shown(cell)} is no direction; +1 or -1 is due", line, name)
+            empty = findings.table.grid.empty if not cell else ""
+            raise findings.table.grid.fail(f"{shown(cell)} is no direction{empty}; +1 or -1 is due", line, name)
         ways.append(one)
     return np.array(ways, dtype=np.int64)
 
@@ -165,7 +166,8 @@ def _axes(findings: Findings, row: IntArray) -> list[str]:
         for cell, line in zip(findings.table.column(column), findings.table.lines, strict=True):
             letter = axis_in(cell)
             if letter is None:
-                raise findings.table.grid.fail(f"{shown(cell)} is no axis; X, Y or Z is due", line, column)
+                empty = findings.table.grid.empty if not cell else ""
+                raise findings.table.grid.fail(f"{shown(cell)} is no axis{empty}; X, Y or Z is due", line, column)
             letters.append(letter)
         return [letters[k] for k in row]
     metadata = findings.table.metadata

@@ -31,7 +31,9 @@ def lengths_of(findings: Findings) -> Lengths:
     for cells, key in ((names, "station"), (points, "point")):
         empty = next((k for k, cell in enumerate(cells) if not cell), None)
         if empty is not None:
-            raise table.grid.fail("is empty; every row needs a label here", table.lines[empty], fields[key].name)
+            raise table.grid.fail(
+                f"is empty{table.grid.empty}; every row needs a label here", table.lines[empty], fields[key].name
+            )
     stations = tuple(dict.fromkeys(names))
     station = np.array([stations.index(name) for name in names], dtype=np.int64)
     reading = findings.numbers("length")
