@@ -1,15 +1,18 @@
 """Accuracy figures against worked numbers, brute force and sampling; wrong rules give other numbers."""
 
 import csv
+import io
 import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from compgen.accuracy import (
     Budget,
     accuracy_of_errors,
+    accuracy_of_runs,
     aligned,
     error_source,
     positioning_test,
@@ -27,6 +30,7 @@ from compgen.core.machine import read_machine
 from compgen.core.names import CURVE_NAMES, error_named
 from compgen.errors import InputError
 from compgen.model import c_matrix, volumetric_error
+from compgen.report.accuracy_text import accuracy_table
 
 EXACT = 1e-9
 
@@ -69,6 +73,18 @@ def test_iso_230_2_gives_the_worked_values_at_each_target(golden):
     assert targets["R_um"] == pytest.approx([7, 10, 9, 10, 13], abs=EXACT)
 
 
+def test_the_uncertainties_at_each_target_are_those_of_means_of_five(golden):
+    found = accuracy_of_runs({"X": golden}).summary()["targets"]["X"]
+    assert found["position_mm"] == [0.0, 100.0, 200.0, 300.0, 400.0]
+    assert found["u_mean_up_um"] == pytest.approx([s / np.sqrt(5.0) for _, s in GOLDEN_UP], abs=EXACT)
+    expected = [np.hypot(u[1], d[1]) / np.sqrt(5.0) for u, d in zip(GOLDEN_UP, GOLDEN_DOWN, strict=True)]
+    assert found["u_B_um"] == pytest.approx(expected, abs=EXACT)
+    text = io.StringIO()
+    Console(file=text, width=130).print(accuracy_table(accuracy_of_runs({"X": golden})))
+    row = next(line.split() for line in text.getvalue().splitlines() if line.split()[:1] == ["400.00"])
+    assert " ".join(row) == "400.00 5.00 +/- 2.68 2.00 +/- 1.79 3.00 +/- 3.22 3.00 2.00 13.00"
+
+
 def test_vdi_3441_gives_the_worked_numbers(golden):
     expected = {"P_a": 8, "U_max": 4, "U_mean": 3.4, "P_s_max": 15, "P_s_mean": 9.6, "P": 23}
     assert values_of(vdi_3441(golden)) == pytest.approx(expected, abs=EXACT)
@@ -81,6 +97,9 @@ def test_the_wrong_rules_of_public_programs_are_not_followed(golden):
     assert min(found["E_up"], found["E_down"]) == pytest.approx(8, abs=EXACT)
     assert found["E"] > max(found["E_up"], found["E_down"]) + 0.5
     assert found["A"] > max(found["A_up"], found["A_down"]) + 0.5
+    means = positioning_test(golden).targets
+    up, down = means["mean_up_um"], means["mean_down_um"]
+    assert max(up.max(), down.max()) - max(up.min(), down.min()) == pytest.approx(8, abs=EXACT)
 
 
 def test_the_editions_differ_in_the_factor_of_s_only(golden):

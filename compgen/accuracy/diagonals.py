@@ -16,7 +16,7 @@ import numpy as np
 from compgen.accuracy.budget import NO_BUDGET, Budget
 from compgen.accuracy.evaluate import Accuracy
 from compgen.accuracy.figure import Figure
-from compgen.accuracy.iso230_2 import LATEST, positioning_test
+from compgen.accuracy.iso230_2 import LATEST, PositioningTest, positioning_test
 from compgen.accuracy.runs import MEAN_UP, RunStatistics, combine, figure, run_statistics
 from compgen.core.csvio import FloatArray
 from compgen.core.diagonals import BODY_DIAGONALS, Diagonals, along_mm
@@ -101,25 +101,28 @@ def accuracy_of_diagonals(
         its direction cosines.
     """
     groups: dict[str, dict[str, Figure]] = {}
+    targets = {}
     for name, run in runs.items():
-        groups[name] = _figures_of(run, edition, budget_along(run, budgets or {}))
+        budget = budget_along(run, budgets or {})
+        test = positioning_test(run.statistics, edition, budget)
+        groups[name], targets[name] = _figures_of(run, test, budget), test.targets
     statements = [f"ISO 230-6, each diagonal as ISO 230-2:{edition}", *(_described(run) for run in runs.values())]
     open_set = _why_no_set(runs)
+    together: dict[str, dict[str, Figure]] = {}
     if open_set is None:
-        groups["diagonals"], said = _largest(runs, groups)
-        groups["squareness indication"] = _squareness(machine, runs, groups)
+        together["diagonals"], said = _largest(runs, groups)
+        together["squareness indication"] = _squareness(machine, runs, groups)
         statements += [*said, _SQUARENESS_TEXT]
     else:
         statements.append(f"Ed, Bd: not given; {open_set}")
     statements += [NO_PROOF, "checked against published formulas and worked examples, not certified"]
-    return Accuracy(groups, tuple(statements))
+    return Accuracy({**together, **groups}, tuple(statements), targets)
 
 
-def _figures_of(run: DiagonalRun, edition: int, budget: Budget) -> dict[str, Figure]:
-    test = positioning_test(run.statistics, edition, budget).figures
+def _figures_of(run: DiagonalRun, test: PositioningTest, budget: Budget) -> dict[str, Figure]:
     found = {
         key: replace(item, meaning=f"diagonal {run.name}, ISO 230-6: {item.meaning}")
-        for key, item in test.items()
+        for key, item in test.figures.items()
         if key not in _NOT_ALONG
     }
     statistics = run.statistics

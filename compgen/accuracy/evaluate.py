@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -38,16 +38,24 @@ Groups = Mapping[str, Mapping[str, Figure]]
 class Accuracy:
     """Figures by group (``volume``, ``orientation``, ``axes``, ``diagonals``, ``errors``, ``X`` ...) and key.
 
-    ``statements`` says in words what they stand for: alignment, reference line, tool offset, edition.
+    ``statements`` says in words what they stand for: alignment, reference line, tool offset, edition. ``targets`` has the
+    values at each target of groups that stem from runs (:class:`compgen.accuracy.iso230_2.PositioningTest`).
     """
 
     groups: Groups
     statements: tuple[str, ...]
+    targets: Mapping[str, Mapping[str, FloatArray]] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """Return plain numbers for JSON."""
         groups = {name: {key: item.summary() for key, item in group.items()} for name, group in self.groups.items()}
-        return {"figures": groups, "statements": list(self.statements)}
+        found: dict[str, Any] = {"figures": groups, "statements": list(self.statements)}
+        if self.targets:
+            found["targets"] = {
+                name: {key: values.tolist() for key, values in columns.items()}
+                for name, columns in self.targets.items()
+            }
+        return found
 
 
 def nodes_of(machine: Machine, *sources: ErrorSource) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -136,14 +144,15 @@ def accuracy_of_runs(
     budgets : what the set-up adds to the uncertainties, by axis.
     """
     groups: dict[str, dict[str, Figure]] = {}
+    targets = {}
     for axis, item in statistics.items():
         budget = (budgets or {}).get(axis, NO_BUDGET)
-        groups[axis] = dict(positioning_test(item, edition, budget).figures)
+        test = positioning_test(item, edition, budget)
+        groups[axis], targets[axis] = dict(test.figures), test.targets
         if item.bidirectional and item.repeated:
             groups[axis] |= {f"VDI {key}": figure for key, figure in vdi_3441(item, budget).items()}
-    return Accuracy(
-        groups, (f"ISO 230-2:{edition}", "checked against published formulas and worked examples, not certified")
-    )
+    statements = (f"ISO 230-2:{edition}", "checked against published formulas and worked examples, not certified")
+    return Accuracy(groups, statements, targets)
 
 
 def narrowed(machine: Machine, lower_mm: FloatArray, upper_mm: FloatArray) -> Machine:

@@ -48,7 +48,9 @@ class PositioningTest:
 
     Keys: ``B``, ``B_mean``, ``M``, ``R``, ``R_up``, ``R_down``, ``E``, ``E_up``, ``E_down``, ``A``, ``A_up``, ``A_down``
     as far as the runs show them: both directions for those without an ending, at least two runs for R and A.
-    ``targets`` has the columns position_mm, B_um, mean_um, R_um, R_up_um, R_down_um, each (m,), nan where unknown.
+    ``targets`` has the columns position_mm, mean_up_um, mean_down_um, s_up_um, s_down_um, B_um, mean_um, R_um, R_up_um,
+    R_down_um, and from the scatter the standard uncertainties u_mean_up_um, u_mean_down_um, u_B_um (shared sources left
+    out), each (m,), nan where unknown.
     """
 
     edition: int
@@ -141,6 +143,8 @@ def _repeatability_at(statistics: RunStatistics, target: int, k: float) -> Combi
 
 def _targets(statistics: RunStatistics, k: float) -> dict[str, FloatArray]:
     up, down, s_up, s_down = statistics.values / MM_PER_UM
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u_up, u_down = (s_up, s_down) / np.sqrt(statistics.count)
     wide = np.maximum(np.maximum(2.0 * k * s_up, 2.0 * k * s_down), k * (s_up + s_down) + np.abs(up - down))
     return {
         "position_mm": statistics.position_mm,
@@ -153,6 +157,9 @@ def _targets(statistics: RunStatistics, k: float) -> dict[str, FloatArray]:
         "R_um": wide,
         "R_up_um": 2.0 * k * s_up,
         "R_down_um": 2.0 * k * s_down,
+        "u_mean_up_um": u_up,
+        "u_mean_down_um": u_down,
+        "u_B_um": np.hypot(u_up, u_down),
     }
 
 

@@ -12,9 +12,21 @@ from rich.text import Text
 
 from compgen.accuracy.compare import Comparison
 from compgen.accuracy.evaluate import Accuracy
-from compgen.accuracy.figure import ComparedFigure, Figure
+from compgen.accuracy.figure import COVERAGE, ComparedFigure, Figure
+from compgen.core.csvio import FloatArray
 
 _HEADINGS = ("figure", "before", "after", "unit", "factor", "En", "verdict")
+#: More targets than these stand in the JSON alone.
+MOST_TARGETS = 40
+_TARGETS = (
+    ("target mm", "position_mm", ""),
+    ("mean up um", "mean_up_um", "u_mean_up_um"),
+    ("mean down um", "mean_down_um", "u_mean_down_um"),
+    ("B um", "B_um", "u_B_um"),
+    ("s up um", "s_up_um", ""),
+    ("s down um", "s_down_um", ""),
+    ("R um", "R_um", ""),
+)
 _STYLES = {"better": "green", "worse": "bold red", "larger": "red"}
 
 
@@ -37,7 +49,23 @@ def accuracy_table(found: Accuracy) -> Group:
         for key, item in group.items():
             table.add_row(key, _with_u(item) + (", U not known" if math.isnan(item.u) else ""), item.unit)
         parts.append(table)
+        if len(found.targets.get(name, {}).get("position_mm", ())) in range(1, MOST_TARGETS + 1):
+            parts.append(_targets_table(found.targets[name]))
     return Group(*parts, Text("\n".join(found.statements)))
+
+
+def _targets_table(columns: Mapping[str, FloatArray]) -> Table:
+    """Values at each target; U from the scatter alone."""
+    table = Table(box=box.SIMPLE)
+    for heading, _, _ in _TARGETS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in range(len(columns["position_mm"])):
+        cells = []
+        for _, name, u_name in _TARGETS:
+            value, u = float(columns[name][row]), float(columns[u_name][row]) if u_name else math.nan
+            cells.append(_number(value) + ("" if math.isnan(u) else f" +/- {COVERAGE * u:.2f}"))
+        table.add_row(*cells)
+    return table
 
 
 def comparison_table(found: Comparison) -> Group:

@@ -25,6 +25,8 @@ GROUPS = {
     "diagonals": "Body diagonals (ISO 230-6)",
     "errors": "Single errors",
     "straightness": "Straightness by three reference lines",
+    "reversal": "Reversal: both directions (ISO 230-2, ISO 230-6)",
+    "squareness indication": "Squareness, an indication from the diagonals",
 }
 
 
