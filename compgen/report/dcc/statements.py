@@ -30,7 +30,8 @@ SIGN = (
 UNCERTAINTY = (
     f"Stated is the expanded uncertainty: the standard uncertainty times the coverage factor k = {COVERAGE:g}, for a normal "
     f"distribution a coverage probability of {100 * PROBABILITY:g} %. Where value and uncertainty are both zero the value "
-    "is fixed by the point or the line that the error is referred to. A figure without uncertainty is marked as computed, or its uncertainty is not known."
+    "is fixed by the point or the line that the error is referred to. "
+    "A figure without uncertainty is marked as computed, or its uncertainty is not known."
 )
 
 
