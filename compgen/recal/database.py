@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -36,26 +38,35 @@ class StoreError(CompgenError):
 
 
 def engine_of(url: str) -> sa.Engine:
-    """Return an engine for a URL or the path of an SQLite file; InputError for a kind that is not served."""
+    """Return an engine for a URL or the path of an SQLite file; InputError for a kind that is not served.
+
+    A process has one for each store, which keeps its compiled statements when its connections are given back.
+    """
     try:
         parsed = sa.make_url(url if "://" in url else f"sqlite:///{url}")
     except sa.exc.ArgumentError as error:
         raise InputError(f"{url!r} is not the URL of a store; give sqlite:///FILE or postgresql://HOST/NAME") from error
     kind = parsed.get_backend_name()
     if kind == "postgresql":
-        return _postgresql(parsed)
+        return _postgresql(parsed, os.getpid())
     if kind != "sqlite" or not parsed.database or parsed.database == ":memory:":
         raise InputError(f"{shown(url)} is not a store; give sqlite:///FILE or postgresql://HOST/NAME")
     folder = Path(parsed.database).absolute().parent
     if not folder.is_dir():  # not made here: on a drive that is not mounted a new, empty store would begin
         raise StoreError(f"the store {shown(url)} cannot be used: there is no folder {folder}; mount or make it first")
-    engine = sa.create_engine(parsed, connect_args={"timeout": BUSY_S}, poolclass=sa.pool.QueuePool, pool_size=2)
+    return _sqlite(parsed.set(database=str(folder / Path(parsed.database).name)), os.getpid())
+
+
+@lru_cache(maxsize=8)
+def _sqlite(url: sa.URL, _process: int) -> sa.Engine:
+    engine = sa.create_engine(url, connect_args={"timeout": BUSY_S}, poolclass=sa.pool.QueuePool, pool_size=2)
     event.listen(engine, "connect", _configure_sqlite)
     event.listen(engine, "begin", _begin_sqlite)
     return engine
 
 
-def _postgresql(url: sa.URL) -> sa.Engine:
+@lru_cache(maxsize=8)
+def _postgresql(url: sa.URL, _process: int) -> sa.Engine:
     """One connection for the work and one for the renewal of leases; what the URL says itself counts."""
     arguments = {name: value for name, value in REACHABLE.items() if name not in url.query}
     url = url.set(drivername="postgresql+psycopg")

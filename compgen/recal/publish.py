@@ -44,7 +44,7 @@ def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord |
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with _locked(folder):
-            tables = store.tables(machine)
+            tables = store.tables(machine, figures=False)
             _check_pointer(folder, tables)
             _remove_leftovers(folder)
             for table in tables:
@@ -90,8 +90,7 @@ def _contents(store: Store, machine: MachineRecord, table: TableRecord) -> dict[
     """Return the files of a version by name; with several controls each has its own sub-folder."""
     several = len(table.controllers) > 1
     files = {f"{f.controller}/{f.name}" if several else f.name: f.content for f in store.table_files(table)}
-    identification = store.identification(table.identification_id)
-    measurement = next(m for m in store.measurements(machine) if m.id == identification.measurement_id)
+    measurement = store.measurement_behind(table)
     about = {
         "machine": machine.name,
         "version": table.version,

@@ -156,11 +156,9 @@ class _Pass:
 
     def _check_clock(self) -> None:
         """Report a clock that stands before what the store holds already."""
-        known = [item.received_at for item in self.store.measurements(self.machine)]
-        known += [item.at for item in self.store.decisions(self.machine)]
-        now = self.store.read(self.store.now)
-        if known and max(known) > now:
-            behind = max(known).isoformat(timespec="seconds")
+        known = self.store.newest_entry(self.machine)
+        if known is not None and known > self.store.read(self.store.now):
+            behind = known.isoformat(timespec="seconds")
             self._problem(
                 "clock", "clock", f"the clock went backwards: the store holds an entry of {behind}", fail=False
             )
@@ -190,7 +188,7 @@ class _Pass:
 
     def _waiting(self, settings: str) -> list[MeasurementRecord]:
         """Return what has no result yet, oldest first; what failed comes again only with other settings."""
-        done = {item.measurement_id for item in self.store.identifications(self.machine)}
+        done = self.store.identified(self.machine)
         failed = {
             item.measurement_id
             for item in self.store.attempts(self.machine)
@@ -262,7 +260,7 @@ class _Pass:
 
     def _outcome(self, active: TableRecord | None, settings: str) -> MachineOutcome:
         """Judge by what the store holds, so that the same inbox gives the same outcome however often it is run."""
-        tables = self.store.tables(self.machine)
+        tables = self.store.tables(self.machine, figures=False)
         self._report_failures(settings)
         last = tables[-1] if tables else None
         held = last is not None and last.state in ("held", "refused")

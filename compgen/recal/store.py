@@ -140,13 +140,13 @@ class Store:
         table = schema.measurements
         query = sa.select(table).order_by(table.c.measured_at, table.c.id)
         query = _where(query, table, machine)
-        if sha256 is not None:
-            query = query.where(table.c.sha256 == sha256)
         files: dict[int, list[tuple[str, str]]] = {}
         listed = schema.measurement_files
         inner = sa.select(listed.c.measurement_id, listed.c.name, listed.c.sha256).order_by(listed.c.id)
-        if machine is not None:
-            inner = inner.join(table, table.c.id == listed.c.measurement_id).where(table.c.machine_id == machine.id)
+        if machine is not None or sha256 is not None:
+            inner = _where(inner.join(table, table.c.id == listed.c.measurement_id), table, machine)
+        if sha256 is not None:
+            query, inner = query.where(table.c.sha256 == sha256), inner.where(table.c.sha256 == sha256)
         for measurement_id, name, digest in self._rows(inner):
             files.setdefault(measurement_id, []).append((name, digest))
         return [MeasurementRecord(**row._mapping, files=tuple(files.get(row.id, ()))) for row in self._rows(query)]
@@ -154,6 +154,27 @@ class Store:
     def contents_of(self, measurement: MeasurementRecord) -> dict[str, bytes]:
         """Return the contents of a measurement's files by name."""
         return {name: self.blob(digest) for name, digest in measurement.files}
+
+    def measurement_behind(self, table: TableRecord) -> MeasurementRecord:
+        """Return the measurement from which a set of tables was made; its files are left out."""
+        measured, found = schema.measurements, schema.identifications
+        query = sa.select(measured).join(found, found.c.measurement_id == measured.c.id)
+        (row,) = self._rows(query.where(found.c.id == table.identification_id))
+        return MeasurementRecord(**row._mapping, files=())
+
+    def identified(self, machine: MachineRecord) -> set[int]:
+        """Return the ids of the machine's measurements that have a result."""
+        table = schema.identifications
+        return {row[0] for row in self._rows(_where(sa.select(table.c.measurement_id), table, machine))}
+
+    def newest_entry(self, machine: MachineRecord) -> datetime | None:
+        """Return the time of the machine's last measurement received or decision, None if there is none."""
+        received, decided = schema.measurements, schema.decisions
+        times = [sa.func.max(received.c.received_at), sa.func.max(decided.c.at)]
+        tables = [received, decided]
+        queries = [_where(sa.select(time), table, machine) for time, table in zip(times, tables, strict=True)]
+        found = [row[0] for query in queries for row in self._rows(query)]
+        return max((time for time in found if time is not None), default=None)
 
     def attempts(self, machine: MachineRecord | None = None) -> list[AttemptRecord]:
         """Return all attempts to process measurements, oldest first."""
@@ -216,9 +237,11 @@ class Store:
 
     def table_files(self, table: TableRecord) -> list[TableFile]:
         """Return the files of a set of tables, byte for byte."""
-        files = schema.table_files
-        query = sa.select(files.c.controller, files.c.name, files.c.sha256).where(files.c.table_id == table.id)
-        return [TableFile(row[0], row[1], self.blob(row[2])) for row in self._rows(query.order_by(files.c.id))]
+        files, blobs = schema.table_files, schema.blobs
+        query = sa.select(files.c.controller, files.c.name, files.c.sha256, blobs.c.deflated)
+        query = query.join(blobs, blobs.c.sha256 == files.c.sha256, isouter=True).where(files.c.table_id == table.id)
+        rows = self._rows(query.order_by(files.c.id))
+        return [TableFile(controller, name, _inflated(digest, packed)) for controller, name, digest, packed in rows]
 
     def decisions(self, machine: MachineRecord | None = None) -> list[DecisionRecord]:
         """Return all decisions in their order: who, what, when, why."""
@@ -253,17 +276,20 @@ class Store:
     def blob(self, sha256: str) -> bytes:
         """Return contents by their SHA-256; StoreError if they are damaged."""
         query = sa.select(schema.blobs.c.deflated).where(schema.blobs.c.sha256 == sha256)
-        packed = self.read(lambda connection: connection.execute(query).scalar())
-        try:
-            content = zlib.decompress(packed or b"")
-        except zlib.error:
-            content = b""
-        if sha256_of(content) != sha256:
-            raise StoreError(f"the contents {sha256[:12]}... are missing or damaged in the store; restore a backup")
-        return content
+        return _inflated(sha256, self.read(lambda connection: connection.execute(query).scalar()))
 
     def _rows(self, query: sa.Select[Any]) -> list[Any]:
         return self.read(lambda connection: list(connection.execute(query).all()))
+
+
+def _inflated(sha256: str, packed: bytes | None) -> bytes:
+    try:
+        content = zlib.decompress(packed or b"")
+    except zlib.error:
+        content = b""
+    if sha256_of(content) != sha256:
+        raise StoreError(f"the contents {sha256[:12]}... are missing or damaged in the store; restore a backup")
+    return content
 
 
 def open_store(url: str, *, clock: Clock | None = None) -> Store:
