@@ -12,11 +12,15 @@ import pytest
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
+from compgen.core.axis_runs import format_axis_runs
 from compgen.core.files import sha256_of
+from compgen.recal import actions
 from compgen.recal.drift import DriftSettings, drift_of_store, drift_report
 from compgen.recal.drift_data import calibrations_of
+from compgen.recal.job import read_job
 from compgen.recal.overview import history
 from compgen.recal.store import open_store
+from compgen.simulate import read_scenario, simulate_axis_runs
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "factory"
 MODULES = ("factory", "plant", "people", "checks")
@@ -266,3 +270,49 @@ def test_the_commands_work_on_the_factory(year, capsys, tmp_path):
     capsys.readouterr()
     assert run_command(cli, ["recal", "history", "mill-b", *job]) == 0
     assert "measurement taken back: a test" in " ".join(capsys.readouterr().out.split())
+
+
+# --- a measurement of one axis ---------------------------------------------------------------------------------------
+
+AXIS_LASER = """\
+name = "laser"
+seed = 3
+[errors]
+file = "{errors}"
+[instrument]
+type = "axis-laser"
+axes = ["X"]
+targets = 5
+cycles = 2
+"""
+
+
+def test_a_laser_along_one_axis_never_replaces_tables_of_all_errors(example, tmp_path):
+    plant = example["plant"]
+    factory = plant.Factory(tmp_path / "out")
+    path = factory.write()
+    text = path.read_text().replace("max_change_um = 8.0", "").replace("temperature_c = [18.0, 22.0]", "")
+    path.write_text(text.replace("[defaults]", '[defaults]\npatterns = ["*.lengths.csv", "*.axis.csv"]', 1))
+    year = example["factory"].Year(factory, read_job(path))
+    at = plant.day_of(0)
+    factory.measure(year.job, "mill-b", at)
+    assert year.run("mill-b").waiting == (1,)
+    actions.approve(year.job, "mill-b", 1, "ada", clock=year.clock)
+    scenario = factory.folder / "scenarios" / "laser.scenario.toml"
+    scenario.write_text(AXIS_LASER.format(errors=f"mill-b-{at:%Y-%m-%d}.errors.csv"))
+    readings = format_axis_runs(simulate_axis_runs(factory.machine("mill-b"), read_scenario(scenario)).readings)
+    inbox, said = year.job.machine("mill-b").inbox, f"# measured_at = {at + timedelta(hours=1):%Y-%m-%dT%H:%M}+00:00\n"
+    (inbox / "compensated.axis.csv").write_text(said + readings)
+    year.now = at + timedelta(days=1)
+    first = year.run("mill-b")
+    assert first.state == "failed" and "measure anything else with the compensation off" in first.messages[0]
+    (inbox / "compensated.axis.csv").unlink()
+    (inbox / "bare.axis.csv").write_text("# active_table = none\n" + said + readings)
+    assert year.run("mill-b").state == "held"
+    (reason,) = year.tables("mill-b")[-1].reasons
+    assert reason.startswith("the measurement does not show EYX, EZX, ") and "EC0Y" in reason
+    store = open_store(year.job.store)
+    told = drift_of_store(store, store.machine("mill-b"), DriftSettings())
+    store.close()
+    assert len(told.times) == 1
+    assert told.notes[-1] == "1 of 2 calibrations are left out: they show a few errors only"

@@ -13,7 +13,7 @@ from compgen.core.names import error_named
 from compgen.errors import InputError
 from compgen.recal.change import Change, change_between
 from compgen.recal.drift_change import ErrorChange, changes, holm
-from compgen.recal.drift_data import Aligned, Calibration, Figure, aligned, calibrations_of
+from compgen.recal.drift_data import Aligned, Calibration, Figure, aligned, calibrations_of, with_all_errors
 from compgen.recal.drift_forecast import Forecast, forecast
 from compgen.recal.drift_trend import Series, Step, Trend, fit_trend, usable_temperature
 from compgen.recal.drift_volume import volume_forecast
@@ -155,11 +155,12 @@ def _figure_summary(item: FigureDrift, times: Sequence[str], confidence: float) 
 def drift_of_store(store: Store, machine: MachineRecord, settings: DriftSettings) -> Drift:
     """Return the drift of a machine of the store; the calibration behind its active tables is the reference."""
     history, ids, model = calibrations_of(store, machine)
+    history, ids, fewer = with_all_errors(history, ids)
     active = next((table for table in store.tables(machine, figures=False) if table.state == "active"), None)
     known = active is not None and active.identification_id in ids
     reference = ids.index(active.identification_id) if known and active is not None else 0
     found = drift_report(model, history, replace(settings, reference=reference), name=machine.name)
-    return replace(found, notes=(*found.notes, *excluded(store, machine).values()))
+    return replace(found, notes=(*found.notes, *fewer, *excluded(store, machine).values()))
 
 
 def drift_report(

@@ -33,6 +33,8 @@ from compgen.recal.store import Store
 
 #: A figure whose weights keep less than this share of their size in the common gauge is not observable.
 NOTHING_LEFT = 1e-6
+#: A calibration that shows less than this share of the errors of the richest one is left out.
+LEAST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,21 @@ def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibrat
         )
     newest = next(item for item in records if item.id == ids[-1])
     return found, ids, store.machine_of(newest)
+
+
+def with_all_errors(
+    history: Sequence[Calibration], ids: Sequence[int]
+) -> tuple[list[Calibration], list[int], list[str]]:
+    """Keep the calibrations that show at least half of the errors of the richest one; return a note about the others.
+
+    What a laser along one axis saw has another gauge, and would leave nothing but that axis to compare.
+    """
+    names = [{*item.covariance.error} for item in history]
+    wanted = max(names, key=len)
+    kept = [k for k, found in enumerate(names) if len(found & wanted) >= LEAST_SHARE * len(wanted)]
+    left = len(history) - len(kept)
+    notes = [f"{left} of {len(history)} calibrations are left out: they show a few errors only"] if left else []
+    return [history[k] for k in kept], [ids[k] for k in kept], notes
 
 
 def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:

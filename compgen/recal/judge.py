@@ -75,6 +75,23 @@ def _day(time: datetime) -> str:
     return time.isoformat(timespec="minutes")
 
 
+def shows_all(judgement: Judgement, store: Store, result: RunResult, active: ActiveState) -> bool:
+    """Whether the measurement shows every error that the active tables take out; otherwise the new ones would drop some.
+
+    A laser along one axis shows its positioning only: tables from that alone forget squareness, straightness and angles,
+    and nothing in that measurement says so.
+    """
+    known = {*result.identification.errors.names}
+    missing = [name for name in store.errors_of(active.identification).names if name not in known]
+    if missing:
+        judgement.figures["errors_not_shown"] = missing
+        judgement.hold.append(
+            f"the measurement does not show {', '.join(missing)}, which version {active.version} takes out and the new "
+            "tables would not; measure them all"
+        )
+    return not missing
+
+
 def judge_change(
     judgement: Judgement, store: Store, machine: Machine, result: RunResult, active: ActiveState, policy: Policy
 ) -> Change | None:

@@ -20,7 +20,15 @@ from compgen.identify import IdentifyOptions
 from compgen.identify.covariance import FILE_NAME as COVARIANCE
 from compgen.pipeline import Checks, RunResult, run
 from compgen.recal.job import MachineJob
-from compgen.recal.judge import ActiveState, Judgement, apply_limits, judge_change, judge_measurement, judge_tables
+from compgen.recal.judge import (
+    ActiveState,
+    Judgement,
+    apply_limits,
+    judge_change,
+    judge_measurement,
+    judge_tables,
+    shows_all,
+)
 from compgen.recal.records import MachineRecord, MeasurementRecord, NewResult, TableFile, TableRecord
 from compgen.recal.states import active_id
 from compgen.recal.store import Store
@@ -190,7 +198,7 @@ def _judged(
             control = item.verification.controller
             names = {path.name: path for path in item.paths}
             new[control] = read_tables(machine, [names[Path(name).name] for name in item.export.files], control)
-    if active is not None and result.accepted:
+    if active is not None and result.accepted and shows_all(judgement, store, result, active):
         judge_change(judgement, store, machine, result, active, job.policy)
         judge_tables(judgement, machine, result, new, active)
     if result.accepted:
