@@ -532,6 +532,13 @@ def test_no_other_command_identifies_from_diagonals(machine, tmp_path, capsys):
     assert "compgen's own format (diagonals)" in " ".join(capsys.readouterr().err.split())
 
 
+def test_a_diagonals_file_without_its_columns_is_told_what_is_missing(machine, tmp_path):
+    path = tmp_path / "b.diagonals.csv"
+    path.write_text("diagonal,s_mm,direction,run,deviation_um\nPPP,0,1,1,0\n")
+    with pytest.raises(InputError, match="x_mm"):
+        read_side(machine, path)
+
+
 def test_axis_names_the_axis_of_an_instrument_file_and_no_other(machine, tmp_path):
     names = product(("FWD", "BWD"), (1, 2, 3), (1, 2))
     rows = [f"REF_DATA_{way}[{i},{j}]={100 * (i - 1) + 0.001 * i * j}" for way, i, j in names]

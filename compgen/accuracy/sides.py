@@ -104,7 +104,7 @@ def read_side(
         return Side(machine, source, "errors", source=known, reversal=reversal_beside(source))
     if set(PREDICTED_COLUMNS) <= header:
         return Side(machine, source, "predicted errors at points", predicted=_read_predicted(machine, source))
-    if {"diagonal", "deviation_um"} <= header:
+    if {"diagonal", "deviation_um"} <= header or source.name.lower().endswith(".diagonals.csv"):
         return Side(machine, source, "measured diagonals", diagonals=diagonal_runs(machine, read_diagonals(source)))
     holds_sixdof = "y_qd1_mm" in header
     measurement = reader([source], instrument if holds_sixdof else None)
