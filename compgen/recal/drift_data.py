@@ -115,7 +115,7 @@ def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibrat
     for record in records:
         errors = store.errors_of(record)
         covariance = spread_of(errors, store.covariance_of(record))
-        if covariance is not None and record.id not in left_out:
+        if covariance is not None and record.measurement_id not in left_out:
             logged = measured[record.measurement_id].temperatures_c
             means = {name: float(figures["mean"]) for name, figures in logged.items()}
             found.append(Calibration(record.measured_at, errors, covariance, means))

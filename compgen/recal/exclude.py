@@ -56,12 +56,16 @@ def said_of(event: EventRecord) -> tuple[str, str, str]:
 
 
 def excluded(store: Store, machine: MachineRecord) -> dict[int, str]:
-    """Return who excluded what and why, in words, by the id of the identification."""
-    last = {event.subject: event for event in store.events(machine) if event.kind == KIND}
-    found = {}
-    for table in store.tables(machine, figures=False):
-        event = last.get(f"version {table.version}")
-        if event is not None and said_of(event)[0] == "excluded":
-            _, actor, reason = said_of(event)
-            found[table.identification_id] = f"version {table.version} is left out ({actor}: {reason})"
+    """Return who excluded what and why, in words, by the id of the measurement, whichever version was named."""
+    measured = {item.id: item.measurement_id for item in store.identifications(machine)}
+    tables = store.tables(machine, figures=False)
+    behind = {f"version {table.version}": measured[table.identification_id] for table in tables}
+    found: dict[int, str] = {}
+    for event in store.events(machine):
+        if event.kind == KIND:
+            what, actor, reason = said_of(event)
+            measurement_id = behind[event.subject]
+            found.pop(measurement_id, None)
+            if what == "excluded":
+                found[measurement_id] = f"{event.subject} is left out ({actor}: {reason})"
     return found
