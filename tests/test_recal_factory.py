@@ -246,6 +246,18 @@ def test_the_history_tells_who_decided_what_when_and_why(year, store):
     assert [entry.at for entry in history(store)] == sorted(entry.at for entry in history(store))
 
 
+def test_the_example_tells_the_year_line_by_line_and_writes_its_pages(year, example):
+    lines = [row.words() for row in year.rows]
+    assert re.match(r"2026-01-05 mill-a +[\d.]+ degC  v1 pending   ada: approve +active v1", lines[0])
+    assert any("ben: override" in line and "rolled back by ada an hour later" in line for line in lines)
+    told = list(example["factory"].tell(year))
+    assert any(re.match(r"  EC0Y drifts by \+1\.\d\d urad ", line) for line in told)
+    assert any("rollback" in line and " ada " in line and "out of tolerance" in line for line in told)
+    pages = sorted((year.factory.folder / "reports").glob("*.html"))
+    assert [page.stem for page in pages] == ["mill-a", "mill-b", "mill-c"]
+    assert all("follows the temperature" in page.read_text() for page in pages[2:])
+
+
 def test_running_again_changes_nothing(year, example, listing):
     before = listing(year.factory.folder / "tables")
     year.now += timedelta(days=1)

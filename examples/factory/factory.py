@@ -219,6 +219,22 @@ def drift_of(store: Store, job: Job, name: str) -> Drift:
     return drift_of_store(store, store.machine(name), DriftSettings(job.machine(name).tolerances))
 
 
+def tell(year: Year) -> Iterator[str]:
+    """Write the page of each machine; yield what the histories say."""
+    store = open_store(year.job.store)
+    try:
+        for name in NAMES:
+            found = drift_of(store, year.job, name)
+            yield f"\n{name}"
+            yield from (f"  {text}" for text in found.sentences())
+            yield f"  {write_history_report(year.factory.folder / 'reports' / f'{name}.html', found)}"
+        yield "\nmill-b: who did what"
+        for entry in history(store, store.machine("mill-b")):
+            yield f"  {entry.at:16.16} {entry.kind:12} {entry.version or '':>3} {entry.actor:10} {entry.text}"
+    finally:
+        store.close()
+
+
 def main() -> None:
     """Run the year from the command line."""
     parser = argparse.ArgumentParser(description="Twelve months of a factory of three simulated machines.")
@@ -231,17 +247,8 @@ def main() -> None:
     year = begin(arguments.out, arguments.seed)
     for row in months(year):
         print(row.words(), flush=True)
-    store = open_store(year.job.store)
-    for name in NAMES:
-        found = drift_of(store, year.job, name)
-        print(f"\n{name}")
-        for text in found.sentences():
-            print(f"  {text}")
-        print(f"  {write_history_report(arguments.out / 'reports' / f'{name}.html', found)}")
-    print("\nmill-b: who did what")
-    for entry in history(store, store.machine("mill-b")):
-        print(f"  {entry.at:16.16} {entry.kind:12} {entry.version or '':>3} {entry.actor:10} {entry.text}")
-    store.close()
+    for line in tell(year):
+        print(line)
 
 
 if __name__ == "__main__":
