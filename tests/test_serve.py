@@ -19,7 +19,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from compgen.errors import InputError
 from compgen.recal import decisions
-from compgen.serve import limits, sessions
+from compgen.serve import background, limits, reading, sessions
 from compgen.serve.fleet import fleet
 from compgen.serve.settings import Settings, check_settings, default_users
 from compgen.serve.users import Users
@@ -47,6 +47,13 @@ def _cheap_hashes(request):
         return
     with helper.cheap_hashes():
         yield
+
+
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch):
+    """Figures that are worked out beside the requests are waited for."""
+    monkeypatch.setattr(background, "PATIENCE_S", 60.0)
+    monkeypatch.setattr(reading, "A_MOMENT_S", 60.0)
 
 
 @pytest.fixture
@@ -113,7 +120,7 @@ def test_the_drift_of_a_machine_is_that_of_its_errors(site):
 def test_the_judged_drift_of_a_machine_is_shown_or_why_there_is_none(site):
     """EC0Y is the one squareness error, so nothing but the gauge could hide its change: 3 and 6 urad, 2 * 0.8 * sqrt(2)."""
     text = site.get("/machines/1/drift").text
-    row = re.search(r'<th scope="row">EC0Y</th>(.*?)</tr>', text)[1]
+    row = re.search(r'Changes</h2>.*?<th scope="row">EC0Y</th>(.*?)</tr>', text, re.S)[1]
     cells = re.findall(r">([^<]+)</td>", row)
     assert (cells[0], cells[1], cells[3], cells[4], cells[6]) == ("+3.00", "2.26", "+6.00", "2.26", "µrad")
     assert 0.0 < float(cells[2]) < 0.05

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import time
+import traceback
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from flask import Flask, Response, current_app, g, redirect, render_template, request
@@ -18,7 +21,7 @@ from compgen.recal.database import StoreError
 from compgen.recal.store import Store, open_store
 from compgen.resources import data_folder
 from compgen.serve import reading, signing
-from compgen.serve.chart import number
+from compgen.serve.chart import UNITS, number
 from compgen.serve.fleet import STATUSES
 from compgen.serve.guard import add_headers, check_host, check_method, check_origin, cookie_name
 from compgen.serve.service import Service, make_service
@@ -54,7 +57,9 @@ def make_app(settings: Settings, store: Store | None = None, clock: Callable[[],
     app.jinja_env.autoescape = True
     app.jinja_env.undefined = StrictUndefined
     app.jinja_env.trim_blocks = app.jinja_env.lstrip_blocks = True
-    app.jinja_env.filters.update(when=_when, figure=_figure, signed=_signed, ago=_ago)
+    app.jinja_env.filters.update(
+        unit=UNITS.__getitem__, micro=_micro, when=_when, figure=_figure, signed=_signed, ago=_ago
+    )
     app.jinja_env.globals.update(STATUSES=STATUSES, page_url=reading.page_url)
     app.extensions["compgen"] = make_service(settings, store or open_store(settings.store_url), clock)
     app.url_map.converters["number"] = reading.Number
@@ -169,7 +174,9 @@ def _own_error(error: CompgenError) -> tuple[str, int]:
 
 
 def _unexpected(error: Exception) -> tuple[str, int]:
-    logs.error("internal error", problem=f"{type(error).__name__}: {error}", path=request.path[:200])
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{Path(place.filename).name}:{place.lineno}"
+    logs.error("internal error", problem=f"{type(error).__name__}: {error}", where=where, path=request.path[:200])
     text = "This is a fault of the program; its log says more."
     return render_template("error.html", code=500, title="Internal error", text=text), 500
 
@@ -187,17 +194,20 @@ def _ago(time: datetime | None) -> str:
 
 
 def _figure(value: float | None, digits: int = 2) -> str:
-    """Return a number with fixed digits, a dash for one that is not known."""
+    """Return a number with fixed digits, a dash for one that is not known; no minus before a zero."""
     if value is None or value != value:
         return "\N{EN DASH}"
-    return (
-        number(float(f"{value:.{digits}f}"))
-        if abs(value) >= 1e5
-        else f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}")
-    )
+    if abs(value) >= 1e5:
+        return number(value)
+    return f"{value:z.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def _signed(value: float | None, digits: int = 2) -> str:
     if value is None or value != value:
         return "\N{EN DASH}"
-    return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
+    return f"{value:+z.{digits}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def _micro(text: str) -> str:
+    """Write units as pages do."""
+    return re.sub(r"\b(um|urad)\b", lambda found: UNITS[found[0]], text)

@@ -1,21 +1,28 @@
-"""The drift of a machine as :mod:`compgen.recal.drift` judges it; worked out once per state of the store."""
+"""The drift of a machine as :mod:`compgen.recal.drift` judges it; worked out once per state of store and job file."""
 
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
 
 from compgen.core.names import error_named
-from compgen.recal.drift import Drift, DriftSettings, drift_of_store
+from compgen.recal.drift import Drift, DriftSettings, FigureDrift, drift_of_store
+from compgen.recal.exclude import KIND as EXCLUSION
+from compgen.recal.job import Job, read_job
 from compgen.recal.records import MachineRecord
 from compgen.recal.store import Store
-from compgen.serve.chart import UNITS
-from compgen.serve.history import COVERAGE
+from compgen.serve.background import Background
+from compgen.serve.chart import UNITS, Chart, Series, chart
+from compgen.serve.history import COVERAGE, time_ticks
 
-#: Drifts that stay in memory.
-MOST = 200
+DAYS_A_MONTH = 30.4375
+#: Trends that are drawn, the most significant first.
+DRAWN = 6
 
 
 @dataclass(frozen=True)
@@ -28,24 +35,62 @@ class ChangeRow:
     first: tuple[float, float, float] | None
 
 
-class DriftCache:
-    """Works out one drift at a time: nobody can keep all processors busy by asking."""
+@dataclass(frozen=True)
+class TrendRow:
+    """Trend of one figure: change a month with expanded uncertainty, adjusted error probability, steps, forecast."""
 
-    def __init__(self, store: Store) -> None:
-        self._store, self._lock = store, threading.Lock()
-        self._known: OrderedDict[tuple[int, ...], Drift] = OrderedDict()
+    name: str
+    unit: str
+    rate: float
+    expanded: float
+    adjusted: float
+    per_kelvin: tuple[float, float] | None
+    steps: Sequence[str]
+    tolerance: float | None
+    forecast: str
 
-    def __call__(self, machine: MachineRecord) -> Drift:
-        """Return the drift; InputError where the store holds no errors with uncertainties."""
-        active = next((t.id for t in self._store.tables(machine, figures=False) if t.state == "active"), 0)
-        key = (machine.id, active, *(item.id for item in self._store.identifications(machine)))
+
+class JobFile:
+    """The job file as it is now; read again when it changed."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path, self._lock = path, threading.Lock()
+        self._state: tuple[int, int] | None = None
+        self._job: Job | None = None
+
+    def tolerances(self, machine: str) -> Mapping[str, float]:
+        """Return the tolerances of a machine, mm and rad, by error; none without a job file or such a machine."""
+        if self._path is None or not self._path.is_file():
+            return {}
+        stat = self._path.stat()
+        state = (stat.st_mtime_ns, stat.st_size)
         with self._lock:
-            if key not in self._known:
-                self._known[key] = drift_of_store(self._store, machine, DriftSettings())
-            self._known.move_to_end(key)
-            while len(self._known) > MOST:
-                self._known.popitem(last=False)
-            return self._known[key]
+            if self._job is None or state != self._state:
+                self._job, self._state = read_job(self._path), state
+            found = self._job.machines.get(machine)
+        return {} if found is None else found.tolerances
+
+
+class DriftCache:
+    """Drifts of machines, worked out beside the requests."""
+
+    def __init__(self, store: Store, background: Background, job: JobFile) -> None:
+        self._store, self._background, self._job = store, background, job
+
+    def __call__(self, machine: MachineRecord, patience_s: float | None = None) -> Drift:
+        """Return the drift; InputError where there are no errors with uncertainties, NotReadyError while it is made."""
+        tolerances = self._job.tolerances(machine.name)
+        decided = self._store.decisions(machine)
+        excluded = tuple(item.id for item in self._store.events(machine) if item.kind == EXCLUSION)
+        made = tuple(item.id for item in self._store.identifications(machine))
+        last = decided[-1].sequence if decided else 0
+        key = ("drift", machine.id, last, made, excluded, tuple(sorted(tolerances.items())))
+
+        def work() -> Drift:
+            return drift_of_store(self._store, machine, DriftSettings(tolerances))
+
+        found: Drift = self._background.get(key, work, patience_s)
+        return found
 
 
 def change_rows(drift: Drift) -> Sequence[ChangeRow]:
@@ -60,3 +105,54 @@ def change_rows(drift: Drift) -> Sequence[ChangeRow]:
     )
     names = dict.fromkeys([*first, *last])
     return [ChangeRow(name, UNITS[error_named(name).unit], last.get(name), first.get(name)) for name in names]
+
+
+def trend_rows(drift: Drift) -> Sequence[TrendRow]:
+    """Return the trends, the most significant first, in units of files and months."""
+    known = [item for item in drift.figures if item.trend is not None]
+    return [_trend_row(item, drift.times) for item in sorted(known, key=lambda item: item.adjusted)]
+
+
+def _trend_row(item: FigureDrift, times: Sequence[str]) -> TrendRow:
+    assert item.trend is not None
+    scale = 1.0 / error_named(item.figure.error).si_per_unit
+    unit, (rate, u), kelvin = UNITS[item.figure.unit], item.trend.slope, item.trend.per_kelvin
+    month = DAYS_A_MONTH * scale
+    return TrendRow(
+        item.figure.name,
+        unit,
+        rate * month,
+        COVERAGE * u * month,
+        item.adjusted,
+        None if kelvin is None else (kelvin[0] * scale, COVERAGE * kelvin[1] * scale),
+        [f"{step.size * scale:+.2f} before {times[step.after][:10]}" for step in item.trend.steps],
+        None if item.tolerance is None else item.tolerance * scale,
+        "" if item.forecast is None else item.forecast.words(item.figure.name),
+    )
+
+
+def drift_charts(drift: Drift) -> Sequence[Chart]:
+    """Draw the volume against what the active tables take out, temperatures, and the most significant figures."""
+    times = [datetime.fromisoformat(text) for text in drift.times]
+    seconds, marks = [time.timestamp() for time in times], time_ticks(times)
+    volume = [
+        Series("change against the active tables", seconds, [rms for rms, _ in drift.volume_um]),
+        Series("expected from the uncertainty alone", seconds, [expected for _, expected in drift.volume_um]),
+    ]
+    found = [chart("Change in the volume, rms, \N{MICRO SIGN}m", volume, marks)]
+    if drift.temperature_c is not None:
+        found.append(chart("Mean temperature, \N{DEGREE SIGN}C", [Series("mean", seconds, drift.temperature_c)], marks))
+    shown = sorted((item for item in drift.figures if item.trend is not None), key=lambda item: item.adjusted)
+    found += [_figure_chart(item, seconds, marks) for item in shown[:DRAWN]]
+    return [item for item in found if item is not None]
+
+
+def _figure_chart(item: FigureDrift, seconds: Sequence[float], marks: Sequence[tuple[float, str]]) -> Chart | None:
+    scale = 1.0 / error_named(item.figure.error).si_per_unit
+    value, u = item.series.value * scale, COVERAGE * item.series.u * scale
+    series = [Series("identified", seconds, value.tolist(), u.tolist())]
+    if item.tolerance is not None:
+        ends = np.array([item.reference - item.tolerance, item.reference + item.tolerance]) * scale
+        span = (seconds[0], seconds[-1])
+        series += [Series("limit of the tolerance", span, (end, end)) for end in ends.tolist()]
+    return chart(f"{item.figure.name}, {UNITS[item.figure.unit]}", series, marks)

@@ -46,10 +46,11 @@ class Comparison:
     reference_change_um: Mapping[str, float]
     accepted: bool | None
 
-    @property
-    def scale_um(self) -> float:
-        """The largest figure, for the lengths of the bars."""
-        return max([value for row in self.rows for value in row[1:] if value is not None], default=0.0) or 1.0
+    def bars(self, *values: float | None) -> list[float]:
+        """Return the lengths of bars for some figures, the longest 200 px."""
+        known = [value for value in values if value is not None]
+        largest = max(known, default=0.0) or 1.0
+        return [round(200.0 * value / largest, 1) for value in known]
 
 
 @dataclass(frozen=True)

@@ -10,17 +10,22 @@ from flask import Blueprint, Response, abort, current_app, render_template, requ
 from werkzeug.routing import IntegerConverter
 
 from compgen.errors import CompgenError, InputError
+from compgen.recal.recheck import format_recheck_points
 from compgen.recal.records import MachineRecord
 from compgen.resources import data_folder
-from compgen.serve.drift_view import change_rows
+from compgen.serve.background import NotReadyError
+from compgen.serve.drift_view import change_rows, drift_charts, trend_rows
 from compgen.serve.fleet import STATUSES, audit_page, fleet, fleet_page, machine_by_id
 from compgen.serve.history import history
 from compgen.serve.metrics import CONTENT_TYPE
 from compgen.serve.proposal import find_table, proposal
+from compgen.serve.recheck_view import basis, wanted_of
 from compgen.serve.service import Service
 from compgen.serve.sessions import same
 
 pages = Blueprint("reading", __name__)
+#: How long the page of a machine waits for the drift, s.
+A_MOMENT_S = 0.2
 NUMBER = "number(max=2147483647)"
 
 
@@ -63,9 +68,17 @@ def overview() -> str:
 
 @pages.get(f"/machines/<{NUMBER}:machine_id>")
 def machine(machine_id: int) -> str:
-    """Show one machine's history."""
-    service = own()
-    return render_template("machine.html", h=history(service.store, service.errors_of, the_machine(machine_id)))
+    """Show one machine's history; what its drift says, if that is known by now."""
+    service, found = own(), the_machine(machine_id)
+    sentences, problem = None, ""
+    try:
+        sentences = service.drift_of(found, A_MOMENT_S).sentences()
+    except NotReadyError:
+        problem = "The drift is being worked out."
+    except InputError as error:
+        problem = str(error)
+    told = history(service.store, service.errors_of, found)
+    return render_template("machine.html", h=told, sentences=sentences, problem=problem)
 
 
 @pages.get(f"/machines/<{NUMBER}:machine_id>/drift")
@@ -74,9 +87,41 @@ def drift(machine_id: int) -> str:
     found = the_machine(machine_id)
     try:
         known = own().drift_of(found)
+    except NotReadyError:
+        return render_template("drift.html", machine=found, waiting=True, problem="")
     except InputError as error:
-        return render_template("drift.html", machine=found, problem=str(error))
-    return render_template("drift.html", machine=found, problem="", drift=known, rows=change_rows(known))
+        return render_template("drift.html", machine=found, waiting=False, problem=str(error))
+    shown = {"rows": change_rows(known), "trends": trend_rows(known), "charts": drift_charts(known)}
+    return render_template("drift.html", machine=found, waiting=False, problem="", drift=known, **shown)
+
+
+@pages.get(f"/machines/<{NUMBER}:machine_id>/recheck")
+def recheck(machine_id: int) -> str:
+    """Show the fewest points at which a wanted change of one error would be seen."""
+    found, service = the_machine(machine_id), own()
+    page: dict[str, Any] = {"machine": found, "waiting": False, "problem": "", "start": None, "plan": None}
+    try:
+        page["start"] = start = basis(service.store, found)
+        page["wanted"], page["change"] = wanted_of(request.args, start, service.job.tolerances(found.name))
+        page["plan"] = service.recheck_of(start, page["wanted"])
+    except NotReadyError:
+        page["waiting"] = True
+    except InputError as error:
+        page["problem"] = str(error)
+    return render_template("recheck.html", **page)
+
+
+@pages.get(f"/machines/<{NUMBER}:machine_id>/recheck.points.csv")
+def recheck_points(machine_id: int) -> Response:
+    """Send the points of a re-check as a points file; 409 for one that cannot be, 503 while it is worked out."""
+    found, service = the_machine(machine_id), own()
+    start = basis(service.store, found)
+    wanted, _ = wanted_of(request.args, start, service.job.tolerances(found.name))
+    try:
+        plan = service.recheck_of(start, wanted)
+    except NotReadyError:
+        abort(503, "The points are being worked out; ask again in a moment.")
+    return _download(format_recheck_points(plan).encode(), "recheck.points.csv")
 
 
 @pages.get(f"/machines/<{NUMBER}:machine_id>/tables/<{NUMBER}:version>")
@@ -98,8 +143,11 @@ def download(machine_id: int, version: int, position: int) -> Response:
     if not 1 <= position <= len(files):
         abort(404, "There is no such file.")
     file = files[position - 1]
-    name = re.sub(r"[^A-Za-z0-9._-]", "_", file.name.rpartition("/")[2]).lstrip(".") or "file"
-    response = Response(file.content, mimetype="application/octet-stream")
+    return _download(file.content, re.sub(r"[^A-Za-z0-9._-]", "_", file.name.rpartition("/")[2]).lstrip(".") or "file")
+
+
+def _download(content: bytes, name: str) -> Response:
+    response = Response(content, mimetype="application/octet-stream")
     response.headers["Content-Disposition"] = f'attachment; filename="{name}"'
     return response
 

@@ -11,10 +11,12 @@ from compgen.recal import actions, decisions
 from compgen.recal.job import read_job
 from compgen.recal.records import DecisionRecord, MachineRecord
 from compgen.recal.store import Store
-from compgen.serve.drift_view import DriftCache
+from compgen.serve.background import Background
+from compgen.serve.drift_view import DriftCache, JobFile
 from compgen.serve.history import ErrorCache
 from compgen.serve.limits import LoginLimit
 from compgen.serve.metrics import ServeMetrics
+from compgen.serve.recheck_view import RecheckCache
 from compgen.serve.sessions import LoginTokens, Sessions
 from compgen.serve.settings import Settings
 from compgen.serve.users import Users
@@ -36,6 +38,8 @@ class Service:
     metrics: ServeMetrics
     errors_of: ErrorCache
     drift_of: DriftCache
+    recheck_of: RecheckCache
+    job: JobFile
 
     def may_decide(self, user: str) -> bool:
         """Whether this user may approve, reject and roll back here."""
@@ -47,8 +51,20 @@ def make_service(settings: Settings, store: Store, clock: Callable[[], float] = 
     sessions = Sessions(clock)
     users = Users(settings.users) if settings.login and settings.users is not None else None
     metrics = ServeMetrics(store, lambda: len(sessions))
-    shared = (sessions, LoginTokens(), LoginLimit(clock), metrics, ErrorCache(store), DriftCache(store))
-    return Service(settings, store, users, *shared)
+    background, job = Background(), JobFile(settings.job)
+    return Service(
+        settings,
+        store,
+        users,
+        sessions,
+        LoginTokens(),
+        LoginLimit(clock),
+        metrics,
+        ErrorCache(store),
+        DriftCache(store, background, job),
+        RecheckCache(store, background),
+        job,
+    )
 
 
 @dataclass(frozen=True)
