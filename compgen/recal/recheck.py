@@ -255,10 +255,14 @@ def _pruned(chosen: Sequence[int], reached: Callable[[Sequence[int]], bool]) -> 
     return kept
 
 
+def format_recheck_points(recheck: Recheck) -> str:
+    """Return the points as the text of a points file."""
+    columns = {name: recheck.position_mm[:, k] for k, name in enumerate(POSITION_COLUMNS)}
+    return format_csv(columns, {"source": "compgen recal recheck"}, dict.fromkeys(POSITION_COLUMNS, 3))
+
+
 def write_recheck_points(path: Path, recheck: Recheck) -> Path:
     """Write the points as a points file, whole or not at all."""
-    columns = {name: recheck.position_mm[:, k] for k, name in enumerate(POSITION_COLUMNS)}
-    text = format_csv(columns, {"source": "compgen recal recheck"}, dict.fromkeys(POSITION_COLUMNS, 3))
     folder = OutputFolder(path.parent)
-    folder.add(path.name, text)
+    folder.add(path.name, format_recheck_points(recheck))
     return next(iter(folder.commit().values()))
