@@ -179,9 +179,11 @@ def _completed(
     found = refit(analysis, added)
     show("testing on lines, stations and times left out")
     scene = analysis.scene
-    columns = [scene.groups[g].columns @ scene.maps[g] for g in added if scene.size(g)]
-    predicting = [scene.groups[g].columns @ scene.maps[g] for g in added if scene.groups[g].predicts and scene.size(g)]
-    gap = gap_of(analysis.fit, columns, predicting, analysis.noise)
+    seen = {g: scene.groups[g].columns @ scene.maps[g] for g in added if scene.size(g)}
+    base = [columns for g, columns in seen.items() if scene.groups[g].tier == "base"]
+    columns = [columns for g, columns in seen.items() if scene.groups[g].tier != "base"]
+    predicting = [columns for g, columns in seen.items() if scene.groups[g].tier != "base" and scene.groups[g].predicts]
+    gap = gap_of(analysis.fit, columns, predicting, analysis.noise, base)
     if before is not analysis.fit:
         gap = replace(gap, train=replace(gap.train, before_mm=before.rms_mm))
     if analysis.fit.rms_mm > HOPELESS_MM:

@@ -55,7 +55,13 @@ class Gap:
     residual_after_mm: FloatArray
 
 
-def gap_of(fit: BaseFit, added: Sequence[FloatArray], predicting: Sequence[FloatArray], noise: Noise) -> Gap:
+def gap_of(
+    fit: BaseFit,
+    added: Sequence[FloatArray],
+    predicting: Sequence[FloatArray],
+    noise: Noise,
+    base: Sequence[FloatArray] = (),
+) -> Gap:
     """Compute the gap.
 
     Parameters
@@ -64,12 +70,14 @@ def gap_of(fit: BaseFit, added: Sequence[FloatArray], predicting: Sequence[Float
     added : columns (n, k) of everything that was added.
     predicting : those of them that say something about readings that were left out.
     noise : the noise model.
+    base : columns that belong to the base model beside those of its fit: they are there before and after.
     """
-    count, base = len(fit.residual_mm), fit.base_size
+    count = len(fit.residual_mm)
+    columns = np.hstack([fit.jacobian[:, : fit.base_size], *base])
     weight = 1.0 / noise.scale
-    everything = _Problem(fit.jacobian[:, :base], _hstack(added, count), fit.residual_mm, weight)
+    everything = _Problem(columns, _hstack(added, count), fit.residual_mm, weight)
     before, after = everything.fitted(False), everything.fitted(True)
-    some = _Problem(fit.jacobian[:, :base], _hstack(predicting, count), fit.residual_mm, weight)
+    some = _Problem(columns, _hstack(predicting, count), fit.residual_mm, weight)
     layout = fit.observed.layout
     lines = _line_folds(layout.condition[layout.stop])
     stations = layout.channel if _stations_left(fit) else None

@@ -7,7 +7,7 @@ groups pay the evidence of a random effect with optimised prior variance, k + k 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,11 +26,19 @@ LEAST_SQUARE = 1e-6
 
 @dataclass(frozen=True)
 class Rules:
-    """What the search may do: ``named`` is the number of named effects, ``most_named`` how many may be chosen."""
+    """What the search may do.
+
+    Parameters
+    ----------
+    named : number of named effects.
+    most_named, most_members : how many named effects and groups in all may be chosen.
+    predicting : whether groups that say nothing about other readings (an offset of each line) are left out.
+    """
 
     named: int
     most_named: int = 4
     most_members: int = MOST_MEMBERS
+    predicting: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,14 +136,14 @@ def gain_of(scene: Scene, others: Sequence[int], group: int) -> float:
     return float(gains(scene, beside(scene, others), [group])[0])
 
 
-def _allowed(scene: Scene, rules: Rules, members: Sequence[int]) -> list[int]:
-    """Groups that may be added: of another name, visible, and within the numbers allowed."""
+def allowed_beside(scene: Scene, rules: Rules, members: Sequence[int]) -> list[int]:
+    """Groups that may be added: of another name, visible, allowed by the rules, and within the numbers allowed."""
     names = {scene.groups[g].name for g in members}
     reported = [g for g in members if scene.groups[g].tier != "base"]
     named = sum(scene.groups[g].tier == "named" for g in members)
     found = []
     for g, group in enumerate(scene.groups):
-        if group.name in names or not scene.size(g):
+        if group.name in names or not scene.size(g) or (rules.predicting and not group.predicts):
             continue
         if group.tier == "named" and named >= rules.most_named:
             continue
@@ -147,7 +155,7 @@ def _allowed(scene: Scene, rules: Rules, members: Sequence[int]) -> list[int]:
 
 def _best_additions(scene: Scene, rules: Rules, members: Sequence[int], most: int) -> list[Chosen]:
     """The sets with one more group that lower the criterion most."""
-    allowed = _allowed(scene, rules, members)
+    allowed = allowed_beside(scene, rules, members)
     if not allowed:
         return []
     gained = gains(scene, beside(scene, members), allowed)
@@ -163,7 +171,21 @@ def _best_additions(scene: Scene, rules: Rules, members: Sequence[int], most: in
 
 
 def search(scene: Scene, rules: Rules, start: Sequence[int] = ()) -> Chosen:
-    """Find the set with the smallest criterion; then drop members that are not significant."""
+    """Find the set with the smallest criterion; then drop members that are not significant.
+
+    A free offset of each line holds everything that is constant in a line, so that what it took up first finds no way
+    in any more: where one won, a search without such groups is made as well.
+    """
+    found = _forward(scene, rules, start)
+    rest = [g for g in found.members if scene.groups[g].predicts]
+    if len(rest) < len(found.members):
+        other = _forward(scene, replace(rules, predicting=True), rest)
+        found = other if other.criterion < found.criterion else found
+    return with_names(scene, rules, found)
+
+
+def _forward(scene: Scene, rules: Rules, start: Sequence[int]) -> Chosen:
+    """Forward beam from ``start``, drops and swaps, then the prune."""
     best = evaluate(scene, rules, start)
     beam = [best]
     while True:
@@ -178,7 +200,7 @@ def search(scene: Scene, rules: Rules, start: Sequence[int] = ()) -> Chosen:
         if beam[0].criterion >= best.criterion - 1e-6:
             break
         best = min(beam, key=lambda item: item.criterion)
-    return with_names(scene, rules, prune(scene, rules, _improved(scene, rules, best)))
+    return prune(scene, rules, _improved(scene, rules, best))
 
 
 def _improved(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:
@@ -204,12 +226,7 @@ def with_names(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:
     """Put names in place of generic groups that hold the same law with more freedom: a shape that is not quite exact."""
     for generic in [g for g in chosen.members if scene.groups[g].tier == "generic"]:
         rest = [g for g in chosen.members if g != generic]
-        own = plain_covariates(scene.groups[generic].covariates) - {"x", "y", "z"}
-        related = [
-            g
-            for g in _allowed(scene, rules, rest)
-            if scene.groups[g].tier == "named" and own and own <= plain_covariates(scene.groups[g].covariates)
-        ]
+        related = [g for g in allowed_beside(scene, rules, rest) if _related(scene, generic, g)]
         if not related:
             continue
         gained = gains(scene, beside(scene, rest), related)
@@ -217,6 +234,16 @@ def with_names(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:
         if gained[best] > SAME_LAW * gain_of(scene, rest, generic):
             chosen = evaluate(scene, rules, [*rest, related[best]])
     return chosen
+
+
+def _related(scene: Scene, generic: int, group: int) -> bool:
+    """Whether a group is a name for what depends on the covariates of a generic one; offsets of lines hold them all."""
+    if scene.groups[group].tier != "named":
+        return False
+    if not scene.groups[generic].predicts:
+        return True
+    own = plain_covariates(scene.groups[generic].covariates) - {"x", "y", "z"}
+    return bool(own) and own <= plain_covariates(scene.groups[group].covariates)
 
 
 def plain_covariates(names: tuple[str, ...]) -> set[str]:
@@ -253,37 +280,3 @@ def prune(scene: Scene, rules: Rules, chosen: Chosen) -> Chosen:
             break
         members.remove(worst)
     return chosen if len(members) == len(chosen.members) else evaluate(scene, rules, members)
-
-
-@dataclass(frozen=True)
-class Alternative:
-    """A name that explains the readings almost as well in place of a member, with its weight and correlation."""
-
-    name: str
-    weight: float
-    group: int
-
-
-#: Difference of the criterion within which a name belongs to the set of 99 %.
-WITHIN = 9.2
-
-
-def alternatives(scene: Scene, rules: Rules, chosen: Chosen, member: int) -> list[Alternative]:
-    """Names that could stand in place of a named member, itself first, with weights that add up to 1."""
-    rest = [g for g in chosen.members if g != member]
-    allowed = [g for g in _allowed(scene, rules, rest) if scene.groups[g].tier == "named"]
-    gained = gains(scene, beside(scene, rest), allowed)
-    rough = {g: penalty(scene, rules, g, 0.0) - gain for g, gain in zip(allowed, gained, strict=True)}
-    reference = rough.get(member, 0.0)
-    best: dict[str, int] = {}
-    for g in sorted(rough, key=lambda g: rough[g]):
-        if scene.groups[g].name not in best and rough[g] - reference < 3 * WITHIN:
-            best[scene.groups[g].name] = g
-    best[scene.groups[member].name] = member
-    values = {name: evaluate(scene, rules, [*rest, g]).criterion for name, g in best.items()}
-    least = min(values.values())
-    kept = {name: value for name, value in values.items() if value - least <= WITHIN}
-    weights = {name: float(np.exp(-0.5 * (value - least))) for name, value in kept.items()}
-    total = sum(weights.values())
-    found = [Alternative(name, weight / total, best[name]) for name, weight in weights.items()]
-    return sorted(found, key=lambda item: -item.weight)

@@ -8,10 +8,11 @@ from typing import Literal
 import numpy as np
 
 from compgen.core.names import SQUARENESS_NAMES
+from compgen.diagnose.alternatives import Alternative, alternatives
 from compgen.diagnose.analysis import Analysis
 from compgen.diagnose.evidence import HOMOGENEITY_P, contribution
 from compgen.diagnose.groups import Group
-from compgen.diagnose.search import Alternative, alternatives, plain_covariates
+from compgen.diagnose.search import plain_covariates
 from compgen.effects import catalogue
 
 Grade = Literal["confirmed", "beside_unknown", "tentative"]
@@ -21,6 +22,8 @@ Word = Literal["named", "none", "unknown", "not_decidable"]
 LEAST_VISIBLE = 0.05
 #: A name is not confirmed if its chi-square is below this share of that of all members without a (firm) name.
 LEAST_SHARE = 0.1
+#: The same for a step whose time was searched for: among many times one suits any slow change a little.
+LEAST_STEP_SHARE, MANY_SCANS = 0.5, 20
 #: p-value of the homogeneity below which a name is not confirmed beside something that has no name.
 HOMOGENEITY_BESIDE_P = 0.01
 #: Unevenness that explains less than this share of the chi-square of a name is its inexact shape, not another effect.
@@ -157,13 +160,15 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     name, chi2, p = scene.groups[group].name, evidence.chi2[group], evidence.homogeneity_p[group]
     visible = float(scene.visible[group])
     reasons = []
-    inexact = inexact or (p < HOMOGENEITY_P and evidence.uneven[group] < SLIGHTLY_UNEVEN * chi2)
-    if p < (HOMOGENEITY_BESIDE_P if generic else HOMOGENEITY_P) and not inexact:
+    slight = evidence.uneven[group] < SLIGHTLY_UNEVEN * chi2
+    inexact = inexact or (p < HOMOGENEITY_P and slight)
+    if p < (HOMOGENEITY_BESIDE_P if generic else HOMOGENEITY_P) and not (inexact or slight):
         reasons.append(f"does not behave like it everywhere (p = {p:.1e})")
     if evidence.misfits and chi2 < evidence.excess:
         reasons.append("explains less than what remains unexplained")
     failed = [g for g, own in evidence.homogeneity_p.items() if g != group and own < HOMOGENEITY_P]
-    if generic and chi2 < LEAST_SHARE * sum(evidence.chi2[g] for g in (*generic, *failed)):
+    share = LEAST_STEP_SHARE if scene.groups[group].scans > MANY_SCANS else LEAST_SHARE
+    if generic and chi2 < share * sum(evidence.chi2[g] for g in (*generic, *failed)):
         reasons.append("small beside what has no name")
     if name in NEVER_CONFIRMED or visible < LEAST_VISIBLE:
         reasons.append(f"the plan shows {100 * visible:.1f} % of it only: any misfit could be reshaped into it")
