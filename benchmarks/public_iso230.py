@@ -41,6 +41,7 @@ _FIGURE = re.compile(
     r"^\s*\**\s*([A-Z](?:_avg|_fwd|_bwd)?)\s*=\s*(-?[0-9.]+(?:e[-+]?\d+)?)\s*\[?(\w*)\]?\s*\**\s*$", re.M
 )
 _TABLE = re.compile(r"#+ Data (forward|backward) direction(.*?)(?=\n#)", re.S)
+_AT_TARGETS = re.compile(r"^(i \|[^\n]*(?:B|R)\(i\) \[[^\n]*)\n((?:[-0-9][^\n]*\n)+)", re.M)
 _GEAR = re.compile(r"^\S.*\|\s*Reference[^|]*\|\s*(\S+)\s*\|\s*(\S+)\s*\|[^|]*\|\s*([0-9.eE-]*)", re.M)
 
 
@@ -54,6 +55,7 @@ class Report:
     readings_mm: Mapping[str, Array]
     half_um: float
     gear: tuple[str, str, str] | None
+    at_targets: Mapping[str, Array]
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,19 @@ def read_report(path: Path) -> Report | None:
         {name: table[:, 1:] * scale * 1e-3 for name, table in numbers.items()},
         0.5 * 10.0**-digits * scale,
         (gear.group(1), gear.group(2), gear.group(3)) if gear else None,
+        {name: np.array(values) * scale for name, values in _columns(text).items()},
     )
+
+
+def _columns(text: str) -> dict[str, list[float]]:
+    """Columns of the tables over the targets by the start of their headings: B(i), S_fwd(i) ... R(i)."""
+    found: dict[str, list[float]] = {}
+    for header, body in _AT_TARGETS.findall(text):
+        names = [cell.split()[0] for cell in header.split("|")[1:] if cell.strip()]
+        for row in _rows(body):
+            for name, cell in zip(names, row[1:], strict=False):
+                found.setdefault(name, []).append(float(cell))
+    return found
 
 
 def _rows(body: str) -> list[list[str]]:
@@ -148,6 +162,25 @@ def compared(found: PositioningTest, report: Report, forward: int, rounded_um: f
         remark = "" if agrees else _explained(name, printed, found, allowed)
         rows.append(Row(name, ours, printed, remark, agrees))
     return rows
+
+
+def at_targets(found: PositioningTest, report: Report, forward: int, rounded_um: float = 0.0) -> str:
+    """Count the values at single targets that agree: mean, reversal, both s, all R."""
+    ours = {
+        "x_avg(i)": found.targets["mean_um"],
+        "B(i)": forward * found.targets["B_um"],
+        "R(i)": found.targets["R_um"],
+    }
+    for label, end in (("fwd", "up" if forward > 0 else "down"), ("bwd", "down" if forward > 0 else "up")):
+        ours |= {f"S_{label}(i)": found.targets[f"s_{end}_um"], f"R_{label}(i)": found.targets[f"R_{end}_um"]}
+    order, count, agree = np.argsort(report.target_mm), 0, 0
+    for name, values in ours.items():
+        printed = report.at_targets.get(name, np.zeros(0))
+        if len(printed) == len(values):
+            allowed = report.half_um * 1.001 + rounded_um * _sensitivity("R", found)
+            count += len(values)
+            agree += int(np.count_nonzero(np.abs(printed[order] - values) <= allowed))
+    return f"values at the targets: {agree} of {count} agree"
 
 
 def _sensitivity(name: str, found: PositioningTest) -> float:
@@ -226,12 +259,13 @@ def checked(data: Path | None, reports: Sequence[Report]) -> tuple[list[Row], li
             copy.write_text(data_text(report), encoding="utf-8")
             found, runs = evaluated(copy)
         rows, gear = compared(found, report, 1, report.half_um), removed(report, runs, report.half_um)
-        return rows, ["from the rounded readings of the report; its forward taken as positive", gear]
+        said = ["from the rounded readings of the report; its forward taken as positive", gear]
+        return rows, [*said, at_targets(found, report, 1, report.half_um)]
     found, runs = evaluated(data)
     for report in reports:
         forward = direction_of_forward(report, runs)
         if forward is not None:
-            said = [f"report {report.path.name}", removed(report, runs)]
+            said = [f"report {report.path.name}", at_targets(found, report, forward), removed(report, runs)]
             if forward < 0:
                 said.append(
                     "forward of the report is REF_DATA_BWD of the data: exchanged; the data's labels were followed"

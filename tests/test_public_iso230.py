@@ -56,9 +56,21 @@ def report_text(printed=PRINTED, residual=None, shift=0.0):
         for i, row in enumerate(table):
             lines.append(f"{i + 1}|{100.0 * i}|" + "".join(f"{round(value + shift, 5)}|" for value in row))
     lines += ["", "## Calculations", ""]
+    lines += target_tables()
     for key, value in printed.items():
         lines += ["", f"{key} = Some figure of an axis [mm]", "", f"**{key} = {round(value, 5)} [mm]** "]
     return "\n".join(lines) + "\n"
+
+
+def target_tables():
+    """Mean and reversal, then s and R of both directions and R at each target, forward being the negative direction."""
+    lines = ["i |x_avg(i) [mm]|B(i) [mm]|", "--- |--- |"]
+    for i, ((up, _), (down, _)) in enumerate(zip(UP, DOWN, strict=True), start=1):
+        lines.append(f"{i}|{(up + down) * 0.5e-3:.5f}|{(down - up) * 1e-3:.5f}|")
+    lines += ["", "i |S_fwd(i) [mm]|S_bwd(i) [mm]|R_fwd(i) [mm]|R_bwd(i) [mm]|R(i) [mm]|", "--- |--- |--- |"]
+    for i, ((_, s_u), (_, s_d), r) in enumerate(zip(UP, DOWN, (7, 10, 9, 10, 13), strict=True), start=1):
+        lines.append(f"{i}|{s_d * 1e-3:.5f}|{s_u * 1e-3:.5f}|{s_d * 4e-3:.5f}|{s_u * 4e-3:.5f}|{r * 1e-3:.5f}|")
+    return [*lines, ""]
 
 
 @pytest.fixture
@@ -80,6 +92,7 @@ def test_a_report_is_found_by_its_readings_and_its_figures_are_compared(benchmar
         assert float(lines_of(text, name)[1]) == pytest.approx(1e3 * PRINTED[name], abs=1e-4)
         assert len(lines_of(text, name)) == 4, "no remark: it agrees"
     assert "report another_name.md" in text
+    assert "values at the targets: 35 of 35 agree" in text
     assert "forward of the report is REF_DATA_BWD of the data: exchanged" in text
     assert "reference reading x -.998 + 5.0 mm, fitted to these readings" in text
     assert "B, M, A differ in: none" in text
@@ -105,6 +118,14 @@ def test_a_figure_that_no_known_rule_gives_is_said_not_to_be_explained(benchmark
     (folder / "another_name.md").write_text(report_text({**PRINTED, "R": 0.0125, "E": 0.009}))
     assert benchmark.main([str(folder)]) == 0
     assert capsys.readouterr().out.count("NOT EXPLAINED") == 2
+
+
+def test_a_value_at_a_target_that_is_printed_otherwise_is_counted(benchmark, folder, capsys):
+    text = report_text()
+    assert text.count("|0.01300|") == 1
+    (folder / "another_name.md").write_text(text.replace("|0.01300|", "|0.01310|"))
+    assert benchmark.main([str(folder)]) == 0
+    assert "values at the targets: 34 of 35 agree" in capsys.readouterr().out
 
 
 def test_a_report_of_other_readings_is_not_compared(benchmark, folder, capsys):
