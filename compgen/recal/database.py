@@ -113,6 +113,8 @@ def retried(action: Callable[[], Result], url: str, wait: Callable[[float], None
             return action()
         except sa.exc.IntegrityError:
             raise
+        except UnicodeDecodeError as error:  # SQLite shows a piece of the damage in its message
+            raise StoreError(f"the store {shown(url)} is damaged: {error}; restore a backup") from error
         except (sa.exc.DBAPIError, sa.exc.TimeoutError) as error:
             waited = time.monotonic() - started >= BUSY_S
             if pause is None or waited or not _may_pass(error):
