@@ -45,8 +45,12 @@ def identified_reversal(found: Identification) -> KnownReversal:
     if found.reversal_curves is not None:
         return KnownReversal(found.reversal_curves, "reversal: identified, over the position of each axis")
     if found.reversal is None:
+        if found.method in ("joint", "two-step", "deviations"):
+            return KnownReversal(
+                None, "reversal: not known: no position was approached from both directions, as far as told"
+            )
         return KnownReversal(
-            None, "reversal: not known: no position was approached from both directions, or none is told"
+            None, "reversal: not known: none stands out of its uncertainty, or one direction was measured"
         )
     curves = {}
     for name, axis in found.reversal.axes.items():
