@@ -35,6 +35,7 @@ _HELP = {
     "directions": "labels: as the file names them; motion: from the order of the rows; alternate: odd runs up, even down.",
     "sheet": "Sheet of a workbook.",
     "dates": "Order of dates such as 03/04/2025 (never guessed): day, month, year.",
+    "decimal": "Decimal mark of a table; the other one parts thousands (asked for where 1,000 may be either).",
     "zero_runs": "Laser runs that are zero at every target: not made (drop) or measured (keep).",
     "machine": "Machine whose travel the positions are held against.",
     "machines": "Further folder with machine files (may be given several times).",
@@ -67,6 +68,7 @@ def _pairs(given: Sequence[str], option: str, alone: str | None = None) -> dict[
 @click.option("--directions", type=click.Choice(("labels", "motion", "alternate")), help=_HELP["directions"])
 @click.option("--sheet", metavar="NAME", help=_HELP["sheet"])
 @click.option("--dates", type=click.Choice(("dmy", "mdy", "ymd")), help=_HELP["dates"])
+@click.option("--decimal", type=click.Choice(("comma", "point")), help=_HELP["decimal"])
 @click.option("--zero-runs", type=click.Choice(("drop", "keep")), help=_HELP["zero_runs"])
 @click.option("--machine", metavar="MACHINE", help=_HELP["machine"])
 @click.option("--machines", multiple=True, type=click.Path(path_type=Path), help=_HELP["machines"])

@@ -42,19 +42,20 @@ _UNIT_WORDS = {
 FIELDS: Mapping[str, tuple[str, ...]] = {
     "position": ("position", "pos", "target", "targetposition", "nominal", "nominalposition", "soll", "sollposition",
                  "sollwert", "command", "commanded", "cmd", "setpoint", "targets", "zielposition", "axisposition",
-                 "posizione", "posicion", "cible", "consigne"),
+                 "posizione", "posicion", "cible", "consigne",
+                 "\u4f4d\u7f6e", "\u76ee\u6807\u4f4d\u7f6e"),
     "actual": ("actual", "actualposition", "measured", "measuredposition", "ist", "istposition", "istwert", "reading",
                "laserreading", "laserposition", "measurement", "mesure", "misura", "medida"),
     "deviation": ("deviation", "dev", "error", "err", "abweichung", "positionsabweichung", "fehler", "diff", "difference",
                   "delta", "poserror", "positionerror", "positioningerror", "positiondeviation", "ecart", "erreur", "scarto",
-                  "scostamento", "errore", "desviacion"),
+                  "scostamento", "errore", "desviacion", "\u504f\u5dee", "\u8bef\u5dee"),
     "correction": ("correction", "compensation", "comp", "korrektur", "korrekturwert", "compensationvalue",
                    "correzione", "correccion"),
     "direction": ("direction", "dir", "richtung", "approach", "fahrtrichtung", "way", "anfahrrichtung",
-                  "sens", "direzione", "direccion"),
+                  "sens", "direzione", "direccion", "\u65b9\u5411"),
     "run": ("run", "cycle", "lauf", "messlauf", "pass", "zyklus", "runno", "runnumber", "cycleno", "messreihe",
             "essai", "prova", "ciclo", "ensayo"),
-    "axis": ("axis", "achse", "axe", "asse", "eje"),
+    "axis": ("axis", "achse", "axe", "asse", "eje", "\u8f74"),
     "station": ("station", "tracer", "stationid", "trackerposition", "standpunkt"),
     "point": ("point", "pointid", "pt", "punkt", "pointno", "pointname", "target id", "id", "no", "nr"),
     "length": ("length", "displacement", "distance", "laenge", "lange", "laserlength", "laser", "range", "abstand",
@@ -185,8 +186,7 @@ def quantity_of(word: str) -> Quantity | None:
 
 
 def _word(text: str) -> str:
-    flat = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
-    return re.sub(r"[^a-z0-9]", "", flat)
+    return re.sub(r"[^a-z0-9\u4e00-\u9fff]", "", unicodedata.normalize("NFKD", text).lower())
 
 
 def fields_of(header: Sequence[str], given: Mapping[str, str]) -> dict[str, Column]:

@@ -14,6 +14,7 @@ from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, Column, known_
 from compgen.imports.grid import Table
 from compgen.imports.hypotheses import ABSURD_DECADES, Verdict, decades_off, unit_of_deviations, unit_of_positions
 from compgen.imports.result import ImportOptions
+from compgen.imports.source import shown
 
 #: Units that are weighed when a file says none.
 _LENGTHS = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "nm", "in")}
@@ -52,10 +53,21 @@ class Findings:
         unit = self.given_unit(key) or self.given_unit("position") or self.fields[key].unit
         if unit is None:
             judged = unit_of_positions(float(np.ptp(values)))
-            unit = self._weighed(f"unit of {key}", judged)
+            inches = self._inches()
+            if inches and judged.best != "in":
+                self.doubts.append(
+                    f"{inches} is in inches, and no unit of {key} stands in the file; give --unit {key}=in or mm"
+                )
+            unit = judged.best if inches else self._weighed(f"unit of {key}", judged)
         self._length(unit, key)
         self.understood.setdefault("position_unit", unit)
         return values * MM_PER_LENGTH[unit]
+
+    def _inches(self) -> str | None:
+        """Return the first field that is said to be in inches; positions are then probably so too."""
+        said = {key: known_unit(unit) for key, unit in self.options.units.items()}
+        said |= {shown(column.name): column.unit for column in self.fields.values() if column.unit}
+        return next((key for key, unit in said.items() if unit in ("in", "mil")), None)
 
     def values_si(self, key: str, name: str, values: FloatArray, usual_si: float, *, angular: bool) -> FloatArray:
         """Return deviations in mm or rad: by the user's word, the column's name, else by their size.

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import csv
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from compgen.errors import InputError
+from compgen.imports.decimals import plain_decimals
 from compgen.imports.source import LARGEST, Text, parse_number, shown
 
 #: The rows of the largest sheet there is.
@@ -20,10 +20,6 @@ MOST_CELLS = 10_000_000
 _SAMPLE_LINES, _HEADER_LINES = 200, 200
 #: Letters of words that Python takes for numbers (inf, nan), and a comma: a column without them is converted at once.
 _NOT_PLAIN = frozenset("infa,")
-_THOUSANDS_COMMA = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d+")
-_THOUSANDS_POINT = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
-_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-_POINT = re.compile(r"[+-]?\d*\.\d+([eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -127,41 +123,17 @@ def _separator(lines: Sequence[str]) -> str | None:
     return best
 
 
-def _plain_decimals(grid: Grid, rows: list[list[str]], lines: Sequence[int]) -> tuple[list[list[str]], bool]:
-    """Turn decimal commas into points if the rows use them; InputError for rows that mix both."""
-    if not any("," in cell for row in rows for cell in row):
-        return rows, False
-    comma = point = 0
-    for row, line in zip(rows, lines, strict=True):
-        for cell in row:
-            if _COMMA.fullmatch(cell) or _THOUSANDS_POINT.fullmatch(cell):
-                comma = comma or line
-            elif _POINT.fullmatch(cell) or _THOUSANDS_COMMA.fullmatch(cell):
-                point = point or line
-    if comma and point:
-        message = f"a decimal comma stands here, a decimal point in line {point}; write all numbers in one way"
-        raise grid.fail(message, comma)
-    changed = comma or any(_THOUSANDS_COMMA.fullmatch(cell) for row in rows for cell in row)
-    return [[_plain(cell) for cell in row] for row in rows] if changed else rows, bool(comma)
-
-
-def _plain(cell: str) -> str:
-    if _COMMA.fullmatch(cell):
-        return cell.replace(",", ".")
-    if _THOUSANDS_POINT.fullmatch(cell):
-        return cell.replace(".", "").replace(",", ".")
-    return cell.replace(",", "") if _THOUSANDS_COMMA.fullmatch(cell) else cell
-
-
-def find_table(grid: Grid) -> Table:
+def find_table(grid: Grid, decimal: str | None = None) -> Table:
     """Find header and rows: the first row of names that rows of numbers follow; what stands above is metadata.
+
+    ``decimal`` is the decimal mark, "comma" or "point", if the user says it.
 
     Raises InputError if there is none, and for a row of another width below the header.
     """
     metadata: dict[str, str] = {}
     for k, row in enumerate(grid.rows[:_HEADER_LINES]):
         if _is_header(grid, k):
-            return _table(grid, k, metadata)
+            return _table(grid, k, metadata, decimal)
         _note(row, metadata)
     raise grid.fail(
         "holds no table: a header line with the names of the columns, and rows of numbers below it, are due"
@@ -215,7 +187,7 @@ def _note(row: Sequence[str], metadata: dict[str, str]) -> None:
         metadata.setdefault("title", text)
 
 
-def _table(grid: Grid, k: int, metadata: dict[str, str]) -> Table:
+def _table(grid: Grid, k: int, metadata: dict[str, str], decimal: str | None) -> Table:
     header = [name.lstrip("#% ") for name in grid.rows[k]]
     while header and not header[-1]:
         header.pop()
@@ -235,7 +207,10 @@ def _table(grid: Grid, k: int, metadata: dict[str, str]) -> Table:
         grid = replace(
             grid, notes=(*grid.notes, f"what stands from line {below} on is no row of the table and was left out")
         )
-    plain, commas = _plain_decimals(grid, rows, lines)
+    try:
+        plain, commas = plain_decimals(rows, lines, decimal)
+    except InputError as error:
+        raise grid.fail(error.message, error.line) from error
     if commas:
         grid = replace(grid, notes=(*grid.notes, "decimal commas were read as decimal points"))
     return Table(grid, names, grid.lines[k], plain, lines, metadata)

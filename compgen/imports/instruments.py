@@ -17,7 +17,7 @@ from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, known_unit
 from compgen.imports.dates import header_date
 from compgen.imports.ecmc import read_ecmc
 from compgen.imports.hypotheses import ABSURD_DECADES, decades_off, unit_of_deviations, usual_deviation_mm
-from compgen.imports.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion
+from compgen.imports.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion, remarks
 from compgen.imports.renishaw import UNITS, Renishaw, read_renishaw, without_runs
 from compgen.imports.result import Imported, ImportOptions, Kind
 from compgen.imports.source import read_source
@@ -62,6 +62,7 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     if options.sign == "correction":
         runs = runs.negated()
         notes.append("the values were said to be corrections: their sign was turned round")
+    notes += remarks(runs, axis or "")
     understood = {
         "axis": axis,
         **_facts(runs, angular=angular),
@@ -185,6 +186,7 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
         runs = replace(runs, direction=motion(runs.position_mm, 2 * runs.run + (runs.direction < 0)))
     if options.sign == "correction":
         runs = runs.negated()
+    notes += remarks(runs, axis or "")
     understood = {
         "axis": axis,
         **_facts(runs, angular=False),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
-from compgen.core.names import AXES, CURVE_NAMES, MM_PER_UM, error_named
+from compgen.core.names import AXES, CURVE_NAMES, error_named
 from compgen.core.reversal import ReversalCurves
 from compgen.core.text import nearest
 from compgen.errors import InputError
@@ -136,7 +136,36 @@ def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[E
     return table, ReversalCurves({(name.axis, name.direction): gap}, dict(metadata))
 
 
-def sizes_um(runs: OneAxis) -> str:
-    """Say in words how large linear readings are."""
-    largest = float(np.max(np.abs(runs.value))) / MM_PER_UM
-    return f"largest {largest:.4g} um over {float(np.ptp(runs.position_mm)):g} mm"
+def remarks(runs: OneAxis, axis: str) -> list[str]:
+    """Say which runs are missing, which readings, and which runs are equal to the last digit; nothing for a regular test."""
+    found, name = [], f"axis {axis}" if axis else "the axis"
+    numbers = np.unique(runs.run)
+    gaps = sorted(set(range(1, int(numbers[-1]) + 1)) - set(numbers.tolist()))
+    if 0 < len(gaps) <= len(numbers):
+        found.append(f"{name}: there is no run {', '.join(map(str, gaps[:8]))}")
+    keys = np.round(runs.position_mm / SAME_TARGET_MM).astype(np.int64)
+    _, target = np.unique(keys, return_inverse=True)
+    _, one_way = np.unique(2 * runs.run + (runs.direction < 0), return_inverse=True)
+    table = np.full((one_way.max() + 1, target.max() + 1), np.nan)
+    table[one_way.ravel(), target.ravel()] = runs.value
+    empty = int(np.isnan(table).sum())
+    if empty and len(runs.value) > table.size // 2:
+        row, column = np.argwhere(np.isnan(table))[0]
+        at = runs.targets_mm[column]
+        what = "reading is" if empty == 1 else "readings are"
+        found.append(f"{name}: {empty} of {table.size} {what} missing, the first in one-way run {row + 1} at {at:g} mm")
+    return found + _copies(runs, name, table, one_way.ravel())
+
+
+def _copies(runs: OneAxis, name: str, table: FloatArray, one_way: IntArray) -> list[str]:
+    """Name runs in the same direction whose values at three targets or more are equal to the last digit, but not all alike."""
+    first: dict[bytes, int] = {}
+    for k, values in enumerate(table):
+        if np.isnan(values).any() or len(values) < 3 or np.ptp(values) == 0:
+            continue
+        row = int(np.flatnonzero(one_way == k)[0])
+        earlier = first.setdefault(values.tobytes() + bytes([int(runs.direction[row]) + 1]), row)
+        if earlier != row:
+            pair = f"{int(runs.run[earlier])} and {int(runs.run[row])}"
+            return [f"{name}: runs {pair} are equal to the last digit at every target; is one a copy of the other?"]
+    return []

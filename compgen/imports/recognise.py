@@ -39,6 +39,7 @@ _FLAGS = {
     "directions": "--directions",
     "sheet": "--sheet",
     "dates": "--dates",
+    "decimal": "--decimal",
     "zero_runs": "--zero-runs",
 }
 _ONE_AXIS = ("axis", "error", "sign", "directions", "dates")

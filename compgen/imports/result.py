@@ -42,6 +42,7 @@ class ImportOptions:
     sign : "error" (measured minus commanded) or "correction" (what is to be added; turned round on import).
     directions : "labels", "motion" (from the order of the rows) or "alternate" (odd runs up, even runs down).
     sheet : name of the sheet of a workbook.
+    decimal : decimal mark of a table, where its numbers do not show it.
     zero_runs : what becomes of laser runs that are zero at every target.
     dates : order of day, month and year where the file writes them as numbers.
     """
@@ -55,6 +56,7 @@ class ImportOptions:
     directions: Literal["labels", "motion", "alternate"] | None = None
     sheet: str | None = None
     dates: Order | None = None
+    decimal: Literal["comma", "point"] | None = None
     zero_runs: Literal["drop", "keep"] | None = None
 
 

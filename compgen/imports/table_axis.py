@@ -10,16 +10,29 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.names import AXES
 from compgen.identify.axis_runs import SAME_TARGET_MM
+from compgen.imports.amounts import labels_of
 from compgen.imports.columns import FIELDS, MM_PER_LENGTH, RunColumn, run_columns, split_name, way
 from compgen.imports.findings import Findings
 from compgen.imports.further import Further, further_of
 from compgen.imports.hypotheses import USUAL_URAD, slope_of, usual_deviation_mm
-from compgen.imports.one_axis import IntArray, OneAxis, axis_in, cycles, motion
+from compgen.imports.one_axis import IntArray, OneAxis, axis_in, cycles, motion, remarks
 from compgen.imports.source import shown
 
 #: A column without a telling name holds readings, not deviations, if it follows the targets so closely.
 FOLLOWS = 1e-2
-_TELLING = ("deviation", "abweichung", "error", "fehler", "230")
+_TELLING = (
+    "deviation",
+    "abweichung",
+    "error",
+    "fehler",
+    "230",
+    "ecart",
+    "scarto",
+    "errore",
+    "desviac",
+    "\u504f\u5dee",
+    "\u8bef\u5dee",
+)
 
 
 @dataclass(frozen=True)
@@ -48,6 +61,7 @@ def axis_readings(findings: Findings, *, angular: bool = False) -> tuple[dict[st
         direction, run = _directions(findings, target[own], rows.run[own], rows.label[own])
         beside = {name: values[rows.row[own]] for name, values in further.covariates.items()}
         found[letter] = OneAxis(target[own], direction, run, value[own], line, beside)
+        findings.notes += remarks(found[letter], letter)
     return found, further
 
 
@@ -68,8 +82,8 @@ def _rows(findings: Findings) -> _Rows:
     values = findings.numbers(key)
     run = np.zeros(len(values), dtype=np.int64)
     if "run" in fields:
-        _, run = np.unique(np.array(findings.table.column(fields["run"].name)), return_inverse=True)
-        run = run.astype(np.int64) + 1
+        run = labels_of(findings, fields["run"])
+        run = run + 1 - min(0, int(run.min())) if run.min() < 1 else run
     return _Rows(np.arange(len(values), dtype=np.int64), run, labels, values, key, fields[key].name)
 
 
