@@ -5,17 +5,21 @@ from __future__ import annotations
 import threading
 from collections import Counter as Tally
 from collections.abc import Callable, Iterator
+from socketserver import ThreadingMixIn
 from typing import TYPE_CHECKING, Any
-from wsgiref.simple_server import WSGIRequestHandler, make_server
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from compgen.errors import CompgenError, InputError
+from compgen.recal import logs
 from compgen.recal.records import TableState
 from compgen.recal.store import Store
 from compgen.serve.fleet import STATUSES, fleet
+from compgen.serve.guard import HOST
+from compgen.serve.settings import LOCAL_NAMES
 
 if TYPE_CHECKING:
     from compgen.recal.runner import MachineOutcome
@@ -135,6 +139,12 @@ class WatchMetrics:
         return generate_latest(self.registry)
 
 
+class _Threads(ThreadingMixIn, WSGIServer):
+    """A thread for each request, so that a slow reader keeps nobody else waiting."""
+
+    daemon_threads = True
+
+
 class _Quiet(WSGIRequestHandler):
     timeout = 10
 
@@ -157,14 +167,24 @@ def start_metrics(text: Callable[[], bytes], port: int, host: str = "127.0.0.1")
 
     def answer(environ: dict[str, Any], start_response: Any) -> list[bytes]:
         headers = [("X-Content-Type-Options", "nosniff"), ("Cache-Control", "no-store")]
+
+        def say(status: str, body: bytes, kind: str = "text/plain") -> list[bytes]:
+            start_response(status, [("Content-Type", kind), *headers])
+            return [] if environ["REQUEST_METHOD"] == "HEAD" else [body]
+
+        name = HOST.fullmatch(environ.get("HTTP_HOST", ""))
+        if name is None or name["name"].lower() not in (*LOCAL_NAMES, host):
+            return say("421 Misdirected Request", b"this server is not known by that name\n")
         if environ["PATH_INFO"] != "/metrics" or environ["REQUEST_METHOD"] not in ("GET", "HEAD"):
-            start_response("404 Not Found", [("Content-Type", "text/plain"), *headers])
-            return [b"metrics are at /metrics\n"]
-        start_response("200 OK", [("Content-Type", CONTENT_TYPE), *headers])
-        return [text()]
+            return say("404 Not Found", b"metrics are at /metrics\n")
+        try:
+            return say("200 OK", text(), CONTENT_TYPE)
+        except Exception as error:  # whatever it is, the recalibration goes on
+            logs.error("metrics", problem=f"{type(error).__name__}: {error}")
+            return say("500 Internal Server Error", b"the log says more\n")
 
     try:
-        server = make_server(host, port, answer, handler_class=_Quiet)
+        server = make_server(host, port, answer, server_class=_Threads, handler_class=_Quiet)
     except OSError as error:
         raise InputError(f"{host}:{port} cannot be used: {error.strerror or error}", field="--metrics-port") from error
     thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
