@@ -1,8 +1,9 @@
-"""From a base fit to its noise model: dependence on range, then the variances of the kernels."""
+"""From a base fit to its noise model: dependence on range and channel, then the variances of the kernels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,6 +17,10 @@ from compgen.diagnose.noise import Noise, Variances, fit_reml, packed, reml_prob
 LEAST_DIFFERENCES = 60
 #: Slope over its uncertainty above which the noise depends on range.
 RANGE_Z = 3.5
+#: The same for channels whose noise differs: deviate of the logarithm of a variance.
+CHANNEL_Z = 6.0
+#: Neighbouring second differences overlap: sum of their squared correlations.
+OVERLAP = 1 + 2 * (4 / 6) ** 2 + 2 * (1 / 6) ** 2
 #: Squares beyond so many times the variance are gross errors and count as this.
 FAR_OUT = 16.0
 #: Variance of single runs, as a share of the white one, below which it is not tested.
@@ -43,7 +48,7 @@ def noise_of(
     layout = fit.observed.layout
     if not has_repeats(layout):
         return _without_repeats(fit, fixed, sigma_mm)
-    scale = before.scale if before is not None else range_scale(fit)
+    scale = before.scale if before is not None else noise_scale(fit)
     residual = fit.residual_mm / scale
     problem = reml_problem(layout, residual, _unit_columns(fixed, len(residual)) / scale[:, None])
     start = None if before is None else np.maximum(packed(before.variances, problem.common), problem.starts * 1e-3)
@@ -90,18 +95,38 @@ def run_ratio(fit: BaseFit, fixed: Sequence[Group], noise: Noise) -> float:
     return max(0.0, fit_reml(problem, start=start, steps=30)[2] - noise.criterion)
 
 
-def range_scale(fit: BaseFit) -> FloatArray:
-    """Factor of the standard deviation of every reading, (n,), mean square 1: 1 unless the noise grows with range.
+def noise_scale(fit: BaseFit) -> FloatArray:
+    """Factor of the standard deviation of every reading, (n,), mean square 1.
 
-    Second differences of the differences of repeats along a run hold nothing slow; a regression of their squares on
-    the square of the range tells.
+    It is 1 unless the noise grows with range, or differs between channels by more than that.
     """
-    readings, layout = fit.readings, fit.observed.layout
-    ones = np.ones(len(readings))
-    if readings.kind != "lengths":
-        return ones
-    square = (readings.range_mm / readings.range_mm.mean()) ** 2
-    power, against = [], []
+    bends = _bends(fit)
+    count = len(fit.residual_mm)
+    if bends is None:
+        return np.ones(count)
+    square = _square_of_range(fit)
+    with_range = _range_scale(bends.power, bends.rows, square, count)
+    own = _channel_factor(fit, bends, bends.power / with_range[bends.rows] ** 2)
+    if not own.any():
+        return with_range
+    factor = _channel_factor(fit, bends, bends.power, certain=True)
+    factor = np.where(factor > 0, factor, 1.0)[fit.observed.layout.channel]
+    scale = factor * _range_scale(bends.power / factor[bends.rows] ** 2, bends.rows, square, count)
+    return np.asarray(scale / np.sqrt(np.mean(scale**2)))
+
+
+@dataclass(frozen=True)
+class _Bends:
+    """Squared second differences of the differences of repeats, mm^2, with variance of a reading; their middle rows."""
+
+    power: FloatArray
+    rows: IntArray
+
+
+def _bends(fit: BaseFit) -> _Bends | None:
+    """Second differences of the differences of repeats along a run: they hold nothing slow. None if they are few."""
+    layout = fit.observed.layout
+    power, middle = [], []
     for block in layout.blocks:
         first, second = _pairs(layout, block.stop)
         if len(first) < 3:
@@ -111,23 +136,52 @@ def range_scale(fit: BaseFit) -> FloatArray:
         difference = fit.residual_mm[block.rows[second]] - fit.residual_mm[block.rows[first]]
         bend = (difference[2:] - 2 * difference[1:-1] + difference[:-2])[together]
         power.append((bend**2 / 12.0).ravel())
-        against.append(square[block.rows[second[1:-1]]][together].ravel())
-    if not power or sum(map(len, power)) < LEAST_DIFFERENCES:
-        return ones
-    return _scale_from(np.concatenate(power), np.concatenate(against), square)
+        middle.append(block.rows[second[1:-1]][together].ravel())
+    if sum(map(len, power)) < LEAST_DIFFERENCES:
+        return None
+    return _Bends(np.concatenate(power), np.concatenate(middle))
 
 
-def _scale_from(power: FloatArray, against: FloatArray, square: FloatArray) -> FloatArray:
+def _square_of_range(fit: BaseFit) -> FloatArray | None:
+    readings = fit.readings
+    return (readings.range_mm / readings.range_mm.mean()) ** 2 if readings.kind == "lengths" else None
+
+
+def _clipped(power: FloatArray) -> FloatArray:
+    """Squares without the weight of gross errors; 0.455 is the median of a squared normal deviate."""
+    return np.minimum(power, FAR_OUT * float(np.median(power)) / 0.455)
+
+
+def _channel_factor(fit: BaseFit, bends: _Bends, power: FloatArray, *, certain: bool = False) -> FloatArray:
+    """Standard deviation of every channel over that of all, (channels,); zeros if they do not differ beyond doubt."""
+    channel = fit.observed.layout.channel[bends.rows]
+    factor = np.zeros(int(fit.observed.layout.channel.max()) + 1)
+    means, counts = np.zeros(len(factor)), np.bincount(channel, minlength=len(factor))
+    for k in np.flatnonzero(counts):
+        means[k] = float(_clipped(power[channel == k]).mean())
+    seen = counts > 0
+    middle = float(np.exp(np.average(np.log(means[seen]), weights=counts[seen])))
+    u = np.sqrt(2.0 * OVERLAP / np.maximum(counts, 1))
+    apart = np.abs(np.log(np.where(seen, means, middle) / middle)) / u
+    if not certain and float(apart.max()) < CHANNEL_Z:
+        return factor
+    factor[seen] = np.sqrt(means[seen] / middle)
+    return factor
+
+
+def _range_scale(power: FloatArray, rows: IntArray, square: FloatArray | None, count: int) -> FloatArray:
+    """Factor of the standard deviation by range, mean square 1, from a regression of squares on the squared range."""
+    if square is None:
+        return np.ones(count)
+    against, power = square[rows], _clipped(power)
     design = np.column_stack([np.ones(len(against)), against])
-    power = np.minimum(power, FAR_OUT * float(np.median(power)) / 0.455)  # 0.455: median of a squared normal deviate
     weight = np.ones(len(power))
     for _ in range(4):  # the variance of a squared normal deviate is twice the square of its mean
         coefficients = np.linalg.lstsq(design * weight[:, None], power * weight, rcond=None)[0]
         expected = np.maximum(design @ coefficients, 0.05 * power.mean())
         weight = 1.0 / expected
     inverse = np.linalg.inv((design * weight[:, None]).T @ (design * weight[:, None]))
-    # neighbouring second differences overlap, which widens the scatter by the sum of their squared correlations
-    u = np.sqrt(inverse[1, 1] * 2.0 * (1 + 2 * (4 / 6) ** 2 + 2 * (1 / 6) ** 2))
+    u = np.sqrt(inverse[1, 1] * 2.0 * OVERLAP)
     if coefficients[1] / u <= RANGE_Z:
         return np.ones(len(square))
     variance = np.maximum(coefficients[0] + coefficients[1] * square, 0.02 * power.mean())
