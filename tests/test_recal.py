@@ -311,6 +311,15 @@ def test_a_newer_proposal_takes_the_place_of_one_that_waits(plant, small_errors)
     assert [path.name for path in (plant.out / "proposed").iterdir()] == ["v0002"]
 
 
+def test_an_older_measurement_that_comes_late_does_not_take_the_place_of_a_newer_proposal(plant, small_errors):
+    plant.measure("b", drifted(small_errors, 12.0), seed=2, hours=-1)
+    plant.run()
+    plant.measure("a", hours=-2)
+    outcome = plant.run()
+    assert plant.states() == ["pending", "held"]
+    assert "version 1, which waits, comes from a newer measurement" in outcome.outcomes[0].messages[0]
+
+
 def test_tables_that_the_round_trip_refuses_can_never_be_approved(plant):
     plant.write(policy="max_step_um = 0.5")
     plant.measure("a")

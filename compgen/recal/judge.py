@@ -16,7 +16,7 @@ from compgen.identify import joint_covariance
 from compgen.pipeline import RunResult, identified_reversal
 from compgen.recal.change import Change, change_between, spread_of
 from compgen.recal.job import Policy
-from compgen.recal.records import IdentificationRecord, MeasurementRecord
+from compgen.recal.records import IdentificationRecord, MeasurementRecord, TableRecord
 from compgen.recal.store import Store
 from compgen.verify import ReadTables, verify
 from compgen.verify.diff import difference
@@ -57,6 +57,19 @@ def judge_measurement(
         judgement.hold.append(f"the active tables come from a newer measurement ({_day(latest)})")
     if policy.temperature_c is not None:
         judgement.hold += _temperature(policy.temperature_c, measurement.temperatures_c)
+
+
+def judge_order(
+    judgement: Judgement, store: Store, measurement: MeasurementRecord, tables: Sequence[TableRecord]
+) -> None:
+    """Hold what was measured before a proposal that waits, so that it does not take that proposal's place."""
+    for table in tables:
+        if table.state == "pending":
+            made = store.identification(table.identification_id).measured_at
+            if measurement.measured_at < made:
+                judgement.hold.append(
+                    f"version {table.version}, which waits, comes from a newer measurement ({_day(made)})"
+                )
 
 
 def _temperature(window_c: tuple[float, float], channels: Mapping[str, Mapping[str, float]]) -> list[str]:

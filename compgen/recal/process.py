@@ -26,6 +26,7 @@ from compgen.recal.judge import (
     apply_limits,
     judge_change,
     judge_measurement,
+    judge_order,
     judge_tables,
     shows_all,
 )
@@ -93,6 +94,7 @@ def process(store: Store, job: MachineJob, record: MachineRecord, measurement: M
         )
         active = _active_now(store, machine, tables, Path(folder) / "now")
         judgement = _judged(store, job, machine, measurement, (outcome, active, now))
+        judge_order(judgement, store, measurement, tables)
         judgement.figures["warnings"] = [without_folder(str(item.message)) for item in caught if _ours(item)]
         files = _tables_of(outcome, Path(folder) / "out")
         result = _result(Path(folder) / "out", machine, outcome, files, judgement)
