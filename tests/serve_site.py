@@ -133,7 +133,8 @@ class Served:
         put(folder)
         self.store = open_store(str(folder / "store.sqlite"))
         self.settings = Settings(str(folder / "store.sqlite"), port=0, decide=True, users=folder / "users.json")
-        self.server = make_server(self.settings)
+        with cheap_hashes():
+            self.server = make_server(self.settings)
         self.address = ("127.0.0.1", int(self.server.effective_port))
         self.url = f"http://127.0.0.1:{self.server.effective_port}"
         self.thread = threading.Thread(target=self._run, daemon=True)

@@ -53,8 +53,8 @@ def figures(scale):
     }
 
 
-def errors_rows():
-    position = np.linspace(-800.0, 0.0, NODES)
+def errors_rows(nodes=NODES):
+    position = np.linspace(-800.0, 0.0, nodes)
     for k, name in enumerate(CURVE_NAMES):
         for at, value in zip(position, 5.0 * np.sin(position / (90.0 + 7 * k)), strict=True):
             yield name, f"{at:.6f}", f"{value:.6f}", "0.2"
@@ -62,8 +62,8 @@ def errors_rows():
         yield name, "", "12.5", "0.4"
 
 
-def volume_rows():
-    level = np.linspace(0.0, 1.0, POINTS_PER_SIDE)
+def volume_rows(side=POINTS_PER_SIDE):
+    level = np.linspace(0.0, 1.0, side)
     for x in level * 800 - 800:
         for y in level * 1000:
             for z in level * 300:
@@ -71,8 +71,11 @@ def volume_rows():
                 yield tuple(f"{v:.4f}" for v in (x, y, z, *before, *(0.01 * v for v in before)))
 
 
-def big_folder(folder, text="plain"):
-    """A folder as a run leaves it: 21 errors at 101 nodes, 4 x 9261 lengths, 9261 points; every label holds ``text``."""
+def big_folder(folder, text="plain", *, nodes=NODES, side=POINTS_PER_SIDE):
+    """A folder as a run leaves it: 21 errors at 101 nodes, 4 x 9261 lengths, 9261 points; every label holds ``text``.
+
+    Fewer ``nodes`` and points on a ``side`` make one that is drawn sooner, with the same sections.
+    """
     folder.mkdir()
     stations = [
         {"station": f"{text} {k}", "setup": 0, "position_mm": [300.0 * k, -400.0, 200.0], "dead_length_mm": 400.0}
@@ -100,13 +103,13 @@ def big_folder(folder, text="plain"):
     csv(
         folder / "identified.errors.csv",
         ("error", "position_mm", "value", "u_value"),
-        errors_rows(),
+        errors_rows(nodes),
         [f"date = {text}"],
     )
     columns = ("x_mm", "y_mm", "z_mm", *(f"{w}_{a}_um" for w in ("before", "after") for a in "xyz"))
-    csv(folder / "volume.csv", columns, volume_rows(), [f"note = {text}"])
+    csv(folder / "volume.csv", columns, volume_rows(side), [f"note = {text}"])
     generator = np.random.default_rng(3)
-    grid = [row[:3] for row in volume_rows()]
+    grid = [row[:3] for row in volume_rows(side)]
     quoted = [f'"{text.replace(chr(34), chr(34) * 2)} {k}"' for k in range(STATIONS)]
     rows = (
         (quoted[k], *place, f"{value:.4f}", 1)
@@ -120,6 +123,14 @@ def big_folder(folder, text="plain"):
 @pytest.fixture(scope="module")
 def big(tmp_path_factory):
     folder = big_folder(tmp_path_factory.mktemp("big") / "run")
+    with pytest.warns(Warning, match="is not the file that was verified"):
+        write_report(folder)
+    return folder / "report.html"
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    folder = big_folder(tmp_path_factory.mktemp("small") / "run", nodes=11, side=5)
     with pytest.warns(Warning, match="is not the file that was verified"):
         write_report(folder)
     return folder / "report.html"
@@ -296,8 +307,8 @@ def test_a_narrow_window_does_not_scroll_sideways(browser, big):
     browser.picture()
 
 
-def test_it_prints_every_section_on_white(browser, big):
-    browser.open(big)
+def test_it_prints_every_section_on_white(browser, small):
+    browser.open(small)
     shown = brightness(browser.picture(dark=True, media="print"))
     assert shown > 0.85
     assert browser.ask("getComputedStyle(document.querySelector('nav')).display") == "none"
@@ -323,7 +334,7 @@ def test_the_numbers_are_there_without_a_script(browser, big):
 
 
 def test_texts_of_the_user_stay_texts(browser, tmp_path):
-    folder = big_folder(tmp_path / "evil", EVIL)
+    folder = big_folder(tmp_path / "evil", EVIL, nodes=11, side=5)
     with pytest.warns(Warning, match="is not the file that was verified"):
         write_report(folder)
     events = browser.open(folder / "report.html")

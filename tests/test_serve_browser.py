@@ -1,22 +1,19 @@
 """The dashboard in a real browser: log in, approve, reject, roll back; nothing runs, nothing is fetched from elsewhere."""
 
-import contextlib
 import importlib.util
 import sys
-import threading
 import time
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("websocket", reason="websocket-client is not installed: the dashboard is not opened in a browser")
+pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
+pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 
 from compgen.recal import decisions
 from compgen.recal.store import open_store
-from compgen.serve.server import make_server
-from compgen.serve.settings import Settings
-from compgen.serve.users import Users
 
 
 def _sibling(name):
@@ -27,37 +24,14 @@ def _sibling(name):
     return module
 
 
-helper, factory = _sibling("browser"), _sibling("serve_factory")
+helper, serving = _sibling("browser"), _sibling("serve_site")
+factory = serving.factory
 pytestmark = pytest.mark.skipif(
     helper.program() is None,
     reason="chromium is not installed (.ci/system-packages): the dashboard is not opened in it",
 )
-PASSWORD = "correct horse battery"
+PASSWORD = serving.PASSWORD
 PATIENCE_S = 30.0
-
-
-class Site:
-    """The dashboard on a real port."""
-
-    def __init__(self, folder, **options):
-        self.store = factory.make_factory(folder / "store.sqlite")
-        Users(folder / "users.json").add("meyer", PASSWORD)
-        self.settings = Settings(str(folder / "store.sqlite"), port=0, decide=True, users=folder / "users.json")
-        self.server = make_server(self.settings)
-        self.url = f"http://127.0.0.1:{self.server.effective_port}"
-        self.thread = threading.Thread(target=self._run, daemon=True)
-        self.thread.start()
-
-    def _run(self):
-        with contextlib.suppress(OSError, ValueError):  # its sockets are closed under it at the end
-            self.server.run()
-
-    def close(self):
-        self.server.close()
-        self.server.asyncore.close_all(self.server._map, ignore_all=True)
-        self.thread.join(timeout=20)
-        self.server.task_dispatcher.shutdown()
-        self.store.close()
 
 
 class Page:
@@ -123,7 +97,16 @@ def browser(tmp_path_factory):
 
 @pytest.fixture
 def site(tmp_path):
-    made = Site(tmp_path)
+    """A dashboard whose store a test may change."""
+    made = serving.Served(tmp_path)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """A dashboard that is only looked at; all tests share it."""
+    made = serving.Served(tmp_path_factory.mktemp("shown"))
     yield made
     made.close()
 
@@ -134,11 +117,45 @@ def page(browser, site):
     return Page(browser, site.url)
 
 
+@pytest.fixture(scope="module")
+def reader(browser, shown):
+    """A person who is logged in and looks around."""
+    browser.call("Network.clearBrowserCookies")
+    looking = Page(browser, shown.url)
+    looking.login()
+    return looking
+
+
 def problems(events, url):
     """What the browser complains about, and what it asked others for."""
     found = [str(e["params"]) for e in events if e.get("method") in ("Log.entryAdded", "Runtime.exceptionThrown")]
     asked = [e["params"]["request"]["url"] for e in events if e.get("method") == "Network.requestWillBeSent"]
     return found + [address for address in asked if not address.startswith(f"{url}/")]
+
+
+PATHS = ("/", "/machines/1", "/machines/1/drift", "/machines/1/recheck", "/machines/1/tables/3", "/machines/4")
+PATHS += ("/machines/4/tables/2", "/audit", "/login")
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_no_page_complains_runs_a_text_or_asks_others(reader, shown, browser, path):
+    reader.visit(path)
+    assert problems(browser.events, shown.url) == []
+    assert browser.ask("document.scripts.length") == 0
+    assert browser.ask("document.title").endswith("compgen")
+    assert browser.ask("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_the_pages_follow_dark_and_light_and_narrow_windows(reader, browser):
+    reader.visit("/machines/1")
+    grounds = set()
+    for dark in (False, True):
+        browser.picture(dark=dark)
+        grounds.add(browser.ask("getComputedStyle(document.body).backgroundColor"))
+    assert grounds == {"rgb(255, 255, 255)", "rgb(18, 23, 30)"}
+    browser.picture(width=400)
+    assert browser.ask("document.documentElement.scrollWidth <= 400")
+    browser.picture()
 
 
 def test_a_person_logs_in_approves_rejects_and_rolls_back(page, site):
@@ -193,19 +210,6 @@ def test_held_tables_need_the_box_and_a_reason_before_the_browser_even_sends(pag
     assert "approve is done" in page.text()
 
 
-@pytest.mark.parametrize(
-    "path",
-    ["/", "/machines/1", "/machines/1/drift", "/machines/1/tables/3", "/machines/4", "/machines/4/tables/2", "/audit"],
-)
-def test_no_page_complains_runs_a_text_or_asks_others(page, site, browser, path):
-    page.login()
-    page.visit(path)
-    assert problems(browser.events, site.url) == []
-    assert browser.ask("document.scripts.length") == 0
-    assert browser.ask("document.title").endswith("compgen")
-    assert browser.ask("document.documentElement.scrollWidth <= window.innerWidth")
-
-
 def test_a_page_of_another_site_cannot_decide(page, site, browser, tmp_path):
     """The other site knows everything but the token; even with the token its origin is refused."""
     page.login()
@@ -222,18 +226,6 @@ def test_a_page_of_another_site_cannot_decide(page, site, browser, tmp_path):
     assert factory.everything(site.store) == before
     page.visit("/")
     assert "Logged in as meyer" in page.text()
-
-
-def test_the_pages_follow_dark_and_light_and_narrow_windows(page, browser):
-    page.visit("/machines/1")
-    grounds = set()
-    for dark in (False, True):
-        browser.picture(dark=dark)
-        grounds.add(browser.ask("getComputedStyle(document.body).backgroundColor"))
-    assert grounds == {"rgb(255, 255, 255)", "rgb(18, 23, 30)"}
-    browser.picture(width=400)
-    assert browser.ask("document.documentElement.scrollWidth <= 400")
-    browser.picture()
 
 
 def test_the_store_can_be_opened_again_after_the_dashboard(page, site, tmp_path):
