@@ -110,20 +110,43 @@ def exit_of(child):
 # --- schema --------------------------------------------------------------------------------------------------------
 
 
+#: One row of everything that refers to a machine, as the first version of the schema had it.
+OLD_ROWS = f"""
+INSERT INTO machines (name, at) VALUES ('old', '2025-01-01 00:00:00');
+INSERT INTO blobs (sha256, size, deflated) VALUES ('{"a" * 64}', 1, '');
+INSERT INTO machine_versions (machine_id, sha256, at) VALUES (1, '{"a" * 64}', '2025-01-01');
+INSERT INTO measurements (machine_id, sha256, name, measured_at, measured_at_source, received_at, temperatures_c)
+  VALUES (1, '{"b" * 64}', 'm', '2025-01-01', 'file', '2025-01-02', '{{"temp_x_c": {{"mean": 20.5}}}}');
+INSERT INTO identifications (machine_id, measurement_id, machine_version_id, errors_sha256, summary, program, at)
+  VALUES (1, 1, 1, '{"a" * 64}', '{{"rms": 0.5}}', '1', '2025-01-02');
+INSERT INTO tables (machine_id, version, identification_id, accepted, controllers, reasons, summary, at)
+  VALUES (1, 1, 1, true, '["isg-csv"]', '[]', '{{}}', '2025-01-02');
+INSERT INTO decisions (machine_id, sequence, table_id, kind, actor, reason, at)
+  VALUES (1, 1, 1, 'approve', 'ada', 'why', '2025-01-02');
+"""
+
+
+@pytest.mark.parametrize("kind", ["postgresql", "sqlite"])
 @pytest.mark.parametrize("revision", REVISIONS)
-def test_a_store_of_every_version_is_upgraded_to_the_schema_of_the_program(url, opened, revision):
-    engine, config = database.engine_of(url), _config()
+def test_a_store_of_every_version_is_upgraded_to_the_schema_of_the_program(url, opened, tmp_path, kind, revision):
+    address = url if kind == "postgresql" else f"sqlite:///{tmp_path}/old.sqlite"
+    engine, config = database.engine_of(address), _config()
     with engine.begin() as connection:
         config.attributes["connection"] = connection
         command.upgrade(config, revision)
-        connection.execute(sa.text("INSERT INTO machines (name, at) VALUES ('old', '2025-01-01 00:00:00')"))
+        for statement in OLD_ROWS.split(";\n")[:-1]:
+            connection.exec_driver_sql(statement)
     engine.dispose()
-    store = opened(url)
+    store = opened(address)
     assert [(machine.name, machine.at) for machine in store.machines()] == [("old", datetime(2025, 1, 1, tzinfo=UTC))]
+    assert [item.temperatures_c for item in store.measurements()] == [{"temp_x_c": {"mean": 20.5}}]
+    assert [(item.summary, item.measurement_id) for item in store.identifications()] == [({"rms": 0.5}, 1)]
+    assert [(table.version, table.state, table.controllers) for table in store.tables()] == [(1, "active", ["isg-csv"])]
     with store.engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), schema.metadata) == []
-    with pytest.raises(StoreError, match="new rows only"):
-        store.write(lambda connection: connection.execute(sa.text("DELETE FROM machines")))
+    for table in ("machines", "identifications", "decisions"):
+        with pytest.raises((StoreError, sa.exc.IntegrityError), match="new rows only"):
+            store.write(lambda connection, name=table: connection.execute(sa.text(f"DELETE FROM {name}")))
     assert store.add_machine("new").id == 2
 
 
