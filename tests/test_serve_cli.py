@@ -16,29 +16,31 @@ import pytest
 from click.testing import CliRunner
 
 pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
+pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
+pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 
 from prometheus_client.parser import text_string_to_metric_families
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.recal.runner import MachineOutcome
+from compgen.recal.store import open_store
 from compgen.serve.app import make_app
 from compgen.serve.metrics import WatchMetrics, start_metrics
 from compgen.serve.settings import Settings
 from compgen.serve.users import Users
 
 
-def _factory():
-    spec = importlib.util.spec_from_file_location("compgen_serve_factory", Path(__file__).with_name("serve_factory.py"))
+def _helper():
+    spec = importlib.util.spec_from_file_location("compgen_serve_site", Path(__file__).with_name("serve_site.py"))
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
 
 
-factory = _factory()
-PASSWORD = "correct horse battery"
-OWN = "http://localhost:8765"
+helper = _helper()
+factory, OWN, PASSWORD = helper.factory, helper.OWN, helper.PASSWORD
 JOB = """\
 store = "store.sqlite"
 [machines.mill-1]
@@ -65,6 +67,15 @@ def test_users_are_added_listed_and_removed(tmp_path):
     assert json.loads(listed.output) == {"users": ["meyer"]}
     CliRunner().invoke(cli, ["serve", "remove-user", "meyer", "--users", str(path)])
     assert Users(path).names() == []
+
+
+def test_a_reader_is_added_and_may_not_decide(tmp_path):
+    path = tmp_path / "users.json"
+    command = ["serve", "add-user", "guest", "--users", str(path), "--password-stdin", "--reader"]
+    assert "guest is added" in CliRunner().invoke(cli, command, input=f"{PASSWORD}\n").output
+    assert not Users(path).may_decide("guest")
+    assert "guest has a new password" in add_user(path, "guest").output
+    assert Users(path).may_decide("guest")
 
 
 def test_the_password_is_asked_for_twice_and_never_shown(tmp_path):
@@ -99,8 +110,8 @@ def test_what_is_not_safe_or_missing_is_exit_code_2_with_the_reason(tmp_path, mo
 
 
 def test_the_server_starts_answers_and_stops_on_sigterm_with_exit_code_0(tmp_path):
-    factory.make_factory(tmp_path / "store.sqlite").close()
-    add_user(tmp_path / "store.sqlite.users.json")
+    helper.put(tmp_path)
+    (tmp_path / "users.json").rename(tmp_path / "store.sqlite.users.json")
     command = [sys.executable, "-m", "compgen", "serve", "--store", "store.sqlite", "--port", "0", "--decide"]
     process = subprocess.Popen([*command, "--log", "json"], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     killer = threading.Timer(120.0, process.kill)
@@ -128,8 +139,8 @@ def site(tmp_path, monkeypatch):
     """A dashboard with a job file, a client that is logged in, and its token."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "recal.toml").write_text(JOB)
-    store = factory.make_factory(tmp_path / "store.sqlite")
-    Users(tmp_path / "users.json").add("meyer", PASSWORD)
+    helper.put(tmp_path)
+    store = open_store(str(tmp_path / "store.sqlite"))
     settings = Settings(
         str(tmp_path / "store.sqlite"), decide=True, users=tmp_path / "users.json", job=tmp_path / "recal.toml"
     )
@@ -172,7 +183,8 @@ def test_a_machine_that_the_job_file_does_not_name_is_not_decided_on(site):
 
 
 def test_watch_metrics_are_served_while_it_runs(tmp_path):
-    store = factory.make_factory(tmp_path / "store.sqlite")
+    helper.put(tmp_path)
+    store = open_store(str(tmp_path / "store.sqlite"))
     metrics = WatchMetrics(store)
     before = datetime.now(UTC).timestamp()
     metrics.count(MachineOutcome("mill-1", "ok", processed=("a", "b"), seconds=2.0))
