@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import sqlalchemy as sa
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
@@ -462,6 +463,25 @@ def test_the_pointer_is_left_alone_by_a_store_that_does_not_know_it(site, tmp_pa
     assert "was never active by this store" in outcome.messages[-1]
     assert os.readlink(site.out / "active") == "v0001"
     assert faults.read_active(site) == []
+
+
+@pytest.mark.parametrize("by", ["id", "key"])
+@pytest.mark.parametrize("table", [table.name for table in schema.ALL])
+def test_a_row_cannot_be_replaced_by_another_one(store, table, by):
+    machine, measurement = measured(store)
+    results.keep_result(store, machine, claims.take(store, measurement, claims.owner_name()), a_result(), None)
+    store.add_event("clock", "clock", "text", machine)
+    columns = [column.name for column in schema.metadata.tables[table].columns if by == "id" or column.name != "id"]
+    connection = sqlite3.connect(store.engine.url.database)
+    before = list(connection.execute(f"SELECT * FROM {table}"))
+    copied = f"INSERT OR REPLACE INTO {table} ({', '.join(columns)}) SELECT {', '.join(columns)} FROM {table} LIMIT 1"
+    unique = [c for c in schema.metadata.tables[table].constraints if isinstance(c, sa.UniqueConstraint)]
+    if by == "id" or unique:
+        with pytest.raises(sqlite3.IntegrityError, match="takes new rows only"):
+            connection.execute(copied)
+    connection.rollback()
+    assert list(connection.execute(f"SELECT * FROM {table}")) == before
+    connection.close()
 
 
 # --- watching ------------------------------------------------------------------------------------------------------

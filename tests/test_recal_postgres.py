@@ -173,7 +173,7 @@ def filled(server, tmp_path_factory):
 
 
 @pytest.mark.parametrize("table", [table.name for table in schema.ALL])
-@pytest.mark.parametrize("action", ["UPDATE {} SET {} = NULL", "DELETE FROM {}"])
+@pytest.mark.parametrize("action", ["UPDATE {} SET {} = NULL", "DELETE FROM {}", "TRUNCATE {} CASCADE"])
 def test_the_database_refuses_to_change_or_remove_a_row(filled, server, table, action):
     import psycopg
 
@@ -181,7 +181,7 @@ def test_the_database_refuses_to_change_or_remove_a_row(filled, server, table, a
     name = filled.engine.url.database
     before = server.sql(f"SELECT count(*) FROM {table}", name)
     assert before[0][0] > 0
-    with pytest.raises(psycopg.errors.RaiseException, match=f"append-only: {table} takes new rows only"):
+    with pytest.raises(psycopg.errors.RaiseException, match="append-only: .* takes new rows only"):
         server.sql(action.format(table, f'"{column}"'), name)
     assert server.sql(f"SELECT count(*) FROM {table}", name) == before
 

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 import sqlalchemy as sa
 
 #: Newest revision of ``migrations/versions``.
-HEAD = "0003"
+HEAD = "0004"
 
 
 class UtcTime(sa.types.TypeDecorator[datetime]):
