@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,22 @@ def open_measurement(
     if len({type(part) for part in parts}) > 1:
         raise InputError("holds another kind of measurement than the first file; identify them one after the other",
                          file=paths[-1])  # fmt: skip
-    return _joined(parts)
+    return _joined(parts if any(kinds) else _on_one_clock(parts))
+
+
+def _on_one_clock(parts: Sequence[Plain]) -> list[Plain]:
+    """Let the times of several imported files count from the earliest of them, where all say when they were measured."""
+    begun = [part.metadata.get("measured_at", "") for part in parts]
+    if not all(begun) or not all("time_s" in part.covariates for part in parts):
+        return list(parts)
+    times = [datetime.fromisoformat(text) for text in begun]
+    if len({time.tzinfo is None for time in times}) > 1:
+        return list(parts)
+    ahead = [(time - min(times)).total_seconds() for time in times]
+    return [
+        replace(part, covariates={**part.covariates, "time_s": part.covariates["time_s"] + later})
+        for part, later in zip(parts, ahead, strict=True)
+    ]
 
 
 def _measured_or_errors(path: Path, axis: str | None) -> Plain | ErrorTable:

@@ -136,7 +136,7 @@ def find_table(grid: Grid, decimal: str | None = None) -> Table:
             return _table(grid, k, metadata, decimal)
         _note(row, metadata)
     raise grid.fail(
-        "holds no table: a header line with the names of the columns, and rows of numbers below it, are due"
+        f"holds no table: a header line with the names of the columns, and rows of numbers below it, are due{grid.empty}"
     )
 
 
@@ -227,8 +227,8 @@ def _rows_below(grid: Grid, names: Sequence[str], first: int) -> tuple[list[list
     for row, line in zip(grid.rows[first:], grid.lines[first:], strict=True):
         if not any(row) or row[0].startswith("#"):
             continue
-        if below or (lines and line > lines[-1] + 1 and not _like(names, row, MOST_COLUMNS)):
-            if below and _like(names, row, MOST_COLUMNS) and len(_filled(row)) >= len(names):
+        if below or (rows and line > lines[-1] + 1 and not _as(rows[0], row)):
+            if below and _as(rows[0], row) and len(_filled(row)) >= len(names):
                 message = f"rows of numbers follow again, below line {below} where the table ended: put each table into a file"
                 raise grid.fail(f"{message} or sheet of its own", line)
             below = below or line
@@ -236,6 +236,14 @@ def _rows_below(grid: Grid, names: Sequence[str], first: int) -> tuple[list[list
         rows.append(_fitted(grid, names, row, line))
         lines.append(line)
     return rows, lines, below
+
+
+def _as(first: Sequence[str], row: Sequence[str]) -> bool:
+    """Whether a row has numbers where the first row has them; an empty cell or the error of a spreadsheet may stand there."""
+    numeric = [k for k, cell in enumerate(first) if parse_number(cell) is not None]
+    cells = [row[k] if k < len(row) else "" for k in numeric]
+    known = [parse_number(cell) is not None for cell in cells]
+    return any(known) and all(good or not cell or cell.startswith("#") for good, cell in zip(known, cells, strict=True))
 
 
 def _fitted(grid: Grid, names: Sequence[str], row: Sequence[str], line: int) -> list[str]:

@@ -137,12 +137,8 @@ def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[E
 
 
 def remarks(runs: OneAxis, axis: str) -> list[str]:
-    """Say which runs are missing, which readings, and which runs are equal to the last digit; nothing for a regular test."""
+    """Say which readings are missing, and which runs are equal to the last digit; nothing for a regular test."""
     found, name = [], f"axis {axis}" if axis else "the axis"
-    numbers = np.unique(runs.run)
-    gaps = sorted(set(range(1, int(numbers[-1]) + 1)) - set(numbers.tolist()))
-    if 0 < len(gaps) <= len(numbers):
-        found.append(f"{name}: there is no run {', '.join(map(str, gaps[:8]))}")
     keys = np.round(runs.position_mm / SAME_TARGET_MM).astype(np.int64)
     _, target = np.unique(keys, return_inverse=True)
     _, one_way = np.unique(2 * runs.run + (runs.direction < 0), return_inverse=True)

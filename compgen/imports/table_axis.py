@@ -83,6 +83,9 @@ def _rows(findings: Findings) -> _Rows:
     run = np.zeros(len(values), dtype=np.int64)
     if "run" in fields:
         run = labels_of(findings, fields["run"])
+        gaps = sorted(set(range(1, min(int(run.max()), 10_000) + 1)) - set(run.tolist()))
+        if 0 < len(gaps) <= len(np.unique(run)):
+            findings.notes.append(f"there is no run {', '.join(map(str, gaps[:8]))}")
         run = run + 1 - min(0, int(run.min())) if run.min() < 1 else run
     return _Rows(np.arange(len(values), dtype=np.int64), run, labels, values, key, fields[key].name)
 
