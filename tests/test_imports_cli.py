@@ -1,9 +1,11 @@
 """`compgen import`, and commands that are given foreign files: from file to tables in one command."""
 
 import json
+import re
 import time
 from pathlib import Path
 
+import numpy as np
 import openpyxl
 import pytest
 
@@ -14,6 +16,7 @@ from compgen.core.error_table import read_errors
 ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = ROOT / "tests" / "golden" / "imports"
 VENDOR = ROOT / "tests" / "golden" / "etalon-exchange" / "vendor.etalon.txt"
+NANOMETRE_MM = 1e-6
 MACHINE = """\
 name = "imported"
 chain = "WFYXZT"
@@ -176,3 +179,82 @@ def test_a_file_of_500_megabytes_is_answered_within_a_second(capsys, tmp_path, m
     assert time.monotonic() - started < 1.0
     assert code == 2
     assert "500 MB" in err
+
+
+@pytest.mark.parametrize("chain", ["WFYXZT", "WXYFZT"])
+@pytest.mark.parametrize("source", ["laser", "exchange", "workbook"])
+def test_an_axis_that_goes_too_far_is_told_to_go_less_far_whatever_the_file_and_the_machine(
+    capsys, tmp_path, chain, source
+):
+    """EXX = +10 um at 400 mm, zero at the reference point 100 mm: the trims of joint 0 are minus that, EEC has it as error."""
+    targets, per_mm = [0, 100, 200, 300, 400], 0.025
+    machine = tmp_path / "m.toml"
+    text = MACHINE.replace('"WFYXZT"', f'"{chain}"\nreference_point_mm = [100.0, -100.0, -40.0]')
+    machine.write_text(text)
+    measured = {"laser": _laser, "exchange": _exchange, "workbook": _workbook}[source](tmp_path, targets, per_mm)
+    code, _, err = call(capsys, "run", machine, measured, "--controller", "linuxcnc-comp", "--controller", "siemens-eec",
+                        "--out", tmp_path / "o")  # fmt: skip
+    assert code == 0, err
+    assert (tmp_path / "o" / "report.html").stat().st_size > 10_000
+    trims = np.loadtxt(tmp_path / "o" / "linuxcnc-comp" / "joint0-x.comp")
+    expected_mm = 1e-3 * per_mm * (trims[:, 0] - 100.0)
+    np.testing.assert_allclose(trims[:, 1], -expected_mm, rtol=0, atol=NANOMETRE_MM)
+    assert trims[-1, 1] == pytest.approx(-0.0075, abs=NANOMETRE_MM)
+    eec = (tmp_path / "o" / "siemens-eec" / "AX_EEC.INI").read_text()
+    values = np.array([float(v) for v in re.findall(r"ENC_COMP\[0,\d+,AX1\]=(\S+)", eec)])
+    low, step = (float(re.search(rf"{key}\[0,AX1\]=(\S+)", eec).group(1)) for key in ("_MIN", "_STEP"))
+    at = low + step * np.arange(len(values))
+    np.testing.assert_allclose(values, 1e-3 * per_mm * (at - 100.0), rtol=0, atol=NANOMETRE_MM)
+
+
+def _laser(folder, targets, per_mm):
+    lines = ["HEADER::", "File type : rtl", "TARGET DATA::", f"Target-count: {len(targets)}", "Targets :"]
+    lines += [" ".join(str(t) for t in targets), "Flags: 0 0 2 0", "USER-TEXT::", "Axis: X", "RUNS::", "Run-count: 4"]
+    lines += ["DEVIATIONS::", "Run Target Data:"]
+    for run in range(1, 5):
+        for k in range(len(targets))[:: 1 if run % 2 else -1]:
+            lines.append(f"{run} {k + 1} {per_mm * targets[k] + (0.02 if run > 2 else -0.02):.4f}")
+    (folder / "x.rtl").write_text("\r\n".join([*lines, "EOF::", ""]))
+    return folder / "x.rtl"
+
+
+def _exchange(folder, targets, per_mm):
+    rows = "".join(f"{t} {1e-3 * per_mm * t:.7f}\n" for t in targets)
+    (folder / "e.txt").write_text(f"// made up\n[EXX]\nGridpoints = {{\n{rows}}}\n")
+    return folder / "e.txt"
+
+
+def _workbook(folder, targets, per_mm):
+    book = openpyxl.Workbook()
+    for row in (
+        ["Achse:", "X"],
+        ["Datum:", "04.03.2025"],
+        [],
+        ["Soll [mm]", "Abweichung [\u00b5m]", "Richtung", "Lauf"],
+    ):
+        book.active.append(row)
+    for run, noise in ((1, -0.02), (2, 0.02)):
+        for way in (1, -1):
+            for target in targets[::way]:
+                book.active.append([target, per_mm * target + noise, "+" if way > 0 else "-", run])
+    book.save(folder / "p.xlsx")
+    return folder / "p.xlsx"
+
+
+def test_import_shows_what_is_not_used_and_carries_the_date_over(capsys, tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text(
+        "Date: 04/03/2025\nTarget [mm],Deviation [um],Dead path [mm],Air temp [degC]\n0,1,5,20\n100,2,5,20.5\n"
+    )
+    words = ("import", path, "--axis", "X", "--out", tmp_path / "o")
+    code, out, _ = call(capsys, *words, "--dates", "dmy")
+    assert code == 0
+    assert "not_used:" in out
+    assert "Dead path [mm]: it has no place in the contract file" in out
+    text = (tmp_path / "o" / "x.axis.csv").read_text()
+    assert "# measured_at = 2025-03-04\n" in text
+    assert "temp_ambient_c" in text
+    code, out, _ = call(capsys, *words)
+    assert code == 0
+    assert "may be 2025-03-04 or 2025-04-03" in out
+    assert "measured_at" not in (tmp_path / "o" / "x.axis.csv").read_text()
