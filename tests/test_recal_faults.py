@@ -276,6 +276,7 @@ def open_site():
     """A site in a folder that every user may enter."""
     folder = Path(tempfile.mkdtemp(prefix="compgen-site-", dir="/tmp"))
     folder.chmod(0o755)
+    command(faults.Site(folder / "warm"), "run")  # imports everything, which nobody may not be allowed to read
     yield faults.Site(folder / "site")
     shutil.rmtree(folder)
 
