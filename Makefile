@@ -13,7 +13,7 @@ demo: .venv/ready
 	$(BIN)/python examples/against_truth.py demo-out
 
 test: lint system
-	$(BIN)/python -m pytest -n 2 -ra
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -ra
 
 # programs of the system that some tests run against; those tests are skipped by name where they cannot be installed
 system:
