@@ -78,12 +78,17 @@ def run_fleet(
     fleet = open_fleet(job.store, workers, cluster)
     if fleet is None:
         return run_jobs(job, names, stop=stop)
+    with closing(fleet):
+        return run_with(fleet, job, names, stop=stop)
+
+
+def run_with(fleet: Workers, job: Job, names: Sequence[str] = (), *, stop: Stop = lambda: False) -> RunOutcome:
+    """Make one pass over the machines ``names`` (default all) with workers that are there; see :func:`run_fleet`."""
 
     def mapper(_: Callable[[MachineJob], MachineOutcome], chosen: Iterable[MachineJob]) -> Iterator[MachineOutcome]:
         return spread(fleet, pass_of(job.store), chosen, lost=_lost, stop=stop)
 
-    with closing(fleet):
-        return run_jobs(job, names, mapper=mapper)
+    return run_jobs(job, names, mapper=mapper)
 
 
 def _lost(job: MachineJob, error: CompgenError) -> MachineOutcome:
