@@ -1,5 +1,7 @@
 """Imports: what stands beside the readings (temperatures, times, tool, feed, load), dates, and what laser files say."""
 
+import time
+import zipfile
 from datetime import datetime
 
 import numpy as np
@@ -36,6 +38,8 @@ def written(tmp_path, text, name="t.csv", encoding="utf-8"):
         ("12. Dezember 2016", "2016-12-12"),
         ("3-Mar-2020", "2020-03-03"),
         ("05/05/2025", "2025-05-05"),
+        ("10:46 13-04-2025", "2025-04-13T10:46:00"),
+        ("2025-04-13 10:46 -0500", "2025-04-13T10:46:00-05:00"),
     ],
 )
 def test_dates_that_can_be_read_in_one_way_are_read_so(text, iso):
@@ -423,3 +427,35 @@ def test_the_name_of_a_laser_file_may_say_the_axis(tmp_path):
     item = import_file(written(tmp_path, laser([UP, DOWN], axis=""), "mill_y-axis.rtl"))
     assert item.data.axes == (1,)
     assert "axis Y by the name of the file" in item.notes
+
+
+def test_a_sheet_of_a_million_rows_is_answered_at_once(tmp_path):
+    row = b"<row><c><v>1.5</v></c><c><v>0.25</v></c></row>"
+    with zipfile.ZipFile(tmp_path / "m.xlsx", "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr("[Content_Types].xml", "<a/>")
+        archive.writestr("xl/workbook.xml", "<a/>")
+        archive.writestr("xl/worksheets/sheet1.xml", b"<a>" + row * 1_100_000 + b"</a>")
+    started = time.process_time()
+    with pytest.raises(InputError, match="a sheet of 51 MB unpacked; at most 48 MB are read: save that sheet as CSV"):
+        import_file(tmp_path / "m.xlsx")
+    assert time.process_time() - started < 1.0
+
+
+def test_no_damage_to_a_table_or_a_laser_file_ends_in_anything_but_an_answer(tmp_path):
+    generator = np.random.default_rng(11)
+    whole = {"t.csv": LENGTHS.encode(), "x.rtl": laser([UP, DOWN], beside=ENVIRONMENT).encode()}
+    pieces = (b"\xff", b",", b";", b"\0", b"1e999", b"::", b"\n", b"/", b"31/02/2025", b"1,000", b'"', b"nan", b"[K]")
+    for name, content in whole.items():
+        for _ in range(150):
+            data = bytearray(content)
+            for _ in range(int(generator.integers(1, 6))):
+                place = int(generator.integers(len(data)))
+                if generator.integers(3) == 0:
+                    del data[place : place + int(generator.integers(1, 40))]
+                else:
+                    data[place:place] = pieces[int(generator.integers(len(pieces)))]
+            try:
+                item = import_file(written(tmp_path, bytes(data), name))
+            except InputError:
+                continue
+            assert item.files()

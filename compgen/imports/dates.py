@@ -26,7 +26,7 @@ _SERIAL_ZERO = datetime(1899, 12, 30)
 _CLOCK = re.compile(
     r"(?<![\d:])(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?(?![\d:])\s{0,2}([aApP])?(?:\.?[mM]\b)?"
 )
-_ZONE = re.compile(r"(?<=\d)\s?(Z|[+-]\d{2}:?\d{2})$")
+_ZONE = re.compile(r"\s?(Z|[+-]\d{2}:?\d{2})$")
 _NUMBERS = re.compile(r"(?<!\d)(\d{4}|\d{1,2})\s?([./-])\s?(\d{1,2})\s?\2\s?(\d{4}|\d{1,2})(?!\d)")
 _WORD = re.compile(r"[A-Za-z\u00e4\u00c4]{3,9}")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
@@ -91,10 +91,9 @@ def read_date(text: str) -> Written | None:
     clock_s = _seconds(found) if found else None
     if found and clock_s is None:
         return None
-    zone = _ZONE.search(content) if found else None
-    rest = content if found is None else f"{content[: found.start()]} {content[found.end() :]}"
-    if zone:
-        rest = rest[: len(rest) - len(zone.group(0))]
+    before, after = (content[: found.start()], content[found.end() :]) if found else (content, "")
+    zone = _ZONE.match(after)
+    rest = before if zone else f"{before} {after}"
     days = _days(rest)
     if not days and (clock_s is None or re.search(r"\d", rest)):
         return None

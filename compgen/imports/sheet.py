@@ -19,6 +19,8 @@ from compgen.imports.source import MEGABYTE, check_size, shown
 
 #: Limits of the archive: packed, unpacked, and members; a workbook that is a bomb is refused before it is unpacked.
 MOST_PACKED, MOST_UNPACKED, MOST_MEMBERS = 64 * MEGABYTE, 256 * MEGABYTE, 2_000
+#: One sheet, unpacked: some one and a half million cells, half a minute of reading.
+MOST_SHEET = 48 * MEGABYTE
 #: Unpacked bytes for each packed one, above which a member of more than a megabyte is a bomb; sheets have up to 60.
 MOST_RATIO = 300
 _FORBIDDEN = (b"<!DOCTYPE", b"<!ENTITY", "<!DOCTYPE".encode("utf-16-le"), "<!DOCTYPE".encode("utf-16-be"))
@@ -104,6 +106,9 @@ def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo)
             f"{shown(member.filename)} unpacks to {member.file_size / max(1, member.compress_size):.0f} times its size"
         )
         raise InputError(f"{message}: it is no measurement (a zip bomb?)", file=path)
+    if member.filename.startswith("xl/worksheets/") and member.file_size > MOST_SHEET:
+        message = f"has a sheet of {member.file_size / MEGABYTE:.0f} MB unpacked; at most {MOST_SHEET / MEGABYTE:.0f} MB are read"
+        raise InputError(f"{message}: save that sheet as CSV, which is read up to a million rows", file=path)
     if not member.filename.endswith((".xml", ".rels", ".vml")):
         return
     tail = b""
