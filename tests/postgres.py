@@ -14,6 +14,8 @@ PROGRAMS = ("initdb", "postgres")
 #: Nothing has to outlive a power failure here.
 FAST = ("fsync=off", "full_page_writes=off", "shared_buffers=16MB", "max_connections=40")
 PATIENCE_S = 60.0
+#: The databases of all tests take a quarter of it.
+ENOUGH_BYTES = 2_000_000_000
 
 
 def folder_of_programs():
@@ -43,12 +45,18 @@ def _end_with_parent():
     ctypes.CDLL(None).prctl(set_death_signal, signal.SIGQUIT)
 
 
+def _place():
+    """Memory where there is enough of it, else the disk; a short name in both, as the path of a socket is limited."""
+    memory = Path("/dev/shm")
+    return memory if memory.is_dir() and shutil.disk_usage(memory).free > ENOUGH_BYTES else Path("/tmp")
+
+
 class Server:
     """A running server; databases are made one after the other."""
 
     def __init__(self):
         self.programs, self.account, self.count = folder_of_programs(), _account(), 0
-        self.folder = Path(tempfile.mkdtemp(prefix="compgen-pg-", dir="/tmp"))  # short: a socket's path is limited
+        self.folder = Path(tempfile.mkdtemp(prefix="compgen-pg-", dir=_place()))
         try:
             if self.account:
                 os.chown(self.folder, self.account["user"], self.account["group"])
