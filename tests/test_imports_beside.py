@@ -459,3 +459,22 @@ def test_no_damage_to_a_table_or_a_laser_file_ends_in_anything_but_an_answer(tmp
             except InputError:
                 continue
             assert item.files()
+
+
+def test_slips_are_remarked_on_and_deviations_of_more_than_100_mm_are_refused(tmp_path):
+    def table(value):
+        rows = [(t, t * 0.01) for t in range(0, 1000, 100)]
+        rows[4] = (400, value)
+        return "position [mm],deviation [um],axis\n" + "".join(f"{t},{v},X\n" for t, v in rows)
+
+    assert not any("far from" in text for text in import_file(written(tmp_path, table(4.1))).notes)
+    slip = import_file(written(tmp_path, table(4100)))
+    assert any("4.1 (mm or rad) at 400 mm, line 6, is far from all others" in text for text in slip.notes)
+    large = import_file(written(tmp_path, table(4.1e6)))
+    assert any("numbers look like" in text for text in large.doubts)
+    readings = "target [mm],measured [mm],axis\n" + "".join(
+        f"{t},{t * 1.00001:.5f},X\n" for t in range(0, 100_000, 100)
+    )
+    slipped = readings.replace("\n400,400.00400,", "\n400,4000.04,")
+    with pytest.raises(InputError, match="t.csv:6: a deviation of 3600 mm is none"):
+        import_file(written(tmp_path, slipped))

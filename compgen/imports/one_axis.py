@@ -18,6 +18,8 @@ from compgen.errors import InputError
 from compgen.identify.axis_runs import SAME_TARGET_MM, two_way_mean, worth_a_table
 
 IntArray = NDArray[np.int64]
+#: A reading is remarked on if it lies so far from the median, mm or rad, and so many times further than nine in ten others.
+_NOTABLE, _FAR = 0.1, 20.0
 _AXIS = re.compile(r"(?<![A-Z])([XYZ])[0-9]?(?![A-Z])")
 
 
@@ -150,7 +152,17 @@ def remarks(runs: OneAxis, axis: str) -> list[str]:
         at = runs.targets_mm[column]
         what = "reading is" if empty == 1 else "readings are"
         found.append(f"{name}: {empty} of {table.size} {what} missing, the first in one-way run {row + 1} at {at:g} mm")
-    return found + _copies(runs, name, table, one_way.ravel())
+    return found + _outlier(runs, name) + _copies(runs, name, table, one_way.ravel())
+
+
+def _outlier(runs: OneAxis, name: str) -> list[str]:
+    """Name the reading that is furthest from the median, if it is far beyond what the others spread over (0.1 mm, mrad)."""
+    away = np.abs(runs.value - np.median(runs.value))
+    worst = int(np.argmax(away))
+    if len(away) < 3 or away[worst] < max(_NOTABLE, _FAR * float(np.quantile(np.delete(away, worst), 0.9))):
+        return []
+    at, value = runs.position_mm[worst], runs.value[worst]
+    return [f"{name}: {value:.4g} (mm or rad) at {at:g} mm, line {runs.line[worst]}, is far from all others; a slip?"]
 
 
 def _copies(runs: OneAxis, name: str, table: FloatArray, one_way: IntArray) -> list[str]:

@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from compgen.controllers.isg.etalon_exchange import is_exchange_text
+from compgen.core.axis_runs import AxisRuns
+from compgen.core.deviations import Deviations
 from compgen.errors import CompgenError, InputError
 from compgen.imports.capture import MOST_BYTES as MOST_CAPTURE
 from compgen.imports.capture import is_capture
@@ -18,6 +20,7 @@ from compgen.imports.renishaw import REFUSED, is_renishaw_text
 from compgen.imports.result import Imported, ImportOptions
 from compgen.imports.sheet import chosen_sheet, read_sheets
 from compgen.imports.source import MOST_BYTES, MOST_OWN_BYTES, check_size, decode_head, read_head, read_source, shown
+from compgen.imports.table_points import check_largest
 from compgen.imports.tables import import_table, merged_sheets
 
 #: Columns that make a file one of the project's own.
@@ -103,6 +106,8 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
     form = form_of(source)
     _check_options(source, form, chosen)
     item = READERS[form](source, chosen)
+    if not item.doubts and isinstance(item.data, AxisRuns | Deviations):
+        check_largest(item.data.deviation_mm, item.data.origin)
     if chosen.kind is not None and item.kind != chosen.kind:
         raise InputError(f"holds {item.kind}, not {chosen.kind}", file=source, field="--kind")
     return item

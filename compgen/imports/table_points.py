@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
-from compgen.core.deviations import Deviations
+from compgen.core.deviations import LARGEST_UM, Deviations
 from compgen.core.lengths import Lengths
+from compgen.core.names import MM_PER_UM
+from compgen.errors import InputError
 from compgen.imports.columns import MM_PER_LENGTH
 from compgen.imports.findings import Findings
 from compgen.imports.further import Further, further_of, metadata_of
@@ -200,6 +202,17 @@ def deviations_of(findings: Findings) -> Deviations:
         metadata=metadata_of(findings, further),
         origin=[(str(findings.table.grid.path), line) for line in findings.table.lines],
     )
+
+
+def check_largest(deviation_mm: FloatArray, origin: Sequence[tuple[str, int]]) -> None:
+    """Refuse deviations that no file of the contract may hold; ``deviation_mm`` is (n,) or (n, 3), nan where unknown."""
+    size = np.nan_to_num(np.abs(deviation_mm)).reshape(len(deviation_mm), -1).max(axis=1)
+    worst = int(np.argmax(size))
+    if size[worst] > LARGEST_UM * MM_PER_UM:
+        file, line = origin[worst]
+        raise InputError(
+            f"a deviation of {size[worst]:.4g} mm is none; is it a slip, or another unit?", file=file, line=line
+        )
 
 
 def _measured(findings: Findings, key: str, position: FloatArray) -> FloatArray:
