@@ -189,7 +189,7 @@ def test_a_second_pass_on_a_cluster_changes_nothing(factory, there):
     job = read_job(factory / "recal.toml")
     first = fleet.run_with(there, job)
     before = contents(factory), rows_of(job.store)
-    again = fleet.run_fleet(job, cluster=address)
+    again = fleet.run_with(there, job)
     assert [item.processed for item in again.outcomes] == [()] * 4
     assert again.exit_code == first.exit_code
     assert (contents(factory), rows_of(job.store)) == before
