@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,10 +16,15 @@ from compgen.diagnose.groups import Group, named_groups
 from compgen.diagnose.noise import Noise
 from compgen.diagnose.noise_fit import noise_of, run_ratio
 from compgen.diagnose.scene import Scene, scene_of
-from compgen.diagnose.search import Chosen, Rules, rules_of, search
+from compgen.diagnose.search import Chosen, Rules, beside, gains, rules_of, search
 from compgen.diagnose.whiten import whitener
 
 Show = Callable[[str], None]
+
+#: Share of what wider curves explain above which one smooth term in one direction stands for them.
+ONE_TERM = 0.85
+#: Named effects that wider curves are compared with.
+MOST_NAMED = 4
 
 
 @dataclass(frozen=True)
@@ -53,26 +58,14 @@ def analyse(
     sigma_mm : standard uncertainty of each reading, (n,), if one is given.
     show : receives the stage in words.
     """
-    wider = wider_of(fit)
-    found = _analysed(fit, wider, most_named, only, sigma_mm, show)
-    chosen = {found.scene.groups[g].name for g in found.chosen.members}
-    taken = [item for item in wider if item.group.name in chosen]
-    return _analysed(widened(fit, taken), (), most_named, only, sigma_mm, show) if taken else found
-
-
-def _analysed(
-    fit: BaseFit,
-    wider: Sequence[Wider],
-    most_named: int,
-    only: Sequence[str],
-    sigma_mm: FloatArray | None,
-    show: Show,
-) -> Analysis:
-    """Analyse the residuals of a base fit, with wider curves among the groups."""
     show("building the catalogue")
+    wider = wider_of(fit)
+    if wider:
+        show("choosing the curves of the base model")
+        taken = needed(fit, wider, only, sigma_mm)
+        fit = widened(fit, taken) if taken else fit
     named, missing = named_groups(fit.readings, only)
-    groups = [*base_groups(fit.readings), *(item.group for item in wider), *named]
-    groups += generic_groups(fit.readings, fit.observed.layout)
+    groups = [*base_groups(fit.readings), *named, *generic_groups(fit.readings, fit.observed.layout)]
     fixed = [group for group in named if group.scans == 1 or fit.readings.kind == "axis"]
     show("fitting the noise")
     noise = noise_of(fit, fixed if _repeats(fit) else [], sigma_mm=sigma_mm)
@@ -87,6 +80,32 @@ def _analysed(
     ratio = run_ratio(fit, [*fixed, *more], noise)
     evidence = evidence_of(scene, chosen, noise, ratio, fit.observed.layout)
     return Analysis(fit, noise, scene, rules, chosen, evidence, tuple(missing))
+
+
+def needed(fit: BaseFit, wider: Sequence[Wider], only: Sequence[str], sigma_mm: FloatArray | None) -> list[Wider]:
+    """Return the wider bases that are worth their columns beside the names, and that no single smooth term replaces.
+
+    A machine whose curves are steeper has them in several errors of an axis; what acts in one direction alone is
+    something else.
+    """
+    named, _ = named_groups(fit.readings, only)
+    fixed = [group for group in named if group.scans == 1]
+    noise = noise_of(fit, fixed if _repeats(fit) else [], sigma_mm=sigma_mm)
+    along = [group for group in generic_groups(fit.readings, fit.observed.layout) if len(group.covariates) == 1]
+    along = [group for group in along if group.covariates[0] in ("x", "y", "z")]
+    groups = [*base_groups(fit.readings), *(item.group for item in wider), *named, *along]
+    scene = scene_of(fit, groups, whitener(fit.observed.layout, noise))
+    chosen = search(scene, replace(rules_of(scene, MOST_NAMED), generic=False)).members
+    found = []
+    for item in wider:
+        place = next((g for g in chosen if groups[g].name == item.group.name), None)
+        if place is None:
+            continue
+        left = beside(scene, [g for g in chosen if g != place])
+        single = [g for g, group in enumerate(groups) if group.covariates == ("xyz"[item.axis],) and scene.size(g)]
+        if max(gains(scene, left, single), default=0.0) < ONE_TERM * float(gains(scene, left, [place])[0]):
+            found.append(item)
+    return found
 
 
 def _repeats(fit: BaseFit) -> bool:

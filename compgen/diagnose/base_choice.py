@@ -21,6 +21,8 @@ from compgen.diagnose.observed import Observed
 
 #: Directions of new columns of which less than this (squared) is left beside the old ones say nothing.
 LEAST_SQUARE = 1e-6
+#: Standard deviations of a chi-square beyond its mean that wider curves must explain to be looked at more closely.
+CHANCE = 4.0
 
 
 @dataclass(frozen=True)
@@ -40,15 +42,16 @@ def fit_smooth(observed: Observed) -> BaseFit:
 
 
 def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
-    """Return for every axis the wider basis that lowers the BIC most, if one does."""
+    """Return for every axis the wider basis with the largest evidence, if one explains more than chance: a first look."""
     found: list[Wider] = []
     for axis in range(3 if fit.basis.errors else 0):
-        best, least = None, 0.0
+        best, least = None, -np.inf
         for basis in wider_bases(fit.basis, axis, fit.observed.poses.position_mm, len(fit.observed)):
             columns = _columns(fit, basis)
             gain, added = _gain(fit, columns)
-            if added and gain - added * np.log(len(fit.observed)) > least:
-                best, least = (basis, columns), gain - added * np.log(len(fit.observed))
+            evidence = gain - added * (1.0 + np.log(max(gain / max(added, 1), 1.0)))
+            if added and gain > added + CHANCE * np.sqrt(2.0 * added) and evidence > least:
+                best, least = (basis, columns), evidence
         if best is not None:
             found.append(Wider(axis, best[0], Group(f"wider curves of {AXES[axis]}", "base", best[1])))
     return tuple(found)

@@ -17,6 +17,8 @@ from compgen.diagnose.scene import Scene
 #: Handicap of a generic group, and of one that depends on time or temperature.
 HANDICAP, SLOW_HANDICAP = 21.0, 27.0
 MOST_MEMBERS = 6
+#: Columns of the base model up to this number pay as in the BIC; more are curves, and pay as a random effect.
+FEW = 3
 BEAM, ADDITIONS = 2, 3
 #: Largest p-value of a member, corrected for the number of groups and scan positions.
 LARGEST_P = 1e-3
@@ -33,12 +35,14 @@ class Rules:
     named : number of named effects.
     most_named, most_members : how many named effects and groups in all may be chosen.
     predicting : whether groups that say nothing about other readings (an offset of each line) are left out.
+    generic : whether groups without a name may be chosen.
     """
 
     named: int
     most_named: int = 4
     most_members: int = MOST_MEMBERS
     predicting: bool = False
+    generic: bool = True
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ def rules_of(scene: Scene, most_named: int) -> Rules:
 def penalty(scene: Scene, rules: Rules, group: int, chi2: float) -> float:
     """Penalty of a member that gains ``chi2``."""
     item, k = scene.groups[group], scene.size(group)
-    if item.tier == "base":
+    if item.tier == "base" and not _is_random(scene, group):
         return k * float(np.log(scene.count))
     if item.tier == "named":
         return k * float(np.log(scene.count)) + 2 * float(np.log(rules.named)) + 2 * float(np.log(item.scans))
@@ -68,9 +72,15 @@ def penalty(scene: Scene, rules: Rules, group: int, chi2: float) -> float:
     return k + k * float(np.log(max(chi2 / max(k, 1), 1.0))) + handicap
 
 
+def _is_random(scene: Scene, group: int) -> bool:
+    """Whether a group is charged as a random effect: those without a name, and curves of many columns."""
+    tier = scene.groups[group].tier
+    return tier == "generic" or (tier == "base" and scene.size(group) > FEW)
+
+
 def _ordered(scene: Scene, members: Sequence[int]) -> list[int]:
     rank = {"base": 0, "named": 1, "generic": 2}
-    return sorted(members, key=lambda g: rank[scene.groups[g].tier])
+    return sorted(members, key=lambda g: (_is_random(scene, g), rank[scene.groups[g].tier]))
 
 
 @dataclass(frozen=True)
@@ -118,7 +128,7 @@ def evaluate(scene: Scene, rules: Rules, members: Sequence[int]) -> Chosen:
     order = _ordered(scene, members)
     found, total = [], 0.0
     criterion = 0.0
-    fixed = [g for g in order if scene.groups[g].tier != "generic"]
+    fixed = [g for g in order if not _is_random(scene, g)]
     known = beside(scene, fixed).chi2
     criterion += sum(penalty(scene, rules, g, 0.0) for g in fixed) - known
     found += [gain_of(scene, [f for f in fixed if f != g], g) for g in fixed]
@@ -146,6 +156,8 @@ def allowed_beside(scene: Scene, rules: Rules, members: Sequence[int]) -> list[i
         if group.name in names or not scene.size(g) or (rules.predicting and not group.predicts):
             continue
         if group.tier == "named" and named >= rules.most_named:
+            continue
+        if group.tier == "generic" and not rules.generic:
             continue
         if group.tier != "base" and len(reported) >= rules.most_members:
             continue
