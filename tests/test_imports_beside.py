@@ -283,7 +283,11 @@ def test_positions_without_a_unit_beside_values_in_inches_are_asked_for(tmp_path
 
 def test_options_that_a_format_cannot_take_and_unknown_fields_are_refused(tmp_path):
     exchange = written(tmp_path, "[EXX]\nGridpoints = {\n0 0.001\n100 -0.002\n}\n", "e.txt")
-    with pytest.raises(InputError, match="--unit: does not apply to a file of the format etalon-exchange; --sign do"):
+    with pytest.raises(
+        InputError, match="--map: does not apply to a file of the format etalon-exchange; --sign, --unit do"
+    ):
+        import_file(exchange, ImportOptions(columns={"position": "A"}))
+    with pytest.raises(InputError, match="say linear= or angle="):
         import_file(exchange, ImportOptions(units={"value": "um"}))
     table = written(tmp_path, "position [mm],deviation [um],axis\n0,1,X\n1,2,X\n")
     with pytest.raises(InputError, match="--sheet: does not apply"):
@@ -478,3 +482,19 @@ def test_slips_are_remarked_on_and_deviations_of_more_than_100_mm_are_refused(tm
     slipped = readings.replace("\n400,400.00400,", "\n400,4000.04,")
     with pytest.raises(InputError, match="t.csv:6: a deviation of 3600 mm is none"):
         import_file(written(tmp_path, slipped))
+
+
+def test_exchange_files_in_other_units_are_doubted_until_the_user_says_them(tmp_path):
+    text = "[EXX]\nGridpoints = {\n0 1\n100 -2\n}\n[EAX]\nGridpoints = {\n0 1\n100 3\n}\n[C0Y]\nVALUE = 20\n"
+    path = written(tmp_path, text, "e.txt")
+    doubts = " ".join(import_file(path).doubts)
+    for name in ("EXX reaches 2000 um", "EAX reaches 3e+06 urad", "C0Y reaches 2e+07 urad"):
+        assert name in doubts
+    item = import_file(path, ImportOptions(units={"linear": "um", "angle": "urad"}))
+    assert item.doubts == ()
+    np.testing.assert_allclose(item.data.curves["EXX"].value, [1e-3, -2e-3], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(item.data.curves["EAX"].value, [1e-6, 3e-6], rtol=0, atol=1e-18)
+    assert item.data.squareness["EC0Y"][0] == pytest.approx(2e-5, abs=1e-18)
+    confirmed = import_file(path, ImportOptions(units={"linear": "mm", "angle": "rad"}))
+    assert confirmed.doubts == ()
+    assert confirmed.data.curves["EXX"].value.tolist() == [1, -2]

@@ -5,18 +5,18 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from compgen.controllers.isg.etalon_exchange import errors_from_etalon
-from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.error_table import ErrorTable
+from compgen.core.names import AXES, MM_PER_UM, error_named
 from compgen.errors import InputError
 from compgen.imports.capture import read_capture
 from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, known_unit
 from compgen.imports.dates import header_date
 from compgen.imports.ecmc import read_ecmc
-from compgen.imports.hypotheses import ABSURD_DECADES, decades_off, unit_of_deviations, usual_deviation_mm
+from compgen.imports.hypotheses import ABSURD_DECADES, USUAL_URAD, decades_off, unit_of_deviations, usual_deviation_mm
 from compgen.imports.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion, remarks
 from compgen.imports.renishaw import UNITS, Renishaw, read_renishaw, without_runs
 from compgen.imports.result import Imported, ImportOptions, Kind
@@ -209,9 +209,9 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
 def import_exchange(path: Path, options: ImportOptions) -> Imported:
     """Import an Etalon exchange file, variant Vendor: errors in mm and rad, as they stand."""
     source = read_source(path, most=MOST_EXCHANGE_BYTES)
-    table = errors_from_etalon(source.text, path)
+    table, units = _in_units(errors_from_etalon(source.text, path), options)
     notes = [
-        "lengths are mm and angles rad, as the format has them; squareness in the convention of ISO 230-1 (reference X)"
+        f"lengths are {units['linear']} and angles {units['angle']}; squareness in the convention of ISO 230-1 (reference X)"
     ]
     if options.sign == "correction":
         curves = {name: replace(curve, value=-curve.value) for name, curve in table.curves.items()}
@@ -225,22 +225,50 @@ def import_exchange(path: Path, options: ImportOptions) -> Imported:
             **{n: float(np.max(np.abs(c.value))) * (1e3 if n[1] in "XYZ" else 1e6) for n, c in table.curves.items()},
             **{name: abs(value) * 1e6 for name, (value, _) in table.squareness.items()},
         },
-        "unit": "mm, rad",
+        "unit": f"{units['linear']}, {units['angle']}",
         "sign": "errors" if options.sign != "correction" else "corrections, turned round",
         "instrument": "laser tracer software (Etalon exchange)",
     }
     kind: Kind = "errors"
-    return Imported(path, "etalon-exchange", kind, table, understood, tuple(_absurd(understood)), tuple(notes))
+    return Imported(path, "etalon-exchange", kind, table, understood, tuple(_absurd(table, options)), tuple(notes))
 
 
-def _absurd(understood: dict[str, Any]) -> list[str]:
-    """Errors of more than 10 mm or 10 mrad are no errors of a machine tool: the unit is another one."""
-    largest = {name: value for name, value in understood["largest_um_urad"].items() if value > 1e4}
-    if not largest:
-        return []
-    name, value = max(largest.items(), key=lambda item: item[1])
-    unit = "um" if name[1] in "XYZ" and name[2] in "XYZ" and name[1] != "0" else "urad"
-    return [f"{name} reaches {value:.4g} {unit}: are the numbers mm and rad?"]
+def _in_units(table: ErrorTable, options: ImportOptions) -> tuple[ErrorTable, dict[str, str]]:
+    """Return the errors in the units that the user says, and those units; the format has mm and rad."""
+    units = {"linear": "mm", "angle": "rad"}
+    scales = {}
+    for kind, known in (("linear", MM_PER_LENGTH), ("angle", RAD_PER_ANGLE)):
+        given = options.units.get(kind)
+        unit = known_unit(given) if given else units[kind]
+        if unit not in known:
+            raise InputError(f"{given!r} is no unit of it; {', '.join(known)} are", field=f"--unit {kind}")
+        units[kind], scales[kind] = str(unit), known[str(unit)]
+    curves = {
+        name: replace(curve, value=curve.value * scales["linear" if error_named(name).kind == "linear" else "angle"])
+        for name, curve in table.curves.items()
+    }
+    squareness = {name: (value * scales["angle"], u) for name, (value, u) in table.squareness.items()}
+    return table.replace(curves=curves, squareness=squareness), units
+
+
+def _absurd(table: ErrorTable, options: ImportOptions) -> list[str]:
+    """Errors that are hundreds of times larger than usual are in another unit, unless the user has said it."""
+    found = []
+    for name, curve in table.curves.items():
+        linear = error_named(name).kind == "linear"
+        usual = usual_deviation_mm(float(np.ptp(curve.position_mm))) if linear else USUAL_URAD * 1e-6
+        kind = "linear" if linear else "angle"
+        if kind not in options.units and decades_off(curve.value, 1.0, usual) > ABSURD_DECADES:
+            reach = f"{float(np.max(np.abs(curve.value))) * (1e3 if linear else 1e6):.4g} {'um' if linear else 'urad'}"
+            found.append(
+                f"{name} reaches {reach}: are the numbers mm and rad? say --unit {kind}={'mm' if linear else 'rad'} or another"
+            )
+    for name, (value, _) in table.squareness.items():
+        if "angle" not in options.units and abs(value) > USUAL_URAD * 1e-6 * 10**ABSURD_DECADES:
+            found.append(
+                f"{name} reaches {1e6 * abs(value):.4g} urad: are the numbers mm and rad? say --unit angle=rad or another"
+            )
+    return found
 
 
 def import_capture(path: Path, options: ImportOptions) -> Imported:

@@ -51,7 +51,7 @@ _TAKES: dict[str, tuple[str, ...]] = {
     "renishaw": ("units", *_ONE_AXIS, "zero_runs"),
     "renishaw-capture": ("dates",),
     "ecmc-iso230": _ONE_AXIS[:-1],
-    "etalon-exchange": ("sign",),
+    "etalon-exchange": ("sign", "units"),
     "table": tuple(name for name in _FLAGS if name not in ("sheet", "zero_runs")),
     "xlsx": tuple(name for name in _FLAGS if name != "zero_runs"),
 }
@@ -122,7 +122,9 @@ def _check_options(path: Path, form: str, options: ImportOptions) -> None:
     for key in options.units:
         if form == "renishaw" and key not in ("value", "deviation"):
             raise InputError("of this format only the unit of the values is open", file=path, field=f"--unit {key}")
-        if key != "value":
+        if form == "etalon-exchange" and key not in ("linear", "angle"):
+            raise InputError("say linear= or angle= for this format", file=path, field=f"--unit {key}")
+        if key not in ("value", "linear", "angle"):
             check_field(key, "--unit")
 
 
