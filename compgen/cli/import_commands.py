@@ -27,7 +27,8 @@ _HELP = {
     "map": "FIELD=COLUMN: position, actual, deviation, correction, direction, run, axis; x, y, z, length, station, point; "
     "dx, dy, dz, xa, ya, za; error, value; temperature, temp_NAME, time, date, feed, load, tool_x, approach_x, repeat, line, "
     "block, setup, pose, u_value. May be given several times.",
-    "unit": "FIELD=UNIT, e.g. deviation=um, position=mm, or UNIT alone for the values; linear=, angle= of errors. um, mm, nm, m, in; urad, mrad, arcsec, "
+    "unit": "FIELD=UNIT, e.g. deviation=um, position=mm, or UNIT alone for the values; linear=, angle= of "
+    "errors. um, mm, nm, m, in; urad, mrad, arcsec, "
     "rad, deg; temp_NAME=degC, K, degF; time=s, ms, min, h; feed=mm/min; load=kg.",
     "axis": "The axis that moved.",
     "error": "The error that the values are (EYX, ECX, ...), for straightness and angles.",
