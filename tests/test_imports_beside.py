@@ -498,3 +498,36 @@ def test_exchange_files_in_other_units_are_doubted_until_the_user_says_them(tmp_
     confirmed = import_file(path, ImportOptions(units={"linear": "mm", "angle": "rad"}))
     assert confirmed.doubts == ()
     assert confirmed.data.curves["EXX"].value.tolist() == [1, -2]
+
+
+def test_the_projects_own_columns_are_known_in_another_dialect(tmp_path):
+    names = "station point x_mm y_mm z_mm length_mm tool_x_mm tool_y_mm tool_z_mm time_s temp_x_c temp_ambient_c"
+    names += " feed_mm_min load_kg u_length_um approach_x run line"
+    cells = [
+        "A",
+        "{k}",
+        "{k}00",
+        "0",
+        "0",
+        "1{k}0,5",
+        "0",
+        "0",
+        "9",
+        "{k}",
+        "20,1",
+        "20,2",
+        "500",
+        "3",
+        "0,2",
+        "1",
+        "1",
+        "{k}",
+    ]
+    rows = [";".join(cells).format(k=k) for k in (1, 2, 3)]
+    item = import_file(written(tmp_path, "\n".join([names.replace(" ", ";"), *rows, ""])))
+    assert item.doubts == ()
+    assert "not_used" not in item.understood
+    assert set(item.data.covariates) == {*names.split()[9:15]}
+    assert set(item.data.labels) == {"run", "line"}
+    assert item.data.covariates["u_length_um"].tolist() == [0.2] * 3
+    assert item.data.approach[:, 0].tolist() == [1, 1, 1]

@@ -158,6 +158,8 @@ def split_name(name: str) -> Column:
     >>> split_name("Pos. [mm]"), split_name("dx_um").unit, split_name("Abweichung / µm").unit
     (Column(name='Pos. [mm]', word='pos', unit='mm'), 'um', 'um')
     """
+    if name.lower().endswith("_mm_min"):
+        return Column(name, _word(name[: -len("_mm_min")]), "mm/min")
     bracket = _BRACKETS.search(name)
     unit = bracket and (known_unit(bracket.group(1)) or further_unit(bracket.group(1)))
     if bracket and unit:
