@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from compgen.cli import cli
+from compgen.cli import cli, parallel_options
 from compgen.cli.common import run_command
 from compgen.core import cluster, parallel
 from compgen.core.deviations import Deviations, format_deviations
@@ -205,6 +205,27 @@ def test_the_self_check_gives_the_same_numbers_in_processes_and_on_a_cluster(
     assert self_check(*case, replicates=10, seed=3, mapper=lambda f, items: spread(pool, f, items)) == here
     assert self_check(*case, replicates=10, seed=3, mapper=lambda f, items: spread(there, f, items)) == here
     assert self_check(*case, replicates=10, seed=4) != here
+
+
+def test_diagnoses_of_many_measurements_are_the_same_in_processes(
+    pool, small_machine_file, small_lengths_file, tmp_path, monkeypatch, capsys, listing
+):
+    lines = [line for line in small_lengths_file.read_text().splitlines(keepends=True) if "rows" not in line]
+    kept = [line for k, line in enumerate(lines) if k < 20 or k % 7]
+    (tmp_path / "short.lengths.csv").write_text("".join(kept))
+    (tmp_path / "wrong.lengths.csv").write_text("station\n")
+    shutil.copy(small_lengths_file, tmp_path / "whole.lengths.csv")
+    files = [str(tmp_path / f"{name}.lengths.csv") for name in ("whole", "wrong", "short")]
+    words = ["diagnose", str(small_machine_file), *files, "--each", "--max-effects", "0"]
+    code = run_command(cli, [*words, "--out", str(tmp_path / "here")])
+    said = capsys.readouterr().out
+    assert code == 1 and "wrong.lengths.csv: " in said
+    monkeypatch.setattr(pool, "close", lambda: None)
+    monkeypatch.setattr(parallel_options, "opened_workers", lambda workers, address: pool)
+    assert run_command(cli, [*words, "--out", str(tmp_path / "there"), "--workers", "2"]) == code
+    assert capsys.readouterr().out == said
+    assert listing(tmp_path / "here") == listing(tmp_path / "there")
+    assert (tmp_path / "here" / "short" / "diagnosis.json").is_file()
 
 
 # --- the mapper ----------------------------------------------------------------------------------------------------

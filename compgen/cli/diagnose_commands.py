@@ -7,17 +7,14 @@ from pathlib import Path
 import click
 
 from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.cli.diagnose_batch import Asked, diagnose_each, diagnosed
 from compgen.cli.identify_commands import sixdof_option
+from compgen.cli.parallel_options import fleet_options
 from compgen.controllers.isg.error_files import read_error_file
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
-from compgen.diagnose import DiagnoseOptions, Diagnosis, diagnose
-from compgen.diagnose.files import diagnosis_files, json_text
-from compgen.diagnose.measurement import read_diagnosed
-from compgen.diagnose.sixdof import SixDofDiagnosis, diagnose_sixdof, sixdof_text
+from compgen.diagnose import DiagnoseOptions
 from compgen.errors import InputError
-from compgen.sixdof.instrument import read_instrument
-from compgen.sixdof.readings import read_sixdof
 
 
 @click.command("diagnose")
@@ -37,6 +34,8 @@ from compgen.sixdof.readings import read_sixdof
     metavar="ERRORS",
     help="Errors (*.errors.csv) that the measurement is compared with: which have changed?",
 )
+@click.option("--each", is_flag=True, help="Every measurement by itself, into a folder of --out by its name.")
+@fleet_options
 @json_option
 def diagnose_command(
     machine: Machine,
@@ -48,6 +47,9 @@ def diagnose_command(
     instrument: Path | None,
     u_um: float | None,
     against: Path | None,
+    each: bool,
+    workers: int,
+    cluster: str | None,
     as_json: bool,
 ) -> int:
     """Find where model and measurement disagree, name the missing effect, add it, and see the gap shrink.
@@ -55,6 +57,8 @@ def diagnose_command(
     MEASUREMENTS are *.lengths.csv (mm), *.deviations.csv or *.axis.csv files (um), or *.sixdof.csv files (mm) with
     --instrument, whose readings are asked about their instrument. Writes diagnosis.json,
     diagnosis.md, pages with pictures (index.html), and extended.toml: the machine with the effects that were found.
+
+    --each asks every file by itself; --workers and --cluster share those out.
 
     Exit code 1: it cannot be decided, or the gap does not shrink on lines that were left out.
 
@@ -66,18 +70,14 @@ def diagnose_command(
     names = tuple(name.strip() for name in effects.split(",") if name.strip()) if effects else ()
     predicted = None if against is None else read_error_file(against)
     options = DiagnoseOptions(max_effects, names, added, u_um, predicted)
+    asked = Asked(machine, options, instrument)
+    if each:
+        return diagnose_each(asked, measurements, out, (workers, cluster), as_json=as_json)
+    if workers > 1 or cluster is not None:
+        raise InputError("--workers and --cluster share out the measurements of --each, which is not given")
     with progress(quiet=as_json) as show:
         show("reading the measurement")
-        found: Diagnosis | SixDofDiagnosis
-        if instrument is not None:
-            if predicted is not None or names or added:
-                raise InputError("--against, --effects and --add do not belong to six-DOF readings")
-            found = diagnose_sixdof(machine, read_sixdof(measurements), read_instrument(instrument))
-            contents = {"diagnosis.json": json_text(found.to_dict()), "diagnosis.md": sixdof_text(found)}
-        else:
-            found = diagnose(machine, read_diagnosed(measurements), options, show=show)
-            show("drawing")
-            contents = diagnosis_files(found)
+        found, contents = diagnosed(asked, measurements, show)
     files = OutputFolder(out)
     for name, content in contents.items():
         files.add(name, content)
