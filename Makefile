@@ -39,9 +39,10 @@ lint: .venv/ready-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	@touch $@
 
-# every benchmark, one after the other; some minutes on a quiet computer
+# every benchmark, one after the other, that of the diagnosis in short; some minutes on a quiet computer
 bench: .venv/ready-dev
 	for name in identify evaluate fit interval_coverage; do $(BIN)/python benchmarks/$$name.py || exit 1; done
+	$(BIN)/python benchmarks/diagnosis.py --sets 2
 
 clean:
 	rm -rf .venv demo-out

@@ -10,7 +10,7 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.diagnose.base import BaseFit
 from compgen.diagnose.base_choice import Wider, widened, wider_of
-from compgen.diagnose.evidence import Evidence, evidence_of
+from compgen.diagnose.evidence import RUN_RATIO, Evidence, evidence_of
 from compgen.diagnose.generic import base_groups, generic_groups
 from compgen.diagnose.groups import Group, named_groups
 from compgen.diagnose.noise import Noise
@@ -77,7 +77,7 @@ def analyse(
         noise = noise_of(fit, [*fixed, *more] if _repeats(fit) else more, sigma_mm=sigma_mm, before=noise)
         scene, rules, chosen = _searched(fit, groups, noise, most_named)
     show("weighing the evidence")
-    ratio = run_ratio(fit, [*fixed, *more], noise)
+    ratio = run_ratio(fit, [*fixed, *more], noise, RUN_RATIO)
     evidence = evidence_of(scene, chosen, noise, ratio, fit.observed.layout)
     return Analysis(fit, noise, scene, rules, chosen, evidence, tuple(missing))
 

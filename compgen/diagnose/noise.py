@@ -227,13 +227,21 @@ def _inverse(matrix: FloatArray) -> tuple[FloatArray, float]:
 
 
 def reml_problem(
-    layout: Layout, residual: FloatArray, fixed: FloatArray, *, repeats: bool = True, runs: bool = True
+    layout: Layout,
+    residual: FloatArray,
+    fixed: FloatArray,
+    *,
+    repeats: bool = True,
+    runs: bool = True,
+    numbered: bool = False,
 ) -> Reml:
     """Set up the criterion: residuals (n,) and fixed effects (n, q) in the differences of repeats.
 
-    Without ``repeats`` the residuals themselves are taken; they must then hold nothing but noise.
+    Without ``repeats`` the residuals themselves are taken; they must then hold nothing but noise. ``numbered``: noise
+    goes on from stop to stop, however long that takes.
     """
-    spacing = spacing_of(layout)
+    time = np.arange(layout.stops, dtype=np.float64) if numbered else layout.time
+    spacing = 1.0 if numbered else spacing_of(layout)
     parts, columns = [], np.column_stack([residual, fixed])
     for block in layout.blocks:
         turned = rotated(block, columns)
@@ -243,9 +251,7 @@ def reml_problem(
             continue
         if matrix.shape[0] > MOST_DIFFERENCES:
             matrix = matrix[:MOST_DIFFERENCES]
-        pattern = kernels(
-            layout.time[block.stop], spacing, layout.run[block.stop], layout.in_run[block.stop], runs=runs
-        )
+        pattern = kernels(time[block.stop], spacing, layout.run[block.stop], layout.in_run[block.stop], runs=runs)
         between = [np.ascontiguousarray((matrix @ (matrix @ kernel).T).T) for kernel in pattern]
         channels = np.stack([matrix @ turned[c] for c in range(block.channels)])
         parts.append(_Part(between, np.ascontiguousarray(channels[:, :, 0]), channels[:, :, 1:]))

@@ -83,16 +83,25 @@ def _without_repeats(fit: BaseFit, fixed: Sequence[Group], sigma_mm: FloatArray 
     return Noise(variances, scale, quadratic, 0, criterion, source, spacing_of(fit.observed.layout))
 
 
-def run_ratio(fit: BaseFit, fixed: Sequence[Group], noise: Noise) -> float:
-    """Likelihood ratio of the parts that change from run to run; 0 where they are too small to matter."""
+def run_ratio(fit: BaseFit, fixed: Sequence[Group], noise: Noise, enough: float = 0.0) -> float:
+    """Likelihood ratio of the parts that change from run to run; 0 where they are too small to matter.
+
+    They are compared with noise that goes on in time, and with noise that goes on from stop to stop, unless the first
+    comparison gives no more than ``enough``.
+    """
     runs = float(noise.variances.own[-2:].sum() + noise.variances.common[-2:].sum())
     if noise.source != "repeats" or runs <= LEAST_RUN_SHARE * noise.variances.white:
         return 0.0
     scale = noise.scale
     columns = _unit_columns(fixed, len(scale)) / scale[:, None]
-    problem = reml_problem(fit.observed.layout, fit.residual_mm / scale, columns, runs=False)
-    start = np.maximum(packed(noise.variances, problem.common), problem.starts * 1e-3)
-    return max(0.0, fit_reml(problem, start=start, steps=30)[2] - noise.criterion)
+    ratio = np.inf
+    for numbered in (False, True):
+        problem = reml_problem(fit.observed.layout, fit.residual_mm / scale, columns, runs=False, numbered=numbered)
+        start = np.maximum(packed(noise.variances, problem.common), problem.starts * 1e-3)
+        ratio = min(ratio, fit_reml(problem, start=start, steps=30)[2] - noise.criterion)
+        if ratio <= enough:
+            break
+    return max(0.0, float(ratio))
 
 
 def noise_scale(fit: BaseFit) -> FloatArray:
