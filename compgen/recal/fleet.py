@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import sqlalchemy as sa
 
-from compgen.core.parallel import LostError, Packed, Stop, StoppedError, Workers, opened_workers, spread, stopping
+from compgen.core.parallel import Packed, Stop, StoppedError, Workers, opened_workers, spread, stopping
 from compgen.errors import CompgenError
 from compgen.plugins import WithPlugins, with_plugins
 from compgen.recal import logs
@@ -107,7 +107,7 @@ def work_of(fleet: Workers) -> Callable[[MachineJob, str, Stop], MachineOutcome]
         try:
             found: MachineOutcome = fleet.call(Packed(pass_of(url)), Packed(job), stop)
             return found
-        except (LostError, StoppedError) as error:
+        except CompgenError as error:  # lost, stopped, or a worker that cannot be used
             return _lost(job, error)
 
     return work
