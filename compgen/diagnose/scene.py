@@ -19,6 +19,8 @@ from compgen.diagnose.whiten import Whitener
 
 #: Directions of a group of which less than this share is left beside the base model are dropped.
 LEAST_VISIBLE = 1e-3
+#: Columns smaller than this share of the largest of their group are rounding.
+ROUNDING = 1e-9
 #: Columns whitened at a time.
 CHUNK = 400
 
@@ -166,7 +168,8 @@ def _reduced(raw: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray,
     if raw.shape[1] == 1:
         return _single(raw, left)
     norm = np.linalg.norm(raw, axis=0)
-    norm[norm == 0.0] = 1.0
+    present = norm > ROUNDING * norm.max()
+    norm = np.where(present, norm, np.inf)
     square, vectors = np.linalg.eigh((raw / norm).T @ (raw / norm))
     kept = square > 1e-8 * max(square[-1], 1e-300)
     turn = vectors[:, kept] / np.sqrt(square[kept]) / norm[:, None]

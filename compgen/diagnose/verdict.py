@@ -22,8 +22,8 @@ Word = Literal["named", "none", "unknown", "not_decidable"]
 LEAST_VISIBLE = 0.05
 #: A name is not confirmed if its chi-square is below this share of that of all members without a (firm) name.
 LEAST_SHARE = 0.1
-#: The same for a step whose time was searched for: among many times one suits any slow change a little.
-LEAST_STEP_SHARE, MANY_SCANS = 0.5, 20
+#: The same for a jump of the whole machine: among many times one suits any slow change a little.
+LEAST_JUMP_SHARE = 0.5
 #: Axis runs are short: a slow effect whose chi-square is below this may as well be a slow wandering of the sensor.
 LEAST_SLOW_CHI2 = 60.0
 #: p-value of the homogeneity below which a name is not confirmed beside something that has no name.
@@ -169,7 +169,7 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     if evidence.misfits and chi2 < evidence.excess:
         reasons.append("explains less than what remains unexplained")
     failed = [g for g, own in evidence.homogeneity_p.items() if g != group and own < HOMOGENEITY_P]
-    share = LEAST_STEP_SHARE if scene.groups[group].scans > MANY_SCANS else LEAST_SHARE
+    share = LEAST_JUMP_SHARE if name == "machine_jump" else LEAST_SHARE
     if generic and chi2 < share * sum(evidence.chi2[g] for g in (*generic, *failed)):
         reasons.append("small beside what has no name")
     if scene.groups[group].slow and scene.fit.readings.kind == "axis" and chi2 < LEAST_SLOW_CHI2:
