@@ -36,6 +36,10 @@ class ClusterError(CompgenError):
     """The cluster cannot be used: not reached, other versions, workers on other machines."""
 
 
+class _BlamedError(Exception):
+    """Several workers were lost while this task ran or waited on them."""
+
+
 @dataclass(frozen=True)
 class Facts:
     """What a worker has to be like: versions of packages, and the machine (empty: any)."""
@@ -139,17 +143,26 @@ class Cluster:
             raise StoppedError("not begun: stopped")
         if self._empty_since is not None:
             self._look()
+        try:
+            answer = self._answer(function, item, stop)
+        except _BlamedError:  # perhaps for another task, which took the worker with it: once more
+            try:
+                answer = self._answer(function, item, stop)
+            except _BlamedError as error:
+                raise LostError("every worker of the cluster that worked on it was lost") from error
+        if isinstance(answer, str):
+            self._refuse(answer)
+        return answer.value()
+
+    def _answer(self, function: Packed, item: Packed, stop: Stop) -> Any:
         key = f"{self._name}-{next(self._numbers)}"
         future = self._client.submit(perform_there, self._wanted, function, item, key=key, pure=False, retries=RETRIES)
         try:
-            answer = self._waited(future, stop)
+            return self._waited(future, stop)
         finally:
             if not future.done():
                 future.cancel()
             future.release()
-        if isinstance(answer, str):
-            self._refuse(answer)
-        return answer.value()
 
     def _waited(self, future: Any, stop: Stop) -> Any:
         from distributed import CancelledError, KilledWorker
@@ -158,7 +171,7 @@ class Cluster:
             try:
                 return future.result(timeout=POLL_S)
             except KilledWorker as error:
-                raise LostError("every worker of the cluster that worked on it was lost") from error
+                raise _BlamedError from error
             except CancelledError as error:
                 raise LostError(f"the scheduler {self.address} was lost") from error
             except TimeoutError:
