@@ -18,7 +18,7 @@ from compgen.accuracy.source import ErrorSource, error_source
 from compgen.controllers.isg.error_files import read_error_file
 from compgen.controllers.isg.etalon_exchange import is_exchange_text
 from compgen.core.axis_runs import AxisRuns
-from compgen.core.csvio import read_csv
+from compgen.core.csvio import names_in_header, read_csv
 from compgen.core.deviations import Deviations
 from compgen.core.diagonals import read_diagonals
 from compgen.core.error_table import ERROR_COLUMNS, ErrorTable
@@ -97,7 +97,7 @@ def read_side(
     """
     source = _errors_in(Path(path))
     text = read_bytes(source, _LOOKED_AT).decode("utf-8-sig", errors="replace")  # to tell the kind; readers are strict
-    header = _header(text)
+    header = names_in_header(text)
     if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
         errors = read_error_file(source)
         known = error_source(machine, errors, covariance_beside(source, errors))
@@ -129,11 +129,6 @@ def _errors_in(path: Path) -> Path:
     if not found.is_file():
         raise InputError("is a folder without identified.errors.csv; give the file that is meant", file=path)
     return found
-
-
-def _header(text: str) -> set[str]:
-    line = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
-    return {name.strip().strip('"') for name in line.split(",")}
 
 
 def covariance_beside(path: Path, errors: ErrorTable) -> Covariance | None:

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.core.csvio import CsvTable, FloatArray, format_csv, read_csv
+from compgen.core.csvio import CsvTable, FloatArray, format_csv, header_columns, read_csv
 from compgen.core.deviations import LARGEST_UM
-from compgen.core.files import read_text
 from compgen.core.lengths import check_distinct, common_metadata, origins
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import InputError
@@ -56,9 +55,7 @@ class AxisRuns:
 
 def holds_axis_runs(path: str | Path) -> bool:
     """Tell by the columns of a measurement file whether it holds axis runs (``deviation_um`` over ``position_mm``)."""
-    header = next((line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")), "")
-    columns = {name.strip().strip('"') for name in header.split(",")}
-    return {"axis", "position_mm", "deviation_um"} <= columns
+    return {"axis", "position_mm", "deviation_um"} <= header_columns(path)
 
 
 def read_axis_runs(paths: str | Path | Sequence[str | Path]) -> AxisRuns:

@@ -103,6 +103,17 @@ def _is_number(cell: str) -> bool:
     return cell.isascii() and "_" not in cell
 
 
+def header_columns(path: str | Path) -> set[str]:
+    """Return the names of the columns of a CSV file, as its first line that is no comment has them."""
+    return names_in_header(read_text(path))
+
+
+def names_in_header(text: str) -> set[str]:
+    """Return the names in the first line of a text that is no comment; empty without one."""
+    header = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+    return {name.strip().strip('"') for name in header.split(",")}
+
+
 def read_csv(
     path: str | Path, required: Iterable[str], optional: Iterable[str] = (), prefixes: Iterable[str] = ()
 ) -> CsvTable:

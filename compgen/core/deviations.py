@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.core.csvio import CsvTable, FloatArray, format_csv, read_csv
-from compgen.core.files import read_text
+from compgen.core.csvio import CsvTable, FloatArray, format_csv, header_columns, read_csv
 from compgen.core.lengths import (
     APPROACH_COLUMNS,
     COVARIATE_COLUMNS,
@@ -70,8 +69,7 @@ class Deviations:
 
 def holds_deviations(path: str | Path) -> bool:
     """Tell by the columns of a measurement file whether it holds deviations (``dx_um`` ...) and not lengths."""
-    header = next((line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")), "")
-    columns = {name.strip().strip('"') for name in header.split(",")}
+    columns = header_columns(path)
     return "length_mm" not in columns and not columns.isdisjoint(DEVIATION_COLUMNS)
 
 

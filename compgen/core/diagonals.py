@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.core.axis_runs import covariates_beside, directions_of, run_deviations_um
-from compgen.core.csvio import CsvTable, FloatArray, format_csv, read_csv
-from compgen.core.files import read_text
+from compgen.core.csvio import CsvTable, FloatArray, format_csv, header_columns, read_csv
 from compgen.core.lengths import POSITION_COLUMNS, check_distinct, common_metadata, origins, vectors_of
 from compgen.core.names import MM_PER_UM
 from compgen.errors import InputError
@@ -73,9 +72,7 @@ class Diagonals:
 
 def holds_diagonals(path: str | Path) -> bool:
     """Tell by the columns of a measurement file whether it holds measured diagonals."""
-    header = next((line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")), "")
-    columns = {name.strip().strip('"') for name in header.split(",")}
-    return {"diagonal", "deviation_um"} <= columns
+    return {"diagonal", "deviation_um"} <= header_columns(path)
 
 
 def read_diagonals(paths: str | Path | Sequence[str | Path]) -> Diagonals:

@@ -60,12 +60,11 @@ class AxisLaser:
         position_mm, mark = np.concatenate(positions), np.concatenate(marks)
         check_stops(position_mm, machine)
         way_mm = np.eye(3)[mark[:, 0]] * mark[:, [1]]
-        travel_s = np.linalg.norm(np.diff(position_mm, axis=0, prepend=position_mm[:1]), axis=1)
         stops = Stops(
             position_mm=position_mm,
             point=label_points(position_mm),
             run=mark[:, 2],
-            time_s=np.cumsum(travel_s / self.feed_mm_min * SECONDS_PER_MIN + self.dwell_s),
+            time_s=stop_times_s(position_mm, self.feed_mm_min, self.dwell_s),
             approach=way_mm,
             covariates={"feed_mm_min": np.full(len(mark), self.feed_mm_min)},
             way_mm=way_mm,
@@ -82,25 +81,43 @@ class AxisLaser:
     ) -> AxisRuns:
         """Return the readings; ``tips`` tells where the tip really is at stops, ``effects`` act on readings alone."""
         stops, mark = self.stops(machine)
-        stops = with_temperatures(stops, temperatures)
+        stops, axis = with_temperatures(stops, temperatures), mark[:, 0]
         moved_mm = tips(stops) - stops.position_mm - np.array(machine.tool_offset_mm)
-        deviation = np.einsum("ij,ij->i", moved_mm, np.eye(3)[mark[:, 0]])
-        for effect in effects:
-            if isinstance(effect, LengthEffect):
-                raise InputError(f"{effect.name} acts on the lengths of a laser-tracer, not on axis runs")
-            if isinstance(effect, RunEffect):
-                deviation = deviation + effect.change(stops.time_s)
-        axis = mark[:, 0]
-        logged = {name: values for name, values in stops.covariates.items() if name.startswith("temp_")}
+        deviation = along_beam(moved_mm, np.eye(3)[axis], stops, effects, "axis runs")
         return AxisRuns(
             axis=axis,
             position_mm=np.round(stops.position_mm[np.arange(len(axis)), axis], 6),
             direction=mark[:, 1],
             run=mark[:, 2],
             deviation_mm=deviation + self.noise_um * MM_PER_UM * rng.standard_normal(len(axis)),
-            covariates={"time_s": stops.time_s, **logged},
+            covariates=logged_beside(stops),
             metadata={"instrument": "axis-laser", "u_deviation_um": f"{self.noise_um:g}"},
         )
+
+
+def stop_times_s(position_mm: FloatArray, feed_mm_min: float, dwell_s: float) -> FloatArray:
+    """Return the times (n,) at the stops (n, 3): travel at the feed from one to the next, and the dwell at each."""
+    travel_mm = np.linalg.norm(np.diff(position_mm, axis=0, prepend=position_mm[:1]), axis=1)
+    return np.asarray(np.cumsum(travel_mm / feed_mm_min * SECONDS_PER_MIN + dwell_s))
+
+
+def along_beam(
+    moved_mm: FloatArray, unit: FloatArray, stops: Stops, effects: Sequence[SimulatedEffect], what: str
+) -> FloatArray:
+    """Return displacements (n, 3) along beams (n, 3) with the effects that act on the readings alone, (n,), mm."""
+    deviation = np.einsum("ij,ij->i", moved_mm, unit)
+    for effect in effects:
+        if isinstance(effect, LengthEffect):
+            raise InputError(f"{effect.name} acts on the lengths of a laser-tracer, not on {what}")
+        if isinstance(effect, RunEffect):
+            deviation = deviation + effect.change(stops.time_s)
+    return np.asarray(deviation)
+
+
+def logged_beside(stops: Stops) -> dict[str, FloatArray]:
+    """Return the columns that are written beside the readings: the time and the temperatures."""
+    temperatures = {name: values for name, values in stops.covariates.items() if name.startswith("temp_")}
+    return {"time_s": stops.time_s, **temperatures}
 
 
 def read_axis_laser(section: tomlio.Section) -> AxisLaser:

@@ -14,11 +14,10 @@ from compgen.core.csvio import FloatArray
 from compgen.core.diagonals import BODY_DIAGONALS, DIAGONALS, Diagonals
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
-from compgen.errors import InputError
-from compgen.simulate.axis_runs import OVERRUN
-from compgen.simulate.effects import LengthEffect, RunEffect, SimulatedEffect
+from compgen.simulate.axis_runs import OVERRUN, along_beam, logged_beside, stop_times_s
+from compgen.simulate.effects import SimulatedEffect
 from compgen.simulate.session import Temperature, with_temperatures
-from compgen.simulate.trajectory import SECONDS_PER_MIN, Stops, check_stops, label_points
+from compgen.simulate.trajectory import Stops, check_stops, label_points
 
 
 @dataclass(frozen=True)
@@ -74,12 +73,11 @@ class DiagonalLaser:
                     units.append(np.tile(way * self.unit(machine, name), (self.targets, 1)))
         position_mm, mark, approach = np.concatenate(positions), np.concatenate(marks), np.concatenate(ways)
         check_stops(position_mm, machine)
-        travel_s = np.linalg.norm(np.diff(position_mm, axis=0, prepend=position_mm[:1]), axis=1)
         stops = Stops(
             position_mm=position_mm,
             point=label_points(position_mm),
             run=mark[:, 1],
-            time_s=np.cumsum(travel_s / self.feed_mm_min * SECONDS_PER_MIN + self.dwell_s),
+            time_s=stop_times_s(position_mm, self.feed_mm_min, self.dwell_s),
             approach=approach,
             covariates={"feed_mm_min": np.full(len(mark), self.feed_mm_min)},
             way_mm=np.concatenate(units),
@@ -99,20 +97,14 @@ class DiagonalLaser:
         stops = with_temperatures(stops, temperatures)
         moved_mm = tips(stops) - stops.position_mm - np.array(machine.tool_offset_mm)
         units = {name: self.unit(machine, name) for name in self.diagonals}
-        deviation = np.einsum("ij,ij->i", moved_mm, np.array([units[name] for name in names]))
-        for effect in effects:
-            if isinstance(effect, LengthEffect):
-                raise InputError(f"{effect.name} acts on the lengths of a laser-tracer, not on diagonals")
-            if isinstance(effect, RunEffect):
-                deviation = deviation + effect.change(stops.time_s)
-        logged = {name: values for name, values in stops.covariates.items() if name.startswith("temp_")}
+        deviation = along_beam(moved_mm, np.array([units[name] for name in names]), stops, effects, "diagonals")
         return Diagonals(
             name=names,
             position_mm=stops.position_mm,
             direction=mark[:, 0],
             run=mark[:, 1],
             deviation_mm=deviation + self.noise_um * MM_PER_UM * rng.standard_normal(len(names)),
-            covariates={"time_s": stops.time_s, **logged},
+            covariates=logged_beside(stops),
             metadata={"instrument": "diagonal-laser", "u_deviation_um": f"{self.noise_um:g}"},
         )
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.core.csvio import CsvTable, FloatArray, format_csv, read_csv
-from compgen.core.files import read_text
+from compgen.core.csvio import CsvTable, FloatArray, format_csv, header_columns, read_csv
 from compgen.core.lengths import check_distinct, check_repeats, common_metadata, origins
 from compgen.core.names import AXES
 from compgen.errors import InputError
@@ -62,8 +61,7 @@ class SixDof:
 
 def holds_sixdof(path: str | Path) -> bool:
     """Whether the header of a file is that of six-DOF readings."""
-    lines = (line for line in read_text(Path(path)).splitlines() if line.strip() and not line.startswith("#"))
-    names = {name.strip() for name in next(lines, "").split(",")}
+    names = header_columns(path)
     return "y_psd1_mm" in names or {"axis", "displacement_mm"} <= names or "y_qd1_mm" in names
 
 
