@@ -9,7 +9,6 @@ import pytest
 
 import compgen
 from compgen.controllers import SourceFile, controller_named
-from compgen.errors import InputError
 from compgen.export import export
 
 MACHINE = compgen.load_machine("zha-gantry")
@@ -23,10 +22,11 @@ def exported(request, make_errors):
     return request.param, dict(made.files), name
 
 
-def parse(controller, files):
+def contradictions(controller, files):
     control = controller_named(controller)
+    settings = control.read_settings(MACHINE)
     given = [SourceFile(Path(name), text) for name, text in files.items()]
-    return control.parse(MACHINE, control.read_settings(MACHINE), given)
+    return control.contradictions(MACHINE, settings, control.parse(MACHINE, settings, given), given)
 
 
 def numbers(tree, where=()):
@@ -53,45 +53,52 @@ def changed(plan, where):
     return tree
 
 
-def test_a_plan_as_it_was_written_is_read_with_its_tables(exported):
+def test_a_plan_as_it_was_written_contradicts_nothing(exported):
     controller, files, name = exported
     assert json.loads(files[name])["machine"] == MACHINE.name
-    parse(controller, files)
+    assert contradictions(controller, files) == []
+    assert contradictions(controller, {file: text for file, text in files.items() if file != name}) == []
 
 
-def test_a_single_other_number_is_refused_with_its_place(exported):
+def test_a_single_other_number_is_named_with_its_place(exported):
     controller, files, name = exported
     plan = json.loads(files[name])
     places = list(numbers(plan))
     assert len(places) > 20
     for where in (places[0], places[len(places) // 2], places[-1]):
-        with pytest.raises(InputError, match="but the tables beside it say") as caught:
-            parse(controller, {**files, name: json.dumps(changed(plan, where))})
-        assert str(caught.value.file) == name
-        assert str(where[0]) in caught.value.field
+        (text,) = contradictions(controller, {**files, name: json.dumps(changed(plan, where))})
+        assert text.startswith(f"{name}: {where[0]}") and "but the tables beside it say" in text
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [
-        ("{", "is not JSON"),
-        ("[1]", "a plan is an object"),
-        ("{}", "missing"),
-        ('{"points": 1, "points": 2}', "stands twice"),
-    ],
+    [("{", "is not JSON"), ("[1]", "a plan is an object"), ("{}", "missing"), ('{"a": 1, "a": 2}', "stands twice")],
 )
-def test_what_is_no_plan_is_refused(exported, text, message):
+def test_what_is_no_plan_is_named(exported, text, message):
     controller, files, name = exported
-    with pytest.raises(InputError, match=message):
-        parse(controller, {**files, name: text})
+    (found,) = contradictions(controller, {**files, name: text})
+    assert message in found
 
 
-def test_a_left_out_or_further_point_is_refused(exported):
+def test_a_left_out_or_further_point_is_named(exported):
     controller, files, name = exported
     plan = json.loads(files[name])
     table = next(key for key in ("points", "values", "parameters") if key in plan)
     first = next(iter(plan[table]))
     without = {key: value for key, value in plan[table].items() if key != first}
     for other in (without, {**plan[table], "99999": 1}):
-        with pytest.raises(InputError, match="missing"):
-            parse(controller, {**files, name: json.dumps({**plan, table: other})})
+        (found,) = contradictions(controller, {**files, name: json.dumps({**plan, table: other})})
+        assert "missing" in found
+
+
+def test_tables_with_another_plan_beside_them_are_not_accepted(tmp_path, make_errors):
+    errors = make_errors(MACHINE)
+    paths = export(MACHINE, errors, "fanuc-pitch").write(tmp_path)
+    assert compgen.verify(MACHINE, compgen.read_tables(MACHINE, paths, "fanuc-pitch"), errors).accepted
+    (plan,) = [path for path in paths if path.name.endswith(".plan.json")]
+    tree = json.loads(plan.read_text())
+    point = next(number for number, value in tree["points"].items() if value)
+    tree["points"][point] *= -1
+    plan.write_text(json.dumps(tree))
+    result = compgen.verify(MACHINE, compgen.read_tables(MACHINE, paths, "fanuc-pitch"), errors)
+    assert not result.accepted and f"points.{point}" in " ".join(result.reasons)

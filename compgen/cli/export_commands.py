@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import click
@@ -26,6 +27,7 @@ from compgen.core.machine import Machine
 from compgen.core.points import format_points, read_points
 from compgen.core.reversal import read_reversal
 from compgen.effects import effects_reversal
+from compgen.errors import CompgenWarning
 from compgen.export import export
 from compgen.imports import open_errors
 from compgen.pipeline import provenance_of, write_all
@@ -141,7 +143,10 @@ def read_command(
       compgen read zha-gantry tables/volcomp0.csv --controller isg-csv --points p.points.csv --out correction.csv
     """
     where = read_points(points)
-    correction_mm = read_tables(machine, tables, controller).correction(machine, where)
+    parsed = read_tables(machine, tables, controller)
+    for text in parsed.contradictions:
+        warnings.warn(text, CompgenWarning, stacklevel=1)
+    correction_mm = parsed.correction(machine, where)
     columns = {f"c{axis}_um": correction_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
     write_file(out, format_points(where, columns, {"machine": machine.name, "controller": controller}))
     figures = residuals(correction_mm)

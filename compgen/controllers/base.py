@@ -175,6 +175,12 @@ class Controller(ABC, Generic[Settings, Tables]):
     def violations(self, machine: Machine, settings: Settings, tables: Tables) -> list[str]:
         """Return every limit of the control that the tables break, and travel that they do not cover, in words."""
 
+    def contradictions(
+        self, machine: Machine, settings: Settings, tables: Tables, files: Sequence[SourceFile]
+    ) -> list[str]:
+        """Return where files that are not needed to read the tables (a plan for their transfer) say something else."""
+        return []
+
     @abstractmethod
     def resolution_mm(self, settings: Settings) -> float:
         """Return the largest correction error that rounding to the format's quantum may cause on one axis, mm."""

@@ -7,40 +7,38 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from compgen.controllers.base import SourceFile
-from compgen.errors import InputError
 
 
-def check_plans(files: Sequence[SourceFile], expected: Callable[[], Mapping[str, Any]]) -> None:
-    """Hold every ``.json`` file against what the tables in the text beside it make.
+def plan_contradictions(files: Sequence[SourceFile], expected: Callable[[], Mapping[str, Any]]) -> list[str]:
+    """Say where a ``.json`` file differs from the plan that the tables in the text beside it make.
 
     Parameters
     ----------
     files : all files of one export; without a plan among them nothing is asked.
     expected : gives the plan of the parsed tables, by the keys of the file; other keys of the file are notes.
 
-    Raises
-    ------
-    InputError
-        for a file that is no JSON object, and at the first number that differs, with its place.
+    Returns
+    -------
+    One sentence for each plan that cannot be used: no JSON, no object, or the first number that differs, with its place.
     """
     plans = [file for file in files if file.path.suffix.lower() == ".json"]
-    if not plans:
-        return
-    wanted = json.loads(json.dumps(dict(expected())))
-    for file in plans:
-        try:
-            found = json.loads(file.text, object_pairs_hook=_once)
-        except (ValueError, RecursionError) as problem:
-            raise InputError(f"is not JSON: {problem}", file=file.path) from None
-        if not isinstance(found, dict):
-            raise InputError(f"holds {_short(found)}, a plan is an object with {', '.join(wanted)}", file=file.path)
-        for where, given, due in _differences({key: found.get(key) for key in wanted}, wanted, ""):
-            raise InputError(
-                f"{_short(given)}, but the tables beside it say {_short(due)}: what is sent from the plan would not be what was "
-                "checked; export again, or leave the plan out",
-                file=file.path,
-                field=where,
-            )
+    wanted = json.loads(json.dumps(dict(expected()))) if plans else {}
+    return [f"{file.path.name}: {text}" for file in plans if (text := _contradiction(file.text, wanted))]
+
+
+def _contradiction(text: str, wanted: Mapping[str, Any]) -> str:
+    try:
+        found = json.loads(text, object_pairs_hook=_once)
+    except (ValueError, RecursionError) as problem:
+        return f"is not JSON: {problem}"
+    if not isinstance(found, dict):
+        return f"holds {_short(found)}, a plan is an object with {', '.join(wanted)}"
+    differing = list(_differences({key: found.get(key) for key in wanted}, wanted, ""))
+    if not differing:
+        return ""
+    where, given, due = differing[0]
+    more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
+    return f"{where} is {_short(given)}, but the tables beside it say {_short(due)}{more}: leave the plan out, or export again"
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -38,12 +38,16 @@ PARTIAL_SHARE = 0.1
 
 @dataclass(frozen=True)
 class ReadTables:
-    """Controller tables as they were parsed from text, with the control that understands them."""
+    """Controller tables as they were parsed from text, with the control that understands them.
+
+    ``files`` are names and SHA-256; ``contradictions`` say where a plan beside the tables holds other numbers.
+    """
 
     controller: AnyController
     settings: Any
     tables: Any
     files: tuple[tuple[str, str], ...]
+    contradictions: tuple[str, ...] = ()
 
     def correction(self, machine: Machine, points: Points) -> FloatArray:
         """Return what the control adds to the command at each point, shape (n, 3), mm."""
@@ -87,7 +91,9 @@ def read_tables(machine: Machine, paths: Sequence[str | Path] | str | Path, cont
     contents = [(path, _read_limited(path)) for path in files]
     sources = [SourceFile(path, _decode(path, content)) for path, content in contents]
     tables = control.parse(machine, settings, sources)
-    return ReadTables(control, settings, tables, tuple((path.name, sha256_of(content)) for path, content in contents))
+    others = tuple(control.contradictions(machine, settings, tables, sources))
+    hashes = tuple((path.name, sha256_of(content)) for path, content in contents)
+    return ReadTables(control, settings, tables, hashes, others)
 
 
 def _read_limited(path: Path) -> bytes:
@@ -224,6 +230,7 @@ def verify(
         *control.violations(machine, tables.settings, tables.tables),
         *judge.reasons(on_grid, on_lines),
         *_reversal_reasons(machine, tables, reversal),
+        *tables.contradictions,
         *safety.reasons,
     ]
     return Verification(

@@ -20,7 +20,7 @@ from compgen.controllers.fanuc.pitch_limits import pitch_usage, pitch_violations
 from compgen.controllers.fanuc.pitch_settings import PitchSettings, read_pitch_settings
 from compgen.controllers.fanuc.pitch_tables import PitchBlock, PitchTables, parse_pitch
 from compgen.controllers.terms import one_dimensional_terms
-from compgen.controllers.transfer_plan import check_plans
+from compgen.controllers.transfer_plan import plan_contradictions
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -69,10 +69,14 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return pitch_context(machine, settings, tables)
 
     def parse(self, machine: Machine, settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTables:
-        """Read parameters 3620 ... 3624 and the points they name; a ``.json`` plan must hold the same."""
-        tables = parse_pitch(settings, files)
-        check_plans(files, lambda: self.context(machine, settings, tables)["plan"])
-        return tables
+        """Read parameters 3620 ... 3624 and the points they name; a ``.json`` plan is passed over."""
+        return parse_pitch(settings, files)
+
+    def contradictions(
+        self, machine: Machine, settings: PitchSettings, tables: PitchTables, files: Sequence[SourceFile]
+    ) -> list[str]:
+        """Say where a plan beside the text differs from it."""
+        return plan_contradictions(files, lambda: self.context(machine, settings, tables)["plan"])
 
     def emulate(self, machine: Machine, settings: PitchSettings, tables: PitchTables, points: Points) -> FloatArray:
         """Return sign * count * A at each point, A held beyond the first and the last section end."""

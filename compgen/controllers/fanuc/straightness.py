@@ -24,7 +24,7 @@ from compgen.controllers.fanuc.straightness_tables import (
 )
 from compgen.controllers.grids import curve_nodes_mm
 from compgen.controllers.terms import one_dimensional_name, one_dimensional_terms
-from compgen.controllers.transfer_plan import check_plans
+from compgen.controllers.transfer_plan import plan_contradictions
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -79,10 +79,14 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         return straightness_context(machine, settings, tables)
 
     def parse(self, machine: Machine, settings: StraightnessSettings, files: Sequence[SourceFile]) -> StraightTables:
-        """Read parameters 5711 ... 5784 and the points of the moving axes; a ``.json`` plan must hold the same."""
-        tables = parse_straightness(settings, files)
-        check_plans(files, lambda: self._plan(machine, settings, tables))
-        return tables
+        """Read parameters 5711 ... 5784 and the points of the moving axes; a ``.json`` plan is passed over."""
+        return parse_straightness(settings, files)
+
+    def contradictions(
+        self, machine: Machine, settings: StraightnessSettings, tables: StraightTables, files: Sequence[SourceFile]
+    ) -> list[str]:
+        """Say where a plan beside the text differs from it."""
+        return plan_contradictions(files, lambda: self._plan(machine, settings, tables))
 
     def _plan(self, machine: Machine, settings: StraightnessSettings, tables: StraightTables) -> dict[str, Any]:
         plan = self.context(machine, settings, tables)["plan"]

@@ -18,7 +18,7 @@ from compgen.controllers.fanuc.volumetric_settings import VolumeSettings, read_v
 from compgen.controllers.fanuc.volumetric_tables import VolumeTable, parse_volume, volume_usage, volume_violations
 from compgen.controllers.grids import STEP_QUANTUM, Grid, equidistant_grid
 from compgen.controllers.terms import one_dimensional_terms, product_terms
-from compgen.controllers.transfer_plan import check_plans
+from compgen.controllers.transfer_plan import plan_contradictions
 from compgen.controllers.trilinear import trilinear
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
@@ -85,10 +85,14 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return volume_context(machine, settings, tables)
 
     def parse(self, machine: Machine, settings: VolumeSettings, files: Sequence[SourceFile]) -> VolumeTable:
-        """Read the CSV, and records in the style of the control, and a ``.json`` plan, which must hold the same."""
-        tables = parse_volume(machine, settings, files)
-        check_plans(files, lambda: self.context(machine, settings, tables)["plan"])
-        return tables
+        """Read the CSV, and records in the style of the control, which must hold the same."""
+        return parse_volume(machine, settings, files)
+
+    def contradictions(
+        self, machine: Machine, settings: VolumeSettings, tables: VolumeTable, files: Sequence[SourceFile]
+    ) -> list[str]:
+        """Say where a plan beside the text differs from it."""
+        return plan_contradictions(files, lambda: self.context(machine, settings, tables)["plan"])
 
     def emulate(self, machine: Machine, settings: VolumeSettings, tables: VolumeTable, points: Points) -> FloatArray:
         """Return sign * count * trilinear value, that of the grid's surface outside."""

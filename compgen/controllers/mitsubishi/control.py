@@ -31,7 +31,7 @@ from compgen.controllers.mitsubishi.tables import (
     values_of,
 )
 from compgen.controllers.terms import one_dimensional_name, one_dimensional_terms
-from compgen.controllers.transfer_plan import check_plans
+from compgen.controllers.transfer_plan import plan_contradictions
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
@@ -80,10 +80,14 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return sheet_context(machine, settings, tables)
 
     def parse(self, machine: Machine, settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
-        """Read the set sheet; a ``.json`` plan must hold the same."""
-        tables = parse_sheet(settings, files)
-        check_plans(files, lambda: self.context(machine, settings, tables)["plan"])
-        return tables
+        """Read the set sheet; a ``.json`` plan is passed over."""
+        return parse_sheet(settings, files)
+
+    def contradictions(
+        self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables, files: Sequence[SourceFile]
+    ) -> list[str]:
+        """Say where a plan beside the text differs from it."""
+        return plan_contradictions(files, lambda: self.context(machine, settings, tables)["plan"])
 
     def emulate(
         self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables, points: Points
