@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.optimize import minimize
 from scipy.sparse import csr_array
 
 from compgen.core.csvio import FloatArray
@@ -297,6 +296,8 @@ def fit_reml(problem: Reml, *, start: FloatArray | None = None, steps: int = 60)
     def value(x: FloatArray) -> tuple[float, FloatArray]:
         found = problem.value(x)
         return found[0], found[1]
+
+    from scipy.optimize import minimize  # imported here: slow to load
 
     result = minimize(
         value, first, jac=True, method="L-BFGS-B", bounds=[bound] * len(first), options={"maxiter": steps, "ftol": 2e-6}

@@ -16,7 +16,6 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from compgen.core.csvio import FloatArray
 from compgen.fit.smooth import Smoother
@@ -65,6 +64,8 @@ def choose(smoother: Smoother, y: FloatArray, u0: float | None) -> float:
 
 def _minimise(function: Callable[[float], float], low: float, high: float) -> float:
     """Lowest point of a function on an interval: a grid of about one decade, then Brent's method around its best."""
+    from scipy.optimize import minimize_scalar  # imported here: slow to load
+
     grid = np.linspace(low, high, max(3, int(np.ceil(high - low)) + 1))
     values = [function(point) for point in grid]
     best = int(np.argmin(values))

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
@@ -170,7 +170,7 @@ def _compare(
     u1, u2 = (np.sqrt(np.einsum("ij,ij->i", root, root)) for root in (root1, root2))
     u = np.hypot(u1, u2)
     known = u > 1e-15
-    k = float(student_t.isf(FALSE_ALARM / 2.0 / max(int(known.sum()), 1), freedom))
+    k = -float(stdtrit(freedom, FALSE_ALARM / 2.0 / max(int(known.sum()), 1)))
     ratio = np.zeros(len(u))
     ratio[known] = np.abs(one - other)[known] / (k * u[known])
     label = np.array(names)

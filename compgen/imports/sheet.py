@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import openpyxl  # reads .xlsx in a stream, without Excel; the one well-kept reader of that format
-
 from compgen.core.text import nearest
 from compgen.errors import InputError
 from compgen.imports.grid import MOST_COLUMNS, MOST_ROWS, Grid
@@ -64,10 +62,13 @@ def chosen_sheet(path: Path, sheets: list[tuple[str, Grid]], name: str | None) -
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """Open a workbook; whatever the reader trips over becomes an InputError."""
+    # reads .xlsx in a stream, without Excel; the one well-kept reader of that format; imported here: slow to load
+    from openpyxl import load_workbook
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # styles and extensions that it does not know do not matter
-            book = openpyxl.load_workbook(path, read_only=True, data_only=True, keep_links=False)
+            book = load_workbook(path, read_only=True, data_only=True, keep_links=False)
             try:
                 yield book
             finally:

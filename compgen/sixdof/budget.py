@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
@@ -134,7 +134,7 @@ def _run_to_run(errors: ErrorTable, random: Sequence[Column], evaluations: Seque
         return []
     tables = [_resampled(item.errors, errors) for item in evaluations]
     part = (np.array(tables) - np.mean(tables, axis=0)) / np.sqrt(count * (count - 1))
-    limit = float(chi2.isf(UNLIKELY, count - 1)) / (count - 1)
+    limit = float(chdtri(count - 1, UNLIKELY)) / (count - 1)
     known = sum((column**2 for _, column in random), np.zeros(part.shape[1]))
     kept = np.zeros(part.shape[1], dtype=bool)
     for _, rows in _rows_of(errors):
