@@ -126,6 +126,9 @@ def run_command(
         print_json(result.summary())
         return code
     for item in result.outcomes:
+        if item.state == "stopped":
+            stdout.print(f"{item.machine}: {'; '.join(item.messages)}", soft_wrap=True)
+            continue
         active = "no tables active" if item.active is None else f"version {item.active} active"
         done = f", processed {', '.join(item.processed)}" if item.processed else ""
         waiting = f", waiting: {', '.join(map(str, item.waiting))}" if item.waiting else ""

@@ -94,7 +94,7 @@ def run_with(fleet: Workers, job: Job, names: Sequence[str] = (), *, stop: Stop 
 def _lost(job: MachineJob, error: CompgenError) -> MachineOutcome:
     """Return the outcome of a machine whose pass did not come to an end."""
     if isinstance(error, StoppedError):
-        return MachineOutcome(job.name, "ok", (f"not looked at: {error}",))
+        return MachineOutcome(job.name, "stopped", (f"not looked at: {error}",))
     outcome = MachineOutcome(job.name, "failed", (str(error),))
     logs.error("machine lost", machine=job.name, problem=str(error))
     return outcome

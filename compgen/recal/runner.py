@@ -39,10 +39,11 @@ Mapper = Callable[[Callable[[MachineJob], "MachineOutcome"], Iterable[MachineJob
 class MachineOutcome:
     """What one pass did for one machine; it can be sent between processes.
 
-    ``state`` is "ok", "held" (the newest tables are held back or refused) or "failed" (something could not be taken or
-    processed); ``messages`` say why. ``processed`` names the measurements of this pass, ``active`` is the active version,
-    ``waiting`` are the versions that wait for a person. With ``again`` something may pass by itself (a full disk, an
-    unreadable file, another runner, a store that is away), with ``unreachable`` it is the store.
+    ``state`` is "ok", "held" (the newest tables are held back or refused), "failed" (something could not be taken or
+    processed) or "stopped" (the pass ended before its turn: nothing is known of it); ``messages`` say why. ``processed``
+    names the measurements of this pass, ``active`` is the active version, ``waiting`` are the versions that wait for a
+    person. With ``again`` something may pass by itself (a full disk, an unreadable file, another runner, a store that is
+    away), with ``unreachable`` it is the store.
     """
 
     machine: str
@@ -66,7 +67,7 @@ class RunOutcome:
     @property
     def accepted(self) -> bool:
         """Whether nothing failed and nothing is held back."""
-        return all(item.state == "ok" for item in self.outcomes)
+        return all(item.state in ("ok", "stopped") for item in self.outcomes)
 
     @property
     def exit_code(self) -> int:
@@ -109,7 +110,7 @@ def run_machine(job: MachineJob, url: str, stop: Stop = lambda: False, clock: Cl
     """Make one pass over one machine; whatever goes wrong is part of the outcome, nothing is raised."""
     started = time.monotonic()
     if stop():
-        return MachineOutcome(job.name, "ok", ("not looked at: stopped",))
+        return MachineOutcome(job.name, "stopped", ("not looked at: stopped",))
     try:
         store = open_store(url, clock=clock)
         try:
