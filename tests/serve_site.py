@@ -2,13 +2,12 @@
 
 import contextlib
 import functools
-import importlib.util
 import re
-import sys
 import tempfile
 import threading
 from pathlib import Path
 
+import serve_factory as factory
 from argon2 import PasswordHasher
 
 from compgen.recal.store import open_store
@@ -18,17 +17,6 @@ from compgen.serve.server import make_server
 from compgen.serve.settings import Settings
 from compgen.serve.users import Users
 
-
-def sibling(name):
-    """Another file of this folder as a module."""
-    spec = importlib.util.spec_from_file_location(f"compgen_serve_{name}", Path(__file__).with_name(f"{name}.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-factory = sibling("serve_factory")
 OWN = "http://localhost:8765"
 PASSWORD = "correct horse battery"
 PAGES = (

@@ -1,11 +1,9 @@
 """The report in a real browser: nothing fails, nothing is fetched, pictures are drawn, switches work, texts stay texts."""
 
-import importlib.util
 import io
 import json
-import sys
-from pathlib import Path
 
+import browser as helper
 import matplotlib.image
 import numpy as np
 import pytest
@@ -16,15 +14,6 @@ from compgen.report.html import write_report
 pytest.importorskip("websocket", reason="websocket-client is not installed: the report is not opened in a browser")
 
 
-def _helper():
-    spec = importlib.util.spec_from_file_location("compgen_test_browser", Path(__file__).with_name("browser.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-helper = _helper()
 pytestmark = pytest.mark.skipif(
     helper.program() is None, reason="chromium is not installed (.ci/system-packages): the report is not opened in it"
 )

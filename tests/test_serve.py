@@ -1,9 +1,7 @@
 """The dashboard: what it shows, and that nobody changes anything without login, token and own page."""
 
-import importlib.util
 import json
 import re
-import sys
 from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,6 +12,7 @@ pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: 
 pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 
+import serve_site as helper
 import sqlalchemy as sa
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -24,16 +23,6 @@ from compgen.serve.fleet import fleet
 from compgen.serve.settings import Settings, check_settings, default_users
 from compgen.serve.users import Users
 
-
-def _helper():
-    spec = importlib.util.spec_from_file_location("compgen_serve_site", Path(__file__).with_name("serve_site.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-helper = _helper()
 factory, Site, Clock = helper.factory, helper.Site, helper.Clock
 OWN, PASSWORD, PAGES, DECISIONS = helper.OWN, helper.PASSWORD, helper.PAGES, helper.DECISIONS
 STYLE = Path(__file__).resolve().parents[1] / "templates" / "_serve" / "style.css"

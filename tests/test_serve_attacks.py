@@ -1,12 +1,9 @@
 """Attacks on the dashboard that a hostile reader tried, each with what has to come of it."""
 
-import importlib.util
 import json
 import socket
-import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
@@ -14,21 +11,13 @@ pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: 
 pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 
+import serve_site as helper
+
 from compgen.errors import InputError
 from compgen.recal import decisions
 from compgen.serve import limits, patience, server
 from compgen.serve.users import Users
 
-
-def _helper():
-    spec = importlib.util.spec_from_file_location("compgen_serve_site", Path(__file__).with_name("serve_site.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-helper = _helper()
 factory, OWN, PASSWORD, DECISIONS = helper.factory, helper.OWN, helper.PASSWORD, helper.DECISIONS
 #: How long a test waits for an answer of the server, s.
 PATIENCE_S = 20.0

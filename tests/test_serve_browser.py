@@ -1,9 +1,6 @@
 """The dashboard in a real browser: log in, approve, reject, roll back; nothing runs, nothing is fetched from elsewhere."""
 
-import importlib.util
-import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -12,19 +9,12 @@ pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: 
 pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 
+import browser as helper
+import serve_site as serving
+
 from compgen.recal import decisions
 from compgen.recal.store import open_store
 
-
-def _sibling(name):
-    spec = importlib.util.spec_from_file_location(f"compgen_serve_{name}", Path(__file__).with_name(f"{name}.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-helper, serving = _sibling("browser"), _sibling("serve_site")
 factory = serving.factory
 pytestmark = pytest.mark.skipif(
     helper.program() is None,

@@ -1,6 +1,5 @@
 """``compgen serve`` as a program: users, unsafe options, a server that starts and stops; decisions reach the folders."""
 
-import importlib.util
 import json
 import os
 import re
@@ -10,7 +9,6 @@ import sys
 import threading
 import urllib.request
 from datetime import UTC, datetime
-from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -19,6 +17,7 @@ pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: 
 pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 
+import serve_site as helper
 from prometheus_client.parser import text_string_to_metric_families
 
 from compgen.cli import cli
@@ -30,16 +29,6 @@ from compgen.serve.metrics import WatchMetrics, start_metrics
 from compgen.serve.settings import Settings
 from compgen.serve.users import Users
 
-
-def _helper():
-    spec = importlib.util.spec_from_file_location("compgen_serve_site", Path(__file__).with_name("serve_site.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-helper = _helper()
 factory, OWN, PASSWORD = helper.factory, helper.OWN, helper.PASSWORD
 JOB = """\
 store = "store.sqlite"

@@ -1,12 +1,9 @@
 """What the dashboard works out beside the requests: drift with forecast, shortest re-check; and what a page costs."""
 
-import importlib.util
 import re
-import sys
 import threading
 import time
 from datetime import timedelta
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +12,7 @@ pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: 
 pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 
+import serve_site as helper
 import sqlalchemy as sa
 
 from compgen.core.points import read_points
@@ -28,16 +26,6 @@ from compgen.recal.records import NewMeasurement, NewResult, TableFile
 from compgen.serve import background, reading
 from compgen.serve.background import Background, NotReadyError
 
-
-def _helper():
-    spec = importlib.util.spec_from_file_location("compgen_serve_site", Path(__file__).with_name("serve_site.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-helper = _helper()
 factory = helper.factory
 STATIONS = {"LT1": [-300.0, -400.0, 100.0], "LT2": [800.0, -300.0, 50.0], "LT3": [-200.0, 700.0, -250.0]}
 STATIONS |= {"LT4": [700.0, 600.0, 150.0]}

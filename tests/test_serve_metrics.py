@@ -1,9 +1,7 @@
 """The metrics of ``serve`` and ``watch``: names, labels and units as Prometheus wants them, and series that stay few."""
 
-import importlib.util
 import re
 import socket
-import sys
 import time
 import urllib.error
 import urllib.request
@@ -15,6 +13,7 @@ pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: 
 pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
 
+import serve_site as helper
 from prometheus_client.parser import text_string_to_metric_families
 
 from compgen.recal.runner import MachineOutcome
@@ -25,17 +24,6 @@ NAME = re.compile(r"compgen_[a-z]+(_[a-z]+)*")
 #: Units of the conventions that our names may end with, and words that say that it is a count or a state.
 UNITS = ("seconds", "timestamp_seconds", "up", "machines", "tables", "version", "failed", "sessions")
 HOSTILE = 'a"b\\c\nd{e="f"} 7 \u20ac'
-
-
-def _helper():
-    spec = importlib.util.spec_from_file_location("compgen_serve_site", Path(__file__).with_name("serve_site.py"))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-helper = _helper()
 
 
 @pytest.fixture
