@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import re
 import sys
 import threading
 import time
@@ -30,6 +31,8 @@ from compgen.recal.store import open_store
 from compgen.recal.watch import Watch
 
 HERE = Path(__file__).resolve().parent
+#: What a page says while its figures are not there yet.
+UNDER_WAY = re.compile("being worked out")
 
 
 def _loaded(path):
@@ -307,8 +310,6 @@ def test_a_backup_moves_a_store_to_the_other_database_and_it_goes_on(url, opened
 def test_the_dashboard_reads_and_decides_on_it(url, opened, tmp_path):
     pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
     pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
-    import re
-
     from compgen.serve.app import make_app
     from compgen.serve.settings import Settings
     from compgen.serve.users import Users
@@ -325,6 +326,12 @@ def test_the_dashboard_reads_and_decides_on_it(url, opened, tmp_path):
 
     def page(name, path):
         answer = clients[name].get(path, base_url=own)
+        deadline = time.monotonic() + 60.0
+        while (
+            UNDER_WAY.search(answer.text) and time.monotonic() < deadline
+        ):  # figures are worked out beside the requests
+            time.sleep(0.05)
+            answer = clients[name].get(path, base_url=own)
         moment = (
             r'\d{4}-\d\d-\d\d[ T]\d\d:\d\d(:\d\d)?|nonce-\S+|nonce="[^"]+"|name="csrf" value="[^"]+"|\d+(\.\d+)? s\b'
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -23,6 +23,7 @@ from compgen.core.machine import Machine, read_machine
 from compgen.errors import CompgenError, InputError
 from compgen.identify.covariance import Covariance, read_covariance
 from compgen.recal import schema
+from compgen.recal.blobs import put_blobs
 from compgen.recal.database import StoreError, engine_of, retried, shown, upgrade
 from compgen.recal.records import (
     AttemptRecord,
@@ -310,27 +311,6 @@ def open_store(url: str, *, clock: Clock | None = None) -> Store:
     engine = engine_of(url)
     retried(lambda: upgrade(engine), url)
     return Store(engine, url, clock)
-
-
-def put_blobs(connection: sa.Connection, contents: Iterable[bytes]) -> list[str]:
-    """Keep contents that are not there yet and return their SHA-256."""
-    digests = []
-    for content in contents:
-        digest = sha256_of(content)
-        known = connection.execute(sa.select(schema.blobs.c.size).where(schema.blobs.c.sha256 == digest)).first()
-        if known is None:
-            insert = _insert_once(connection)
-            row = {"sha256": digest, "size": len(content), "deflated": zlib.compress(content, 6)}
-            connection.execute(insert.values(**row).on_conflict_do_nothing())
-        digests.append(digest)
-    return digests
-
-
-def _insert_once(connection: sa.Connection) -> Any:
-    from sqlalchemy.dialects import postgresql, sqlite
-
-    kind = postgresql if connection.dialect.name == "postgresql" else sqlite
-    return kind.insert(schema.blobs)
 
 
 def _where(query: sa.Select[Any], table: sa.Table, machine: MachineRecord | None) -> sa.Select[Any]:
