@@ -193,6 +193,25 @@ def test_a_varying_reversal_becomes_ixx86_and_a_backlash_table():
         assert up - down == pytest.approx(-curve.at(np.array([x]))[0], abs=2 / 16000)
 
 
+@pytest.mark.parametrize("counts", [1000.0, -1000.0])
+@pytest.mark.parametrize("home", [0.0, 120.0])
+def test_a_varying_reversal_leaves_minus_half_of_it_after_either_direction(counts, home):
+    """ISO 230-2: B is the position reached in positive minus in negative direction; the curves are the mean of both."""
+    machine = machine_with(tool=(0.0, 0.0, 0.0), counts_per_mm=counts, home_mm={"X": home})
+    curve = compgen.Curve(np.array([-300.0, 500.0]), np.array([-0.002, -0.010]), np.full(2, np.nan))
+    _, tables = made(machine, errors_of(EXX=1e-5), ReversalCurves({(0, 0): curve}))
+
+    def at(x, sign):
+        return added(tables, [x, 0, 0], machine, [sign, 1, 1])[0, 0]
+
+    for x in (-300.0, -200.0, 0.0, 450.0, 500.0):
+        reversal = -0.006 - 0.008 * (x - 100.0) / 800.0
+        for sign in (1, -1):
+            # what is added there against the zero of the motor, where the tables hold nothing but Ixx86
+            moved = at(x, sign) - 0.5 * (at(home, 1) + at(home, -1))
+            assert moved == pytest.approx(-1e-5 * (x - home) - 0.5 * sign * reversal, abs=3 / 16000), (x, sign)
+
+
 # --- limits and settings ---------------------------------------------------------------------------------------------
 
 
@@ -209,6 +228,14 @@ def test_a_varying_reversal_becomes_ixx86_and_a_backlash_table():
 def test_broken_rules_are_violations(text, words):
     found = CONTROL.violations(PLAIN, CONTROL.read_settings(PLAIN), parsed(text))
     assert any(words in message for message in found), found
+
+
+def test_the_preflight_gives_the_scale_of_an_inch_machine(make_errors):
+    machine = machine_with(counts_per_mm={"X": 1000.0, "Y": 2000.0, "Z": -500.0})
+    text = compgen.export(machine, make_errors(machine), NAME).preflight
+    for motor, counts in ((1, "1000.000000 counts per mm (25400.0000"), (3, "-500.000000 counts per mm (-12700.0000")):
+        assert f"motor {motor} is {'XYZ'[motor - 1]}: {counts} counts per inch)" in text
+    assert "Inch machines:" in text
 
 
 def test_counts_per_mm_are_mandatory_and_say_why():

@@ -192,6 +192,11 @@ def test_a_reversal_along_the_axis_becomes_a_bilateral_table():
 # --- limits ----------------------------------------------------------------------------------------------------------
 
 
+def test_the_preflight_says_that_an_inch_machine_takes_the_lists_as_they_are(make_errors):
+    text = compgen.export(PLAIN, make_errors(PLAIN), NAME).preflight
+    assert "Metric only" in text and "convert no number" in text
+
+
 def test_limits_of_points_and_missing_lists_are_named(make_errors):
     errors = make_errors(PLAIN)
     tables = parsed(dict(compgen.export(PLAIN, errors, NAME).files))

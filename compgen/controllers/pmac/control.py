@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
-from compgen.controllers.pmac.basis import Ring, pmac_basis, ring_of, sixteenths, tables_from
+from compgen.controllers.pmac.basis import Ring, pmac_basis, ring_of, tables_from
 from compgen.controllers.pmac.notes import pmac_notes, table_context
 from compgen.controllers.pmac.settings import PmacSettings, read_pmac_settings
 from compgen.controllers.pmac.tables import PER_COUNT, Backlash, IntArray, Line, PmacTables, Sheet
@@ -64,7 +64,8 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         """Return the tables with Ixx86 and, where the reversal varies, a backlash table and its half in the pitch table.
 
         With the reversal B the control takes -B off after negative travel, so both directions stand at +B/2 of the
-        mean; -(B - B at zero)/2 goes into the pitch table, the rest is a constant.
+        mean; -(B - B at zero)/2 goes into the pitch table, the rest is a constant. B, both halves and "positive" are those
+        of the motor: a motor that counts against its axis sees the same B in its counts.
         """
         lines, backlash, constants = list(tables.tables), [], {}
         for (axis, _), curve in sorted(reversal.curves.items()):
@@ -266,8 +267,10 @@ def _with_backlash(
     pitch = np.rint(table.at(counts)).astype(np.int64)
     varying = curve.at(ring.positions_mm(settings)) - at_home
     varying[0] = 0.0
+    # In the motor's own counts a reversal B is |counts per mm| B, whichever way the motor counts: where it counts
+    # against its axis, both the position and the direction of travel change their sign.
     size = np.rint(-PER_COUNT * scale * varying).astype(np.int64)
-    half = sixteenths(settings, axis, -0.5 * varying)
+    half = np.rint(-0.5 * PER_COUNT * scale * varying).astype(np.int64)
     entries: IntArray = np.append(pitch[1:] + half[1:], 0)
     length = ring.step * ring.size
     own = Backlash(settings.motors[axis], length, np.append(size[1:], 0))
