@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import sys
+import time
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 
@@ -17,7 +18,7 @@ from compgen.core.points import Points
 from compgen.core.steady import steady
 from compgen.model.exact import exact_error
 from compgen.model.grid import volume_grid
-from compgen.recal import actions, decisions, publish, runner
+from compgen.recal import actions, decisions, inbox, publish, runner
 from compgen.recal.inbox import measurement_of
 from compgen.recal.job import Policy, read_job
 from compgen.recal.judge import Judgement, judge_measurement
@@ -361,13 +362,13 @@ def test_a_failing_machine_does_not_stop_the_others_and_a_bad_file_is_not_tried_
 
 
 def test_what_cannot_be_read_is_reported_once_and_taken_when_it_can(plant):
-    (plant.inbox / "a.deviations.csv").symlink_to(plant.folder / "unplugged.csv")
+    (plant.inbox / "a.deviations.csv").write_bytes(b"0" * 2_000_000)
+    plant.write("max_size_mb = 1.5")
     first, second = plant.run(), plant.run()
     assert first.exit_code == second.exit_code == 1
-    assert "cannot be read" in first.outcomes[0].messages[0]
+    assert "is too large: 2 MB where 1.5 MB are left" in first.outcomes[0].messages[0]
     assert len(open_store(plant.job().store).events()) == 1
-    plant.measure("b")
-    (plant.inbox / "b.deviations.csv").rename(plant.folder / "unplugged.csv")
+    plant.measure("a")
     assert plant.run().outcomes[0].processed == ("a.deviations.csv",)
 
 
@@ -462,3 +463,90 @@ def test_a_folder_in_the_inbox_is_one_measurement(plant, small_machine, small_er
     outcome = plant.run()
     assert outcome.outcomes[0].processed == ("monday",)
     assert plant.states() == ["pending"]
+
+
+# --- an inbox into which anybody may put anything -------------------------------------------------------------------
+
+
+def test_only_regular_files_of_the_inbox_itself_are_read(plant, monkeypatch):
+    plant.write()
+    secret = plant.folder / "secret.csv"
+    secret.write_text("root:x:0\n")
+    elsewhere = plant.folder / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "x.deviations.csv").write_text("x_mm\n1\n")
+    os.mkfifo(plant.inbox / "fifo.deviations.csv")
+    (plant.inbox / "fifo-link.deviations.csv").symlink_to(plant.inbox / "fifo.deviations.csv")
+    (plant.inbox / "zero.deviations.csv").symlink_to("/dev/zero")
+    (plant.inbox / "foreign.deviations.csv").symlink_to(secret)
+    (plant.inbox / "folder").symlink_to(elsewhere)
+    (plant.inbox / "nested").mkdir()
+    (plant.inbox / "nested" / "n.deviations.csv").symlink_to(secret)
+    plant.measure("good")
+    outcome = plant.run().outcomes[0]
+    assert outcome.processed == ("good.deviations.csv",)
+    assert outcome.state == "failed"
+    said = "\n".join(outcome.messages)
+    assert "root:x" not in said
+    for name in ("fifo.", "fifo-link.", "zero.", "foreign.", "folder", "n.dev"):
+        assert name in said
+    assert said.count("it is a link") == 4 and said.count("is a link to a folder") == 1
+    assert said.count("it is a pipe or a device") == 1
+    store = open_store(plant.job().store)
+    assert [item.name for item in store.measurements()] == ["good.deviations.csv"]
+
+
+def test_a_folder_that_becomes_a_link_between_listing_and_reading_is_not_followed(plant):
+    plant.write()
+    elsewhere = plant.folder / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "n.deviations.csv").write_text("secret\n")
+    nested = plant.inbox / "nested"
+    nested.mkdir()
+    (nested / "n.deviations.csv").write_text("x_mm\n")
+    (group,) = inbox.scan(plant.job().machine("mill"), NOW).groups
+    shutil.rmtree(nested)
+    nested.symlink_to(elsewhere)
+    with pytest.raises(compgen.InputError, match="it is a link"):
+        inbox.load(plant.job().machine("mill"), group)
+
+
+def test_the_size_of_all_files_of_a_measurement_is_limited_before_they_are_read(plant):
+    plant.write("max_size_mb = 1.0")
+    nested = plant.inbox / "nested"
+    nested.mkdir()
+    for k in range(3):
+        (nested / f"{k}.deviations.csv").write_bytes(b"1" * 400_000)
+    with (plant.inbox / "sparse.deviations.csv").open("wb") as stream:
+        stream.truncate(1 << 40)  # holds nothing, would take a terabyte of memory
+    said = "\n".join(plant.run().outcomes[0].messages)
+    assert "2.deviations.csv: is too large: 0.4 MB where 0.2 MB are left" in said and "0.deviations" not in said
+    assert "sparse.deviations.csv: is too large: 1.1e+06 MB where 1 MB are left" in said
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"," * 10_000_000,
+        b",".join(b"c%d" % k for k in range(1_000_000)) + b"\n",
+        b"# temp_ = " + b" " * 5_000_000 + b"x\nx_mm\n1\n",
+        b"# temp_x_c only comments\n",
+        b"temp_x_c" + b"y" * 200_000 + b",x_mm\n1,2\n",
+        b"temp_x_c," * 500_000 + b"x_mm\n" + b"1\n" * 1000,
+        b'temp_x_c,"x_mm\n1,2\n',
+    ],
+    ids=["commas", "columns", "spaces", "comments", "long", "temperatures", "quote"],
+)
+def test_a_file_that_is_no_table_is_refused_soon_and_the_next_machine_has_its_turn(plant, content, small_machine_file):
+    other = f'[machines.next]\nmachine = "mill.toml"\ninbox = "inbox2"\ncontrollers = ["{CONTROL}"]\nout = "out2"\n'
+    plant.write(more=other + 'measured_with = "bare"\n')
+    (plant.inbox / "bad.deviations.csv").write_bytes(content)
+    plant.measure("good")
+    (plant.folder / "inbox2").mkdir()
+    shutil.copy(plant.inbox / "good.deviations.csv", plant.folder / "inbox2")
+    began = time.monotonic()
+    outcome = plant.run()
+    assert time.monotonic() - began < 30.0
+    assert outcome.exit_code == 1
+    assert outcome.outcomes[0].processed == outcome.outcomes[1].processed == ("good.deviations.csv",)
+    assert max(map(len, outcome.outcomes[0].messages)) < 2000

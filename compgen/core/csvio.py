@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from compgen.core.csvparse import CsvFile, parse_any, parse_plain
 from compgen.core.files import read_text
-from compgen.core.text import nearest, one_line
+from compgen.core.text import doubled, nearest, one_line
 from compgen.errors import CompgenWarning, InputError
 
 FloatArray = NDArray[np.float64]
 _LARGEST_LABEL = 2.0**53
 _ROWS_AT_ONCE = 10_000
+#: Columns that a header may have; characters of it that a message shows; columns left out that are named each.
+MOST_COLUMNS, _SHOWN, _NAMED = 10_000, 200, 20
 
 
 @dataclass(frozen=True)
@@ -148,12 +150,24 @@ def csv_table(
     if file.rows is not None:
         _check_fields(source, file.header, file.rows, file.lines)
     _check_complete(source, content, file)
-    for name in file.header:
-        if not _is_allowed(name, known, prefixes):
-            message = f"column {one_line(name)!r} is not known and left out; {nearest(name, known)}"
-            warnings.warn(f"{source}:{file.header_line}: {message}", CompgenWarning, stacklevel=4)
+    _warn_left_out(
+        f"{source}:{file.header_line}", [name for name in file.header if not _is_allowed(name, known, prefixes)], known
+    )
     kept = {k: name for k, name in enumerate(file.header) if _is_allowed(name, known, prefixes)}
     return CsvTable(source, {name: file.column(k) for k, name in kept.items()}, file.lines, file.metadata)
+
+
+def _warn_left_out(place: str, names: list[str], known: set[str]) -> None:
+    for name in names[:_NAMED]:
+        message = f"column {_shown(name)!r} is not known and left out; {nearest(name[:_SHOWN], known)}"
+        warnings.warn(f"{place}: {message}", CompgenWarning, stacklevel=5)
+    if len(names) > _NAMED:
+        warnings.warn(f"{place}: {len(names) - _NAMED} more columns are left out", CompgenWarning, stacklevel=5)
+
+
+def _shown(text: str) -> str:
+    """Return the beginning of a user's text on one line: a message is no place for megabytes."""
+    return one_line(text[: 2 * _SHOWN])[:_SHOWN] + (" ..." if len(text) > _SHOWN else "")
 
 
 def _is_allowed(name: str, known: set[str], patterns: tuple[str, ...]) -> bool:
@@ -169,12 +183,15 @@ def _check_fields(source: Path, header: list[str], rows: list[list[str]], lines:
 
 
 def _check_header(source: Path, line: int, header: list[str], required: list[str]) -> None:
-    doubled = sorted({name for name in header if header.count(name) > 1})
-    if doubled:
-        raise InputError(f"the header names {doubled[0]!r} twice", file=source, line=line)
+    if len(header) > MOST_COLUMNS:
+        message = f"the header has {len(header)} columns; at most {MOST_COLUMNS} are read: is this a table?"
+        raise InputError(message, file=source, line=line)
+    twice = doubled(header)
+    if twice is not None:
+        raise InputError(f"the header names {_shown(twice)!r} twice", file=source, line=line)
     missing = [name for name in required if name not in header]
     if missing:
-        needed, present = ", ".join(required), one_line(", ".join(header))
+        needed, present = ", ".join(required), _shown(", ".join(header))
         hint = "; separate columns by commas" if len(header) == 1 and re.search(r"[;\t]", header[0]) else ""
         message = f"column {missing[0]!r} is missing; needed are {needed}; the header has {present}{hint}"
         raise InputError(message, file=source, line=line)

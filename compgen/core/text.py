@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
+from typing import TypeVar
+
+Item = TypeVar("Item", bound=Hashable)
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -13,6 +16,16 @@ def nearest(word: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=0.5)
     hint = f"did you mean {lowered[close[0]]!r}? " if close else ""
     return f"{hint}Known: {', '.join(choices) if choices else 'none'}"
+
+
+def doubled(items: Iterable[Item]) -> Item | None:
+    """Return the first item that came before, None if all differ; one look at each, however many there are."""
+    seen: set[Item] = set()
+    for item in items:
+        if item in seen:
+            return item
+        seen.add(item)
+    return None
 
 
 def one_line(text: object) -> str:

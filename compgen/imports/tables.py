@@ -12,6 +12,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.core.reversal import ReversalCurves
+from compgen.core.text import doubled
 from compgen.errors import InputError
 from compgen.imports.columns import error_columns, fields_of
 from compgen.imports.findings import Findings
@@ -182,10 +183,9 @@ def _joined_runs(parts: Sequence[AxisRuns]) -> AxisRuns:
 
 
 def _joined_errors(first: Imported, parts: Sequence[ErrorTable]) -> ErrorTable:
-    names = [name for item in parts for name in item.names]
-    doubled = next((name for name in names if names.count(name) > 1), None)
-    if doubled:
-        raise InputError(f"{doubled} stands on two sheets; choose one with --sheet", file=first.path)
+    twice = doubled(name for item in parts for name in item.names)
+    if twice is not None:
+        raise InputError(f"{twice} stands on two sheets; choose one with --sheet", file=first.path)
     curves = {name: curve for item in parts for name, curve in item.curves.items()}
     squareness = {name: value for item in parts for name, value in item.squareness.items()}
     return ErrorTable(curves, squareness, parts[0].metadata)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
-import io
-import re
-from collections.abc import Mapping
+import os
+import stat
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from compgen.core.csvio import MOST_COLUMNS
 from compgen.core.files import sha256_of
 from compgen.errors import InputError
 from compgen.recal.job import MachineJob
@@ -19,7 +21,8 @@ from compgen.recal.records import NewMeasurement
 #: Comments of a measurement file that say when it was made, and with which tables (a version, or "none").
 TIME_KEYS = ("measured_at", "date")
 ACTIVE_KEY = "active_table"
-_COMMENT = re.compile(rb"^[ \t]*#[ \t]*([A-Za-z_]\w*)[ \t]*=[ \t]*(.*?)[ \t\r]*$", re.MULTILINE)
+#: Files of one measurement, and characters of a comment that says something about it.
+MOST_FILES, LONGEST_COMMENT = 1000, 200
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,9 @@ def scan(job: MachineJob, now: datetime) -> Found:
         if entry.name.startswith("."):
             continue
         try:
+            if entry.is_symlink() and entry.is_dir():
+                problems.append(Problem(str(entry), "is a link to a folder; put the folder itself into the inbox"))
+                continue
             files = tuple(sorted(entry.iterdir())) if entry.is_dir() else (entry,)
             group = tuple(path for path in files if _fits(job, path))
             if group and not _settling(job, group, now):
@@ -61,7 +67,7 @@ def scan(job: MachineJob, now: datetime) -> Found:
 
 def _fits(job: MachineJob, path: Path) -> bool:
     named = not path.name.startswith(".") and any(fnmatchcase(path.name, pattern) for pattern in job.patterns)
-    return named and (path.is_file() or path.is_symlink())  # a link that leads nowhere is reported when it is read
+    return named and (path.is_symlink() or not path.is_dir())  # a link, a pipe, a device is reported when it is read
 
 
 def _settling(job: MachineJob, group: tuple[Path, ...], now: datetime) -> bool:
@@ -70,22 +76,75 @@ def _settling(job: MachineJob, group: tuple[Path, ...], now: datetime) -> bool:
     return any(0.0 <= age < job.settle_s for age in ages)
 
 
-def load(group: tuple[Path, ...]) -> NewMeasurement:
-    """Read the files of one measurement; InputError if one cannot be read or changes at this moment."""
+def load(job: MachineJob, group: tuple[Path, ...]) -> NewMeasurement:
+    """Read the files of one measurement.
+
+    Raises
+    ------
+    InputError
+        if one cannot be read, changes at this moment, is a link or no file, or all are larger than the job allows.
+    """
+    if len(group) > MOST_FILES:
+        raise InputError(f"holds {len(group)} files; one measurement has at most {MOST_FILES}", file=group[0].parent)
     contents: dict[str, bytes] = {}
     times = []
+    left = round(job.max_size_mb * 1e6)
     for path in group:
-        try:
-            before = path.stat()
-            contents[path.name] = path.read_bytes()
-            after = path.stat()
-        except OSError as error:
-            raise InputError(f"cannot be read: {error.strerror or error}", file=path) from error
-        if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
-            raise InputError("is being written at this moment; it is taken by the next run", file=path)
-        times.append(after.st_mtime)
+        content, state = _read_regular(path, left, folder_is_real=path.parent != job.inbox)
+        contents[path.name], left = content, left - len(content)
+        times.append(state.st_mtime)
     name = group[0].name if len(group) == 1 else group[0].parent.name
     return measurement_of(name, contents, datetime.fromtimestamp(max(times), UTC))
+
+
+def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes, os.stat_result]:
+    """Return contents and state of a file that anybody may have put there: regular, at most ``most`` bytes, no link.
+
+    Nothing is waited for (a pipe that nobody writes to) and nothing without end is read (a device). With
+    ``folder_is_real`` the folder of the file must not be a link either.
+
+    Raises
+    ------
+    InputError
+        for anything else, a file that is too large, and one that changes while it is read.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        kind = path.lstat().st_mode
+        if stat.S_ISLNK(kind) or (folder_is_real and path.parent.is_symlink()):
+            raise InputError("cannot be read: it is a link; put the file itself there", file=path)
+        if not stat.S_ISREG(kind):  # not even opened: a device may do something then
+            raise InputError("cannot be read: it is a pipe or a device, not a file", file=path)
+        with _opened_folder(path.parent, real=folder_is_real) as folder:
+            handle = os.open(path if folder is None else path.name, flags, dir_fd=folder)
+        with os.fdopen(handle, "rb") as stream:
+            before = os.fstat(handle)
+            if not stat.S_ISREG(before.st_mode):
+                raise InputError("cannot be read: another thing took its place meanwhile", file=path)
+            if before.st_size > most:
+                size, allowed = before.st_size / 1e6, most / 1e6
+                message = f"is too large: {size:.3g} MB where {allowed:.3g} MB are left for this measurement"
+                raise InputError(f"{message}; max_size_mb of the job file is the limit", file=path)
+            content = stream.read(most + 1)
+            after = os.fstat(handle)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from error
+    if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns) or len(content) != after.st_size:
+        raise InputError("is being written at this moment; it is taken by the next run", file=path)
+    return content, after
+
+
+@contextlib.contextmanager
+def _opened_folder(folder: Path, *, real: bool) -> Iterator[int | None]:
+    """Open a folder, so that nobody can put another one in its place; None on a system that cannot."""
+    if os.open not in os.supports_dir_fd:
+        yield None
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | (os.O_NOFOLLOW if real else 0))
+    try:
+        yield handle
+    finally:
+        os.close(handle)
 
 
 def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime) -> NewMeasurement:
@@ -94,8 +153,7 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
     digest = digests[0] if len(digests) == 1 else sha256_of("\n".join(digests).encode())
     comments: dict[str, str] = {}
     for content in contents.values():
-        found = {key.decode(): value.decode("utf-8", "replace") for key, value in _COMMENT.findall(content)}
-        comments = {**found, **comments}
+        comments = {**_comments(content), **comments}
     times = [time for key in TIME_KEYS if (time := _time(comments.get(key, ""))) is not None]
     temperatures: dict[str, dict[str, float]] = {}
     for content in contents.values():
@@ -111,6 +169,17 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
     )
 
 
+def _comments(content: bytes) -> dict[str, str]:
+    """Return the comments ``# key = value`` of a file that this module looks at, cut at a sensible length."""
+    found = {}
+    for line in content.splitlines():
+        key, equals, value = line.strip().partition(b"=")
+        name = key[1:].strip().decode("utf-8", "replace") if key.startswith(b"#") else ""
+        if equals and name in (*TIME_KEYS, ACTIVE_KEY):
+            found[name] = value.decode("utf-8", "replace").strip()[:LONGEST_COMMENT]
+    return found
+
+
 def _time(text: str) -> datetime | None:
     """Read an ISO time; without a zone it is local time."""
     try:
@@ -124,7 +193,12 @@ def _temperatures(content: bytes) -> dict[str, dict[str, float]]:
     if b"temp_" not in content:
         return {}
     lines = [line for line in content.decode("utf-8-sig", "replace").splitlines() if line.strip() and line[0] != "#"]
-    rows = list(csv.reader(io.StringIO("\n".join(lines))))
+    try:
+        rows = list(csv.reader(lines))
+    except csv.Error:  # the reader of the measurement says what is wrong, and where
+        return {}
+    if not rows or len(rows[0]) > MOST_COLUMNS:
+        return {}
     found = {}
     for column, name in enumerate(cell.strip() for cell in rows[0]):
         if fnmatchcase(name, "temp_*_c"):

@@ -73,6 +73,7 @@ class MachineJob:
     allow_unverified: bool = False
     notify: tuple[str, ...] = ()
     settle_s: float = 0.0
+    max_size_mb: float = 100.0
     policy: Policy = Policy()
     identify: Mapping[str, Any] = field(default_factory=dict)
     tolerances: Mapping[str, float] = field(default_factory=dict)
@@ -210,6 +211,7 @@ def _options(keys: _Keys, folder: Path, name: str) -> dict[str, Any]:
         "allow_unverified": keys.take("allow_unverified", tomlio.flag, False),
         "notify": keys.take("notify", command_words, ()),
         "settle_s": keys.take("settle_s", tomlio.not_negative, 0.0),
+        "max_size_mb": keys.take("max_size_mb", tomlio.positive, MachineJob.max_size_mb),
         "policy": _policy(keys.section("policy")),
         "identify": _identify(keys.section("identify")),
         "tolerances": _tolerances(keys.section("tolerances")),

@@ -180,9 +180,10 @@ class _Pass:
             self._problem("inbox", problem.subject, problem.message)
         for group in found.groups:
             try:
-                new = inbox.load(group)
+                new = inbox.load(self.job, group)
             except CompgenError as error:
-                self._problem("inbox", str(group[0]), str(getattr(error, "message", error)))
+                place = str(getattr(error, "file", None) or group[0])
+                self._problem("inbox", place, str(getattr(error, "message", error)))
                 continue
             self.store.add_measurement(self.machine, new)
             self.present.add(new.sha256)

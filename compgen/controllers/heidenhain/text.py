@@ -15,7 +15,7 @@ from pathlib import Path
 
 from compgen.controllers.base import SourceFile
 from compgen.core.files import read_bytes
-from compgen.core.text import one_line
+from compgen.core.text import doubled, one_line
 from compgen.errors import InputError
 
 #: No table of a control is anywhere near this long, has lines of this length, or so much before its header.
@@ -154,8 +154,9 @@ def _columns(file: SourceFile, header: str, line: int) -> tuple[Column, ...]:
     for name in names:
         if not _COLUMN.fullmatch(name):
             raise file.fail(f"{name[:40]!r} is not the name of a column", line)
-        if names.count(name) > 1:
-            raise file.fail(f"column {name} stands here twice", line)
+    twice = doubled(names)
+    if twice is not None:
+        raise file.fail(f"column {twice} stands here twice", line)
     starts = [match.start() for match in found]
     ends = [*starts[1:], starts[-1]]
     return tuple(Column(name, start, end - start) for name, start, end in zip(names, starts, ends, strict=True))

@@ -36,6 +36,7 @@ from compgen.controllers.isg.parameters import (
 )
 from compgen.controllers.isg.settings import IsgTables
 from compgen.core.names import AXES, error_named
+from compgen.core.text import doubled
 from compgen.errors import CompgenWarning
 
 _Row = tuple[int, list[str]]
@@ -101,9 +102,9 @@ def _check_header(source: SourceFile, line: int, names: list[str]) -> None:
         if name[0] in "+-.0123456789":
             raise source.fail(f"a header with names is due at the start of a block, found {name[:40]!r}", line)
         check_name(source, line, name)
-    doubled = next((name for name in names if names.count(name) > 1), None)
-    if doubled:
-        raise source.fail(f"the header names {doubled} twice (the control's error 70469)", line)
+    twice = doubled(names)
+    if twice is not None:
+        raise source.fail(f"the header names {twice} twice (the control's error 70469)", line)
     if all(len(name) == 1 for name in names):
         raise source.fail("the header names arguments only; at least one error parameter is due", line)
 

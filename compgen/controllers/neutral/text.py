@@ -18,7 +18,7 @@ from compgen.controllers.neutral.tables import FieldGrid, NeutralTables, same_cu
 from compgen.core.csvio import FloatArray, csv_table
 from compgen.core.error_table import ERROR_COLUMNS, Curve, ErrorTable, errors_of_table
 from compgen.core.names import ERROR_NAMES, SQUARENESS_NAMES, error_named
-from compgen.core.text import nearest, one_line
+from compgen.core.text import doubled, nearest, one_line
 from compgen.errors import InputError
 
 FIELD_SCHEMA, CURVE_SCHEMA = "compgen-correction-field", "compgen-error-curves"
@@ -81,9 +81,7 @@ def _refused(word: str) -> float:
 def _pairs(items: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(items)
     if len(found) != len(items):
-        names = [name for name, _ in items]
-        doubled = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the key {one_line(doubled)[:40]!r} stands twice in one object")
+        raise ValueError(f"the key {one_line(doubled(name for name, _ in items))[:40]!r} stands twice in one object")
     return found
 
 
