@@ -63,6 +63,7 @@ range_mm = [-240.0, 0.0]
 nodes = 7
 [controllers.siemens-cec]
 sign = "error"
+mult_mode = "S1"
 """
 JOB = f"""\
 [defaults]

@@ -53,6 +53,7 @@ range_mm = [-240.0, 0.0]
 nodes = 4
 [controllers.siemens-cec]
 sign = "error"
+mult_mode = "S1"
 """
 TABLE, ITS_END = "NC_CEC.INI", b"M17\n"
 NOISE_MM = 3e-4

@@ -29,6 +29,7 @@ range_mm = [-240.0, 0.0]
 nodes = 7
 [controllers.siemens-cec]
 sign = "error"
+mult_mode = "S1"
 [controllers.pmac]
 counts_per_mm = { X = 1000.0, Y = 2000.0, Z = -1500.0 }
 """

@@ -399,7 +399,7 @@ def bad_machine(folder, small_machine_file, old, new):
         ("nodes = 6", "nodes = 6\nstep = 4", "is not a known key"),
         ('chain = "WFYXZT"', 'chain = "WYXZT"', "chain 'WYXZT' is not valid"),
         ("[-300.0, 200.0]", "[200.0, -300.0]", "range_mm"),
-        ('sign = "error"', 'mult_mode = "S1"', "[controllers.siemens-cec] sign: is missing"),
+        ('mult_mode = "S1"', "products = true", "[controllers.siemens-cec] mult_mode: is missing"),
         ('sign = "error"', 'sign = "err"', "sign"),
         ("[controllers.siemens-cec]", "[controllers.simens-cec]", "did you mean 'siemens-cec'"),
         ('name = "small-gantry"', "name = 7", "name: one line of text is expected"),
@@ -416,14 +416,14 @@ def test_a_bad_machine_exits_with_2_and_writes_nothing(
     assert listing(tmp_path) == before
 
 
-def test_siemens_cec_without_its_section_asks_for_the_sign(
+def test_siemens_cec_without_the_mode_of_its_products_asks_for_it(
     call, small_machine_file, small_lengths_file, listing, tmp_path
 ):
-    machine = bad_machine(tmp_path, small_machine_file, '[controllers.siemens-cec]\nsign = "error"\n', "")
+    machine = bad_machine(tmp_path, small_machine_file, 'mult_mode = "S1"', "products = true")
     before = listing(tmp_path)
     words = ("--controller", "isg-csv", "--controller", "siemens-cec", "--out", tmp_path / "out")
     code, stdout, stderr = call("run", machine, small_lengths_file, *words)
-    check_refused(code, stdout, stderr, 'write sign = "error" or sign = "correction"')
+    check_refused(code, stdout, stderr, 'write e.g. mult_mode = "S1", or write products = false')
     assert listing(tmp_path) == before
 
 

@@ -1,5 +1,6 @@
 """SINUMERIK tables: golden files, signs by hand, folding, limits, malformed text."""
 
+import re
 import time
 from decimal import Decimal
 from itertools import product
@@ -20,8 +21,10 @@ from compgen.core.machine import CHAINS, Machine, read_machine
 from compgen.core.names import CURVE_NAMES, error_named
 from compgen.core.points import Points
 from compgen.errors import CompgenWarning, InputError
+from compgen.export import export
 from compgen.export.render import load_format, render, render_files
 from compgen.model.volumetric import volumetric_error
+from compgen.verify import read_tables, verify
 
 GOLDEN = Path(__file__).parent / "golden"
 NANOMETRE = 1e-6  # mm
@@ -296,7 +299,7 @@ def test_only_the_angle_and_its_fold_change_sign_with_the_convention(tmp_path):
 
 
 def test_the_fold_cancels_the_scaled_angle_to_the_last_decimal(tmp_path):
-    machine = make_machine(tmp_path, 'sign = "correction"')
+    machine = make_machine(tmp_path, 'sign = "correction"\nmult_mode = "S1"')
     control = controller_named("siemens-cec")
     own = control.read_settings(machine)
     basis = control.basis(machine, own, random_errors(machine))
@@ -335,7 +338,7 @@ def test_cross_tables_survive_the_text_and_act_as_the_term_model(tmp_path, mode,
 
 @pytest.mark.parametrize("chain", CHAINS)
 def test_the_tables_of_all_21_errors_take_the_error_out_at_every_node(tmp_path, chain):
-    machine = make_machine(tmp_path, 'sign = "error"', chain)
+    machine = make_machine(tmp_path, 'sign = "error"\nmult_mode = "S1"', chain)
     control = controller_named("siemens-cec")
     own = control.read_settings(machine)
     errors = random_errors(machine)
@@ -380,7 +383,7 @@ def test_without_products_there_are_nine_tables_and_no_multiplier(tmp_path):
 
 
 def test_tables_of_zeros_are_left_out_but_one_remains(tmp_path):
-    machine = make_machine(tmp_path, 'sign = "error"')
+    machine = make_machine(tmp_path, 'sign = "error"\nmult_mode = "S1"')
     control = controller_named("siemens-cec")
     own = control.read_settings(machine)
     basis = control.basis(machine, own, random_errors(machine))
@@ -391,7 +394,7 @@ def test_tables_of_zeros_are_left_out_but_one_remains(tmp_path):
 
 
 def test_tables_of_different_outputs_share_no_lever(tmp_path):
-    machine = make_machine(tmp_path, 'sign = "error"', "WXYFZT")
+    machine = make_machine(tmp_path, 'sign = "error"\nmult_mode = "S1"', "WXYFZT")
     control = controller_named("siemens-cec")
     own = control.read_settings(machine)
     basis = control.basis(machine, own, random_errors(machine))
@@ -411,7 +414,7 @@ def test_tables_of_different_outputs_share_no_lever(tmp_path):
 @pytest.fixture
 def simple(tmp_path):
     def make(own: str = ""):
-        machine = simple_machine(tmp_path, f'sign = "correction"\n{own}', "siemens-cec")
+        machine = simple_machine(tmp_path, f'sign = "correction"\nmult_mode = "S1"\n{own}', "siemens-cec")
         control = controller_named("siemens-cec")
         return machine, control, control.read_settings(machine)
 
@@ -491,7 +494,7 @@ def test_an_unstated_limit_is_a_value_to_set_and_a_warning_above_the_usual_one(s
 
 
 def test_largest_sum_of_a_product_stands_in_the_corner_found_by_brute_force(tmp_path):
-    machine = make_machine(tmp_path, 'sign = "correction"', "WXYFZT")
+    machine = make_machine(tmp_path, 'sign = "correction"\nmult_mode = "S1"', "WXYFZT")
     control = controller_named("siemens-cec")
     own = control.read_settings(machine)
     basis = control.basis(machine, own, random_errors(machine))
@@ -571,11 +574,68 @@ def test_a_broken_rule_of_the_control_is_one_violation_that_names_it(simple, own
 # --- settings ------------------------------------------------------------------------------------------------------
 
 
-def test_the_sign_is_mandatory_and_the_reason_is_said(tmp_path):
+def test_the_sign_is_inferred_and_said_with_both_traces_unless_it_is_stated(tmp_path):
     control = controller_named("siemens-cec")
-    with pytest.raises(InputError, match="sign: is missing. Siemens' readable documents") as caught:
-        control.read_settings(make_machine(tmp_path))
+    for own, inferred in (("", True), ('sign = "error"', False), ('sign = "correction"', False)):
+        machine = make_machine(tmp_path, own)
+        settings_ = control.read_settings(machine)
+        assert settings_.subtracts == (own != 'sign = "correction"')
+        made = export(machine, random_errors(machine), "siemens-cec")
+        assert ("is inferred" in made.manifest["sign_statement"]) == inferred
+        assert any("inferred from two traces" in text for text in made.warnings) == inferred
+        for trace in ("calibration cycle", "p. 236"):
+            assert trace in made.preflight
+    assert "calibration cycle" in " ".join(load_format("siemens-cec-eec").unverified)
+
+
+def test_without_a_mode_no_products_are_written_and_what_stays_is_said_in_the_verdict(tmp_path):
+    machine = make_machine(tmp_path, 'sign = "error"')
+    errors = random_errors(machine)
+    made = export(machine, errors, "siemens-cec")
+    assert not re.search(r"MULT_BY_TABLE\[\d+\]=[1-9]", made.files["NC_CEC.INI"])
+    result = verify(machine, read_tables(machine, made.write(tmp_path / "out"), "siemens-cec"), errors)
+    (left,) = [note for note in result.notes if "no products of tables are written" in note]
+    assert "X(x)*z (" in left and left in made.preflight
+    control = controller_named("siemens-cec")
+    read = read_tables(machine, made.write(tmp_path / "out"), "siemens-cec")
+    points = random_points(machine, 4000)
+    rest = volumetric_error(machine, errors, points.position_mm) + control.emulate(
+        machine, read.settings, read.tables, points
+    )
+    said = float(re.search(r"together they leave ([\d.]+) um", left).group(1))
+    assert said == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(rest**2, axis=1))), rel=0.1)
+    assert any("mult_mode is not stated" in note for note in result.notes)
+
+
+@pytest.mark.parametrize("own", ["products = true", 'sign = "error"\nproducts = true'])
+def test_products_without_a_mode_are_refused_with_the_reason(tmp_path, own):
+    with pytest.raises(InputError, match=r"mult_mode: is missing.*0.56.*products = false") as caught:
+        controller_named("siemens-cec").read_settings(make_machine(tmp_path, own))
     assert caught.value.exit_code == 2
+
+
+def test_a_file_that_multiplies_tables_is_not_read_without_a_mode(tmp_path):
+    machine = simple_machine(tmp_path, "", "siemens-cec")
+    control = controller_named("siemens-cec")
+    text = constant(0, "0.2", 2) + constant(1, "0.3") + "M17\n"
+    with pytest.raises(InputError, match=r"MULT_BY_TABLE\[0\]: the file multiplies tables.*mult_mode") as caught:
+        parsed(control, machine, control.read_settings(machine), text)
+    assert caught.value.line == 9
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [("", True), ('profile = "840D sl"', True), ("nc_axes = 10", False), ("tables_available = 31", False)],
+)
+def test_a_number_of_tables_that_nobody_stated_is_in_the_verdict(tmp_path, own, said):
+    machine = make_machine(tmp_path, f'sign = "error"\nmult_mode = "S1"\n{own}')
+    errors = random_errors(machine)
+    made = export(machine, errors, "siemens-cec")
+    result = verify(machine, read_tables(machine, made.write(tmp_path / "out"), "siemens-cec"), errors)
+    assert result.accepted
+    notes = [note for note in result.notes if "19 tables" in note and "nc_axes" in note]
+    assert bool(notes) == said
+    assert result.summary()["notes"] == list(result.notes)
 
 
 @pytest.mark.parametrize(

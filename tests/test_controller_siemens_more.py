@@ -36,7 +36,7 @@ TOOL_MM = (12.0, -25.0, -90.0)
 def machine_with(chain="WXYFZT", own=None, others=None):
     """An uneven machine with negative travel, an interior reference point and a tool, with settings of controls."""
     axes = tuple(Axis(r, np.linspace(*r, 7)) for r in ((-350.0, 450.0), (-200.0, 300.0), (-400.0, 50.0)))
-    settings = {"siemens-cec": {"sign": "error"}, **(others or {}), **(own or {})}
+    settings = {"siemens-cec": {"sign": "error", "mult_mode": "S1"}, **(others or {}), **(own or {})}
     controls = {name: Section(data, path=None, name=f"controllers.{name}") for name, data in settings.items()}
     return Machine("m", Chain(chain), axes, "X", TOOL_MM, (-50.0, 100.0, -150.0), controllers=controls)
 
@@ -212,8 +212,8 @@ def test_settings_of_the_two_kinds_are_taken_where_the_own_section_is_silent():
     own = {"siemens-cec-eec": {"sign": "error", "eec_max_points": 50, "encoder": 0}}
     settings = control.read_settings(machine_with(own=own, others=others))
     assert (settings.cec.sign, settings.eec.active, settings.eec.max_points) == ("error", (0, 0, 0), 50)
-    with pytest.raises(InputError, match=r"\[controllers.siemens-cec-eec\] sign: is missing"):
-        control.read_settings(machine_with(others={"siemens-cec": {}}))
+    with pytest.raises(InputError, match=r"\[controllers.siemens-cec-eec\] mult_mode: is missing"):
+        control.read_settings(machine_with(others={"siemens-cec": {"products": True}}))
     with pytest.raises(InputError, match=r"eec_max_pints: is not a known key; did you mean 'eec_max_points'"):
         control.read_settings(machine_with(own={"siemens-cec-eec": {"eec_max_pints": 4}}))
 
@@ -394,7 +394,7 @@ def test_the_kept_tables_are_the_best_of_all_sets_by_brute_force(mode, allowed):
 @pytest.mark.parametrize("profile", ["828D", "802D sl"])
 @pytest.mark.parametrize("name", ["siemens-cec", "siemens-cec-eec"])
 def test_a_model_with_few_tables_gets_accepted_ones_and_says_what_stays(tmp_path, profile, name):
-    own = {name: {"sign": "error", "profile": profile}}
+    own = {name: {"sign": "error", "mult_mode": "S1", "profile": profile}}
     machine = machine_with("WFYXZT", own)
     errors = errors_of(machine, angle_rad=20e-6)
     made = export(machine, errors, name)
@@ -421,7 +421,7 @@ def test_a_model_with_few_tables_gets_accepted_ones_and_says_what_stays(tmp_path
 
 def test_a_set_that_is_nearly_as_good_is_judged_by_what_it_holds_and_a_bad_one_by_the_best(tmp_path):
     """Straightness X(y) and Y(x) of nearly one size and room for one table: slightly other errors prefer the other."""
-    machine = machine_with("WFYXZT", {"siemens-cec": {"sign": "error", "tables_available": 1}})
+    machine = machine_with("WFYXZT", {"siemens-cec": {"sign": "error", "mult_mode": "S1", "tables_available": 1}})
     nodes = [axis.nodes_mm for axis in machine.axes]
     shape = np.array([0.0, 1.0, -1.0, 1.0, -1.0, 1.0, 0.0])
 
@@ -441,7 +441,9 @@ def test_a_set_that_is_nearly_as_good_is_judged_by_what_it_holds_and_a_bad_one_b
 def test_more_tables_never_leave_more():
     errors, left = None, []
     for tables in (1, 3, 6, 9, 13, 19):
-        machine = machine_with("WFYXZT", {"siemens-cec": {"sign": "error", "tables_available": tables}})
+        machine = machine_with(
+            "WFYXZT", {"siemens-cec": {"sign": "error", "mult_mode": "S1", "tables_available": tables}}
+        )
         errors = errors or errors_of(machine)
         control, settings, read = parsed(machine, "siemens-cec", export(machine, errors, "siemens-cec").files)
         position = positions_in(machine, 2000)
@@ -452,7 +454,7 @@ def test_more_tables_never_leave_more():
 
 
 def test_reserved_tables_stay_free_for_a_pair_of_one_direction():
-    own = {"siemens-cec": {"sign": "error", "profile": "828D", "tables_reserved": 2}}
+    own = {"siemens-cec": {"sign": "error", "mult_mode": "S1", "profile": "828D", "tables_reserved": 2}}
     machine = machine_with("WFYXZT", own)
     reversal = ReversalCurves({(0, 0): Curve(np.zeros(1), np.array([-8e-3]), np.zeros(1))})
     made = export(machine, errors_of(machine), "siemens-cec", reversal=reversal)

@@ -428,11 +428,13 @@ def test_a_zone_is_judged_by_itself_and_must_lie_within_the_travel(small_machine
         capability(small_machine, small_errors, zone_mm=((-400.0, 0.0), None, None), controllers=())
 
 
-def test_a_control_whose_sign_is_not_stated_is_compared_all_the_same(small_machine, small_errors):
+def test_a_control_whose_mode_of_products_is_not_stated_is_compared_all_the_same(small_machine, small_errors):
     machine = replace(small_machine, controllers={})
-    (first, _) = capability(machine, small_errors, controllers=("siemens-cec",)).controls
-    assert first.left is not None
-    assert any("sign is not stated" in note for note in first.notes)
+    without, products = capability(machine, small_errors, controllers=("siemens-cec",)).controls
+    assert without.left is not None and products.left is not None
+    assert not without.notes
+    assert any("mult_mode is not stated" in note for note in products.notes)
+    assert (without.own, products.own) == (True, False)
 
 
 # --- explanation -----------------------------------------------------------------------------------------------------

@@ -454,6 +454,33 @@ def test_a_wrong_sign_reads_what_the_page_says(small_machine, small_errors, prog
         assert abs(wrong - right) > 10 * MICROMETRE
 
 
+@pytest.mark.parametrize("name", ["siemens-cec", "siemens-cec-eec"])
+@pytest.mark.parametrize("mode", ["S1", "S3"])
+def test_one_position_tells_the_four_modes_of_products_apart(name, mode, small_machine, small_errors):
+    machine = small_machine.with_setting("siemens-cec", "mult_mode", mode)
+    tables = exported_tables(machine, small_errors, name)
+    program = check_program(machine, tables, small_errors)
+    assert len(program.position_mm) == 5
+    slips = {text[10:12]: item for text, *item in program.slips if text.startswith("mult_mode S")}
+    assert sorted(slips) == sorted({"S1", "S2", "S3", "S4"} - {mode})
+    (number,), (axis,) = ({item[k] for item in slips.values()} for k in (0, 1))
+    # each wrong reading by the control of that mode itself: the true machine with what it then adds
+    readings = {}
+    for other in ("S1", "S2", "S3", "S4"):
+        changed = small_machine.with_setting("siemens-cec", "mult_mode", other)
+        settings = tables.controller.read_settings(changed)
+        direction = np.tile([1.0, 1.0, -1.0], (5, 1))
+        added = tables.controller.emulate(
+            changed, settings, tables.tables, compgen.Points(program.position_mm, approach=direction)
+        )
+        tip = exact_error(small_machine, small_errors, program.position_mm + added) + added
+        readings[other] = (tip - tip[0])[number - 1, "XYZ".index(axis)]
+        if other != mode:
+            assert readings[other] == pytest.approx(slips[other][3], abs=0.1 * MICROMETRE)
+    assert slips["S2"][2] == pytest.approx(readings[mode], abs=0.1 * MICROMETRE)
+    assert np.min(np.diff(sorted(readings.values()))) > 5 * MICROMETRE
+
+
 PROGRAMS = [
     "etalon-exchange",
     "isg-csv",

@@ -214,6 +214,17 @@ class Controller(ABC, Generic[Settings, Tables]):
         """Return what of these errors the tables could hold but have no room for, in words with what stays in um."""
         return []
 
+    def reservations(self, machine: Machine, settings: Settings, tables: Tables) -> list[str]:
+        """Return what the verdict must say of tables that break no limit: what is inferred, missing or not known."""
+        return []
+
+    def other_readings(self, settings: Settings, tables: Tables) -> dict[str, Settings]:
+        """Return settings under which the control may read the same tables, by what it then does, in words.
+
+        Only where no document settles the reading: the check program gets a point that tells them apart.
+        """
+        return {}
+
     def usage(self, machine: Machine, settings: Settings, tables: Tables) -> list[Usage]:
         """Return how much of each limit of the control the tables use."""
         return []

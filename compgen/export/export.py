@@ -142,7 +142,8 @@ def export(
         rest = reversal.without(held)
         tables = control.with_reversal(machine, settings, tables, held) if held.curves else tables
     own = _with_backlash(control, machine, settings, control.context(machine, settings, tables), rest)
-    own = {**own, "warnings": [*own["warnings"], *control.left_out(machine, settings, errors), *machine.emphasis.notes]}
+    said = [*control.reservations(machine, settings, tables), *control.left_out(machine, settings, errors)]
+    own = {**own, "warnings": [*own["warnings"], *said, *machine.emphasis.notes]}
     own["warnings"] = [*own["warnings"], *advice_of_effects(machine)]
     common = export_context(machine, errors, controller, provenance or Provenance(), reversal)
     files = render_files(card, {**common, **own}, templates)

@@ -37,9 +37,9 @@ TOOL_LENGTHS_MM = (0.0, -100.0, -200.0)
 VARIANTS: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]] = {
     "siemens-cec": (("without products", {"products": False}), ("with products", {"products": True}))
 }
-#: Settings that the machine file must state for an export, and what a comparison may take instead: both signs leave
-#: the same residual.
-ASSUMED: Mapping[str, Mapping[str, Any]] = {"siemens-cec": {"sign": "error"}, "siemens-cec-eec": {"sign": "error"}}
+#: Settings that the machine file must state for an export, and what a comparison may take instead: in every mode the
+#: products leave the same residual.
+ASSUMED: Mapping[str, Mapping[str, Any]] = {"siemens-cec": {"mult_mode": "S1"}}
 
 
 @dataclass(frozen=True)
@@ -260,29 +260,34 @@ class _Variant:
     notes: tuple[str, ...]
 
 
-def _readable(machine: Machine, name: str) -> bool:
-    """Whether the machine file says all that a control must know."""
+def _settings(machine: Machine, name: str) -> Any:
+    """Settings of a control, or None if the machine file does not say all that it must know."""
     try:
-        controller_named(name).read_settings(machine)
+        return controller_named(name).read_settings(machine)
     except CompgenError:
-        return False
-    return True
+        return None
 
 
 def _variants(machine: Machine, name: str) -> list[_Variant]:
-    section = machine.controller_settings(name)
-    stated = dict(section.data)
-    assumed = {} if _readable(machine, name) else ASSUMED.get(name, {})
-    assumed = {key: value for key, value in assumed.items() if key not in stated}
-    notes = tuple(f"{key} is not stated in the machine file; {value!r} is taken here" for key, value in assumed.items())
+    given = _settings(machine, name)
     found = []
     for words, changes in VARIANTS.get(name, (("", {}),)):
-        data = {**stated, **assumed, **changes}
-        changed = tomlio.Section(data, path=section.path, text=section.text, name=section.name)
-        other = replace(machine, controllers={**machine.controllers, name: changed})
-        own = all(stated.get(key, True) == value for key, value in changes.items())  # each is true if not stated
-        found.append(_Variant(name, words, other, own, notes))
+        other, notes = _with_settings(machine, name, changes), tuple[str, ...]()
+        if _settings(other, name) is None:
+            stated = machine.controller_settings(name).data
+            assumed = {key: value for key, value in ASSUMED.get(name, {}).items() if key not in stated}
+            other = _with_settings(machine, name, {**assumed, **changes})
+            notes = tuple(f"{key} is not stated in the machine file; {assumed[key]!r} is taken here" for key in assumed)
+        own = given is not None and all(getattr(given, key) == value for key, value in changes.items())
+        found.append(_Variant(name, words, other, own or not changes, notes))
     return found
+
+
+def _with_settings(machine: Machine, name: str, changes: Mapping[str, Any]) -> Machine:
+    section = machine.controller_settings(name)
+    data = {**section.data, **changes}
+    changed = tomlio.Section(data, path=section.path, text=section.text, name=section.name)
+    return replace(machine, controllers={**machine.controllers, name: changed})
 
 
 def _control_result(

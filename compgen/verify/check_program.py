@@ -6,8 +6,9 @@ reading counts from the one at the first position, so that any displacement inst
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,8 @@ def check_program(
     way_mm = np.minimum(APPROACH_MM, APPROACH_SHARE * (machine.upper_mm - machine.lower_mm))
     candidates = _candidates(machine, way_mm)
     added = tables.correction(machine, _approached(candidates))
-    chosen = _choose(added)
+    others = _other_readings(machine, tables, candidates)
+    chosen = _choose(added, list(others.values()))
     position_mm, added_mm = candidates[chosen], added[chosen]
     lag = 0.0 if reversal is None else reversal.displacement(position_mm, _directions(position_mm))
     off = exact_error(machine, errors, position_mm) + lag
@@ -93,8 +95,39 @@ def check_program(
         off_mm=off_mm,
         on_mm=on_mm,
         separation_mm=min(float(np.max(np.abs(moved @ wrong.T - moved))) for wrong in signed_permutations()[1:]),
-        slips=tuple(_slip(name, wrong - moved, on_mm) for name, wrong in _wrong(moved)),
+        slips=(
+            *(_slip(name, wrong - moved, on_mm) for name, wrong in _wrong(moved)),
+            *_readings(moved, {name: part[chosen] - part[chosen[0]] for name, part in others.items()}, on_mm),
+        ),
     )
+
+
+def _other_readings(machine: Machine, tables: ReadTables, position_mm: FloatArray) -> dict[str, FloatArray]:
+    """What the same tables add at positions (n, 3) if the control reads them otherwise, by words, each (n, 3), mm."""
+    control = tables.controller
+    return {
+        words: np.asarray(control.emulate(machine, settings, tables.tables, _approached(position_mm)))
+        for words, settings in control.other_readings(tables.settings, tables.tables).items()
+    }
+
+
+def _apart(moved: Sequence[FloatArray]) -> FloatArray:
+    """Smallest difference between any two readings of the tables, each (n, 3): shape (n, 3), mm."""
+    return np.asarray(np.min([np.abs(a - b) for a, b in combinations(moved, 2)], axis=0))
+
+
+def _readings(
+    moved_mm: FloatArray, others_mm: Mapping[str, FloatArray], on_mm: FloatArray
+) -> list[tuple[str, int, str, float, float]]:
+    """Slips of the other readings, all at the position and axis that tell every two of them apart best."""
+    if not others_mm:
+        return []
+    place, axis = divmod(int(np.argmax(_apart([moved_mm, *others_mm.values()]))), 3)
+    right = float(on_mm[place, axis])
+    return [
+        (name, place + 1, AXES[axis], right, right + float(other[place, axis] - moved_mm[place, axis]))
+        for name, other in others_mm.items()
+    ]
 
 
 def _approached(position_mm: FloatArray) -> Points:
@@ -115,8 +148,12 @@ def _candidates(machine: Machine, way_mm: FloatArray) -> FloatArray:
     return np.round(np.vstack([first, grid]), 3)
 
 
-def _choose(added_mm: FloatArray) -> list[int]:
-    """Indices of five candidates: the first, the largest change of X, Y and Z, and the one that tells most apart."""
+def _choose(added_mm: FloatArray, others_mm: Sequence[FloatArray]) -> list[int]:
+    """Indices of five candidates: the first, the largest change of X, Y and Z, and the one that tells most apart.
+
+    The last one tells wrong permutations of the axes apart, and the other readings of the tables (n, 3) from each other,
+    as far as the first four do not.
+    """
     moved = added_mm - added_mm[0]
     chosen = [0]
     for axis in range(3):
@@ -127,6 +164,9 @@ def _choose(added_mm: FloatArray) -> list[int]:
     miss = np.max(np.abs(wrong - moved), axis=2)
     so_far = np.max(miss[:, chosen], axis=1)
     least = np.min(np.maximum(so_far[:, None], miss), axis=0)
+    if others_mm:
+        apart = np.max(_apart([moved, *(part - part[0] for part in others_mm)]), axis=1)
+        least = np.minimum(least, np.maximum(np.max(apart[chosen]), apart))
     score = least + 1e-6 * np.linalg.norm(moved, axis=1)
     score[chosen] = -1.0
     return [*chosen, int(np.argmax(score))]

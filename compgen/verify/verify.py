@@ -127,7 +127,8 @@ class Verification:
 
     ``reasons`` says why the tables are not accepted (empty: accepted). ``unrepresentable_um`` is the largest residual
     that the best table of this control leaves (a constant offset is left out if the control cannot hold one), and
-    ``uncorrected_um`` names the errors behind it with the largest displacement that stays.
+    ``uncorrected_um`` names the errors behind it with the largest displacement that stays. ``reservations`` are what the
+    control says of tables that break no limit: what is inferred, has no room, or is not known.
     """
 
     controller: str
@@ -140,6 +141,7 @@ class Verification:
     points: int
     files: tuple[tuple[str, str], ...]
     reasons: tuple[str, ...]
+    reservations: tuple[str, ...]
     safety: Safety = field(repr=False)
     position_mm: FloatArray = field(repr=False)
     error_before_mm: FloatArray = field(repr=False)
@@ -158,7 +160,7 @@ class Verification:
     @property
     def notes(self) -> tuple[str, ...]:
         """What else the user should know of accepted tables."""
-        notes = list(self.safety.warnings)
+        notes = [*self.reservations, *self.safety.warnings]
         if self.partial:
             share = 100.0 * self.after_rigid_removed.rms_um / max(self.before_rigid_removed.rms_um, 1e-12)
             notes.append(
@@ -247,6 +249,10 @@ def verify(
         points=len(where),
         files=tables.files,
         reasons=tuple(dict.fromkeys(reasons)),
+        reservations=(
+            *control.reservations(machine, tables.settings, tables.tables),
+            *control.left_out(machine, tables.settings, errors),
+        ),
         safety=safety,
         position_mm=where.position_mm,
         error_before_mm=before,

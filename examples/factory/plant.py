@@ -54,6 +54,7 @@ range_mm = [-240.0, 0.0]
 nodes = 4
 [controllers.siemens-cec]
 sign = "error"
+mult_mode = "S1"
 """
 
 JOB = """\

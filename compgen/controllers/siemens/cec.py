@@ -1,7 +1,7 @@
 """SINUMERIK cross-error compensation (CEC, sag): any axis corrected as a function of any axis, and products of tables.
 
 Source: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245-252, 264; 802D sl, p. 215-222.
-The sign of the sum is not settled by the readable documents and must be stated in the machine file.
+The sign of the sum is not in the readable documents; it is inferred, see ``templates/siemens-cec/format.toml``.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ import numpy as np
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controllers.grids import equidistant_grid
 from compgen.controllers.siemens.limits import cec_usage, largest_sums, set_violations, stated_limit_violations
-from compgen.controllers.siemens.preflight import cec_parameters, cec_sign_statement, cec_warnings
+from compgen.controllers.siemens.preflight import cec_parameters, cec_reservations, cec_sign_statement, cec_warnings
 from compgen.controllers.siemens.products import (
     MM_DECIMALS,
+    MODE_WORDS,
     NEGLIGIBLE_PRODUCT_MM,
     CecMap,
     CecTable,
@@ -29,7 +30,7 @@ from compgen.controllers.siemens.products import (
     term_names,
     written_decimals,
 )
-from compgen.controllers.siemens.ranking import Choice, chosen_terms, terms_of_tables
+from compgen.controllers.siemens.ranking import Choice, chosen_terms, terms_of_tables, without_products
 from compgen.controllers.siemens.reversal import backlash_rows, reversal_statement, with_reversal_tables
 from compgen.controllers.siemens.settings import CecSettings, take_cec_settings
 from compgen.controllers.siemens.syntax import (
@@ -87,7 +88,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
     bidirectional = True
 
     def read_settings(self, machine: Machine) -> CecSettings:
-        """Check the settings; ``sign`` is mandatory."""
+        """Check the settings; ``mult_mode`` is mandatory where products are stated."""
         section = machine.controller_settings(self.name)
         settings = take_cec_settings(section, machine)
         section.finish()
@@ -107,8 +108,14 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return terms_of_tables(machine, errors, terms, settings.mult_mode, choice, term_names(tables.tables))
 
     def left_out(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> list[str]:
-        """Return which tables the control has no room for, and what stays uncorrected for that, in words."""
-        return self._choice(machine, settings, errors).statements()
+        """Return which tables the control has no room for, which products are not written, and what stays for that."""
+        return self._choice(machine, settings, errors).statements() + unwritten_products(
+            machine, settings, errors, ALL_PAIRS
+        )
+
+    def reservations(self, machine: Machine, settings: CecSettings, tables: CecTables) -> list[str]:
+        """Return what was inferred (sign), left out (products), or is not known (number of tables)."""
+        return cec_reservations(tables.tables, settings)
 
     def _choice(self, machine: Machine, settings: CecSettings, errors: ErrorTable) -> Choice:
         terms = cec_terms(machine, settings, errors, ALL_PAIRS)
@@ -142,12 +149,13 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         mean_sums = largest_sums(machine, both, settings.mult_mode) if len(both) < len(tables.tables) else sums
         names, subtracts = settings.axis_names, settings.subtracts
         return {
-            "sign_statement": cec_sign_statement(names, subtracts, mean_sums)
+            "sign_statement": cec_sign_statement(names, subtracts, mean_sums, stated=settings.sign_stated)
             + reversal_statement(tables.tables, names),
             "parameters": cec_parameters(machine, names, tables.tables, settings.mult_mode, sums)
             + backlash_rows(tables.tables, names),
             "warnings": cec_warnings(machine, names, tables.tables, settings, sums),
             "sign": settings.sign,
+            "sign_stated": settings.sign_stated,
             "mult_mode": settings.mult_mode,
             "container": settings.container.kind,
             "program_enables": settings.container.enables,
@@ -197,6 +205,16 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         found = set_violations(machine, tables.tables, settings.max_points, settings.tables_available)
         return found + stated_limit_violations(machine, tables.tables, settings)
 
+    def other_readings(self, settings: CecSettings, tables: CecTables) -> dict[str, CecSettings]:
+        """Return the three other modes of products, where there are any."""
+        if not any(entry.multiplier for entry in tables.tables.values()):
+            return {}
+        return {
+            f"mult_mode {mode}: {words}": replace(settings, mult_mode=mode)
+            for mode, words in MODE_WORDS.items()
+            if mode != settings.mult_mode
+        }
+
     def table_nodes_mm(self, machine: Machine, settings: CecSettings, tables: CecTables) -> tuple[FloatArray, ...]:
         """Return the nodes of all tables by their input axis."""
         return nodes_by_axis((entry.input_axis, entry.table.nodes_mm) for entry in tables.tables.values())
@@ -233,6 +251,20 @@ def cec_terms(
     return ordinary + product_terms(machine, errors, nodes, origin)
 
 
+def unwritten_products(
+    machine: Machine,
+    settings: CecSettings,
+    errors: ErrorTable,
+    pairs: Sequence[tuple[int, int]],
+    beside: Sequence[Term] = (),
+) -> list[str]:
+    """Return what stays uncorrected because the settings allow no products, in words; nothing if they do."""
+    if settings.products:
+        return []
+    everything = cec_terms(machine, replace(settings, products=True), errors, pairs)
+    return without_products(machine, errors, everything, beside)
+
+
 def cec_tables_of(
     machine: Machine, settings: CecSettings, terms: Sequence[Term], values: Mapping[str, FloatArray]
 ) -> CecTables:
@@ -260,6 +292,16 @@ def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], se
     found = {
         index: _read_table(part, settings.axis_names, labels.get(index, "")) for index, part in sorted(parts.items())
     }
+    if not settings.mode_stated:
+        for index in (index for index, entry in found.items() if entry.multiplier):
+            raise (
+                parts[index]
+                .scalar("$AN_CEC_MULT_BY_TABLE")
+                .fail(
+                    "the file multiplies tables, and the machine file does not say what the control makes of that: state "
+                    'mult_mode = "S1", "S2", "S3" or "S4" in the section of the control'
+                )
+            )
     for (variable, index), item in switches.items():
         if variable == "SN_CEC_TABLE_ENABLE" and index in found:
             found[index] = replace(found[index], enabled=item.whole(0, 1) == 1)

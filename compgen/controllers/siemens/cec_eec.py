@@ -9,14 +9,21 @@ itself cancels the direct term of their factor and nothing else.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage
 from compgen.controllers.siemens.cec import VARIABLES as CEC_VARIABLES
-from compgen.controllers.siemens.cec import CecTables, SiemensCec, cec_tables_from, cec_tables_of, cec_terms
+from compgen.controllers.siemens.cec import (
+    CecTables,
+    SiemensCec,
+    cec_tables_from,
+    cec_tables_of,
+    cec_terms,
+    unwritten_products,
+)
 from compgen.controllers.siemens.eec import VARIABLES as EEC_VARIABLES
 from compgen.controllers.siemens.eec import EecTables, SiemensEec, eec_tables_from, eec_terms
 from compgen.controllers.siemens.products import MULT_MODES, term_names
@@ -64,7 +71,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
     _cec, _eec = SiemensCec(), SiemensEec()
 
     def read_settings(self, machine: Machine) -> CecEecSettings:
-        """Check the settings; ``sign`` is mandatory here or in ``[controllers.siemens-cec]``."""
+        """Check the settings, here and in the sections of both kinds of tables."""
         section = machine.controller_settings(self.name)
         for other in OTHER_SECTIONS:
             for key, value in machine.controller_settings(other).data.items():
@@ -89,8 +96,14 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         return _pitch(machine, settings, errors) + held
 
     def left_out(self, machine: Machine, settings: CecEecSettings, errors: ErrorTable) -> list[str]:
-        """Return which CEC tables the control has no room for, and what stays uncorrected for that, in words."""
-        return self._choice(machine, settings, errors).statements()
+        """Return which CEC tables the control has no room for, which products are not written, and what stays."""
+        pitch = _pitch(machine, settings, errors)
+        products = unwritten_products(machine, settings.cec, errors, _CROSS, pitch)
+        return self._choice(machine, settings, errors).statements() + products
+
+    def reservations(self, machine: Machine, settings: CecEecSettings, tables: CecEecTables) -> list[str]:
+        """Return what the verdict must say of the cross tables."""
+        return self._cec.reservations(machine, settings.cec, tables.cec)
 
     def _choice(self, machine: Machine, settings: CecEecSettings, errors: ErrorTable) -> Choice:
         terms = cec_terms(machine, settings.cec, errors, _CROSS)
@@ -148,6 +161,11 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
             *self._cec.violations(machine, settings.cec, tables.cec),
             *_double_positioning(settings, tables),
         ]
+
+    def other_readings(self, settings: CecEecSettings, tables: CecEecTables) -> dict[str, CecEecSettings]:
+        """Return the other modes of products of the cross tables."""
+        others = self._cec.other_readings(settings.cec, tables.cec)
+        return {words: replace(settings, cec=cec) for words, cec in others.items()}
 
     def table_nodes_mm(
         self, machine: Machine, settings: CecEecSettings, tables: CecEecTables

@@ -9,7 +9,13 @@ import numpy as np
 
 from compgen.controllers.siemens.limits import largest_slopes, speed_percent
 from compgen.controllers.siemens.products import CecMap, sum_into_axes
-from compgen.controllers.siemens.profiles import DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT, PROFILES
+from compgen.controllers.siemens.profiles import (
+    DEFAULT_MAX_SUM_MM,
+    DEFAULT_MAX_VELO_PERCENT,
+    FEWEST_AXES,
+    PROFILES,
+    USUAL,
+)
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 
@@ -18,6 +24,18 @@ Sums = Sequence[tuple[float, tuple[float, float, float]]]
 
 class CecLimits(Protocol):
     """The settings that decide which warnings are due."""
+
+    @property
+    def sign_stated(self) -> bool:
+        """Whether the machine file states the sign."""
+
+    @property
+    def mode_stated(self) -> bool:
+        """Whether the machine file states the reading of MULT_BY_TABLE."""
+
+    @property
+    def products(self) -> bool:
+        """Whether products are written."""
 
     @property
     def mult_mode(self) -> str:
@@ -44,8 +62,11 @@ class CecLimits(Protocol):
 NOTICEABLE_JUMP_MM = 5e-4
 
 
-def cec_sign_statement(names: Sequence[str], subtracts: bool, sums: Sums) -> str:
-    """Return the sign convention in words with the largest sum of the file as a worked number."""
+def cec_sign_statement(names: Sequence[str], subtracts: bool, sums: Sums, *, stated: bool) -> str:
+    """Return the sign convention in words with the largest sum of the file as a worked number.
+
+    ``stated`` is False where the machine file leaves the sign to what is inferred.
+    """
     output = max(range(3), key=lambda axis: abs(sums[axis][0]))
     value, place = sums[output]
     rule = (
@@ -53,6 +74,7 @@ def cec_sign_statement(names: Sequence[str], subtracts: bool, sums: Sums) -> str
         if subtracts
         else 'sign = "correction": the sum of the tables is the correction, the control ADDS it to the command.'
     )
+    rule += "" if stated else " This sign is inferred, not stated in the machine file: check it at the machine first."
     moved = -value if subtracts else value
     return (
         f"{rule} Values in mm. Here: at X {place[0]:.3f} Y {place[1]:.3f} Z {place[2]:.3f} mm the sum into "
@@ -111,14 +133,6 @@ def cec_warnings(machine: Machine, names: Sequence[str], tables: CecMap, limits:
                 f"{names[axis]}: the sum reaches {value:+.4f} mm; the usual MD32720 is {DEFAULT_MAX_SUM_MM:g} mm and "
                 "would clip it"
             )
-    small = PROFILES["828D"]
-    needed, nodes = max(tables) + 1, max(len(entry.table.values) for entry in tables.values())
-    if limits.tables_available is None and (needed > (small.cec_tables or 0) or nodes > (small.cec_nodes or 0)):
-        found.append(
-            f"{needed} tables with up to {nodes} nodes: a SINUMERIK 828D has {small.cec_tables} tables of "
-            f"{small.cec_nodes} nodes, an 840D sl twice as many tables as axes; state profile, and nc_axes or "
-            "tables_available"
-        )
     slopes = largest_slopes(machine, tables, limits.mult_mode)
     for axis in range(3):
         percent = speed_percent(slopes, axis, limits.max_speed_mm_min)
@@ -128,6 +142,31 @@ def cec_warnings(machine: Machine, names: Sequence[str], tables: CecMap, limits:
                 f"MD32730 is {DEFAULT_MAX_VELO_PERCENT:g} % and would make it lag behind"
             )
     return found + _jumps(machine, names, tables, limits.mult_mode)
+
+
+def cec_reservations(tables: CecMap, limits: CecLimits) -> list[str]:
+    """Return what the verdict must say: an inferred sign, products that are missing, a number of tables not known."""
+    found = []
+    if not limits.sign_stated:
+        found.append(
+            'sign = "error" (the control subtracts the tables) is inferred from two traces, not stated in the machine file '
+            "nor by the vendor: do the dial-gauge check of preflight.md first, then state sign"
+        )
+    if not limits.products and not limits.mode_stated:
+        found.append(
+            "mult_mode is not stated: what the control makes of two multiplied tables is not known, so none are multiplied "
+            "and angular errors stay. Find it with the test of preflight.md and state it, or write products = false"
+        )
+    small, usual = PROFILES["828D"], PROFILES[USUAL]
+    needed, nodes = max(tables) + 1, max(len(entry.table.values) for entry in tables.values())
+    sure = usual.tables_per_axis * FEWEST_AXES
+    if limits.tables_available is None and (needed > sure or nodes > (small.cec_nodes or 0)):
+        found.append(
+            f"these are {needed} tables with up to {nodes} nodes, and how many the control has is not stated: an 840D sl "
+            f"has two for each of its axes ({sure} with {FEWEST_AXES}), an 828D {small.cec_tables} of {small.cec_nodes} "
+            "nodes; what has no room does not act. State nc_axes or tables_available"
+        )
+    return found
 
 
 def _jumps(machine: Machine, names: Sequence[str], tables: CecMap, mode: str) -> list[str]:

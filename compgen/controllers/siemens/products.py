@@ -35,6 +35,13 @@ MULT_MODES: dict[str, tuple[bool, bool]] = {
     "S3": (True, False),  # A + A B
     "S4": (False, True),  # B + A B
 }
+#: The same in words.
+MODE_WORDS = {
+    "S1": "both factors of a product also act directly",
+    "S2": "factors of a product do not act directly",
+    "S3": "the multiplier of a product does not act directly",
+    "S4": "only the multiplier of a product acts directly",
+}
 #: Decimals of tables in mm, and of the factors of a product and the tables that hold their folds.
 MM_DECIMALS, FACTOR_DECIMALS = 6, 9
 #: Angles below this are no angles, and products that stay below half of the last decimal in mm are no products.

@@ -39,6 +39,8 @@ PROFILES = {
     "808D": Profile(None, None, eec_nodes=200),
     "802D sl": Profile(2, 350, eec_nodes=200, eec_nodes_documented=False),
 }
+#: Axes that a control of a machine with X, Y and Z has at least.
+FEWEST_AXES = 3
 #: What counts where the machine file names no model.
 USUAL = "840D sl"
 #: Defaults of MD32720 (mm) and MD32730 (%) as far as they are known, the same for all models.
@@ -57,7 +59,7 @@ def take_profile(section: tomlio.Section) -> Profile:
 
 def take_cec_capacity(section: tomlio.Section, profile: Profile) -> tuple[int, int | None]:
     """Take ``max_points`` and ``tables_available`` (None: not known); what is stated overrides the profile."""
-    own_axes = section.take("nc_axes", tomlio.whole(3, 93), None)
+    own_axes = section.take("nc_axes", tomlio.whole(FEWEST_AXES, 93), None)
     tables = profile.cec_tables
     if profile.tables_per_axis and own_axes is not None:
         tables = profile.tables_per_axis * own_axes

@@ -61,14 +61,9 @@ class Choice:
         """Say what is left out, largest first; nothing if everything has room."""
         if not self.dropped:
             return []
-        named = [
-            f"{name} ({size / MM_PER_UM:.2f} um rms)"
-            for name, size in sorted(self.dropped, key=lambda item: -item[1])
-            if size >= _NAMED_FROM_MM
-        ]
         return [
             f"{self.wanted} tables would be needed, {self.allowed} may be used: not corrected are "
-            f"{', '.join(named) or 'tables of less than 0.01 um'}; together they leave "
+            f"{_named(self.dropped) or 'tables of less than 0.01 um'}; together they leave "
             f"{self.left_mm / MM_PER_UM:.2f} um rms over the volume (first order)"
         ]
 
@@ -118,6 +113,36 @@ def chosen_terms(
     dropped = [item for gain, part in zip(gains, picked, strict=True) for item in gain.missed(part)]
     return Choice(
         kept, tuple(dropped), table_count(kept, mode), allowed, wanted, float(np.sqrt(max(left, 0.0))), tuple(beside)
+    )
+
+
+def without_products(
+    machine: Machine, errors: ErrorTable, terms: Sequence[Term], beside: Sequence[Term] = ()
+) -> list[str]:
+    """Say what stays uncorrected because no products are written: their names, and the rms over the volume.
+
+    ``terms`` are the ordinary ones and the products, ``beside`` as in :func:`chosen_terms`. Nothing if it is nothing.
+    """
+    ordinary = [term for term in terms if term.carrier[0].lever is None]
+    gains = [_Gains.of(machine, errors, terms, beside, output) for output in range(3)]
+    own = [[term for term in gain.terms if term in ordinary] for gain in gains]
+    left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, own, strict=True))
+    missed = [item for gain, part in zip(gains, own, strict=True) for item in gain.missed(part)]
+    named = _named(missed)
+    if not named:
+        return []
+    return [
+        f"no products of tables are written: not corrected are {named}; together they leave "
+        f"{np.sqrt(max(left, 0.0)) / MM_PER_UM:.2f} um rms over the volume (first order)"
+    ]
+
+
+def _named(missed: Sequence[tuple[str, float]]) -> str:
+    """Names with their rms in um, the largest first; what is below 0.01 um is left out."""
+    return ", ".join(
+        f"{name} ({size / MM_PER_UM:.2f} um rms)"
+        for name, size in sorted(missed, key=lambda item: -item[1])
+        if size >= _NAMED_FROM_MM
     )
 
 

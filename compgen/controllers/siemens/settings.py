@@ -16,10 +16,13 @@ from compgen.core.machine import Machine
 from compgen.core.names import AXES
 
 _NAME = re.compile(r"[A-Z_][A-Z0-9_]{0,31}")
-_SIGN_MISSING = (
-    "is missing. Siemens' readable documents do not say whether the control adds or subtracts the sum of the tables: "
-    'test it at the machine (one table, both nodes 0.05: the axis moves by -0.05 for "error", by +0.05 for '
-    '"correction") and write sign = "error" or sign = "correction"'
+#: No sentence of the vendor gives the sign; two independent traces lead to this one (``preflight.SIGN_TRACES``).
+INFERRED_SIGN = "error"
+_MODE_MISSING = (
+    "is missing. With products = true the file multiplies tables, and no readable document says what the two factors do "
+    "by themselves: a file made for another mode than that of the control leaves several times the error. Do the test "
+    'with constants of the preflight list (sum 0.56: "S1", 0.06: "S2", 0.26: "S3", 0.36: "S4") and write e.g. '
+    'mult_mode = "S1", or write products = false'
 )
 Encoders = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
@@ -45,7 +48,9 @@ class CecSettings:
     Parameters
     ----------
     sign : ``"error"`` (the control subtracts the sum) or ``"correction"`` (it adds it).
+    sign_stated : False where the machine file does not say it and the inferred one is taken.
     mult_mode : S1 to S4, see :mod:`compgen.controllers.siemens.products`.
+    mode_stated : False where the machine file does not say it: then no file with products is written or read.
     products : whether angular errors are exported as products of tables.
     axis_names : names of X, Y, Z on the control.
     axis_style : ``"paren"`` writes (AX1), ``"quote"`` writes "AX1".
@@ -61,7 +66,9 @@ class CecSettings:
     """
 
     sign: str
+    sign_stated: bool
     mult_mode: str
+    mode_stated: bool
     products: bool
     axis_names: tuple[str, str, str]
     axis_style: str
@@ -115,15 +122,21 @@ class EecSettings:
 
 
 def take_cec_settings(section: tomlio.Section, machine: Machine) -> CecSettings:
-    """Take the settings of CEC tables from a section; ``sign`` is mandatory."""
-    if "sign" not in section:
-        section.take("sign", tomlio.choice("error", "correction"), None)
-        raise section.fail("sign", _SIGN_MISSING)
+    """Take the settings of CEC tables from a section; ``mult_mode`` is mandatory where ``products = true`` is stated.
+
+    Without ``mult_mode`` and ``products`` no products are written: a wrong mode is worse than a wrong sign.
+    """
+    mode = section.take("mult_mode", tomlio.choice(*MULT_MODES), None)
+    products = section.take("products", tomlio.flag, mode is not None)
+    if products and mode is None:
+        raise section.fail("mult_mode", _MODE_MISSING)
     max_points, tables_available = take_cec_capacity(section, take_profile(section))
     return CecSettings(
-        sign=section.take("sign", tomlio.choice("error", "correction")),
-        mult_mode=section.take("mult_mode", tomlio.choice(*MULT_MODES), "S1"),
-        products=section.take("products", tomlio.flag, True),
+        sign=section.take("sign", tomlio.choice("error", "correction"), INFERRED_SIGN),
+        sign_stated="sign" in section,
+        mult_mode=mode or next(iter(MULT_MODES)),
+        mode_stated=mode is not None,
+        products=products,
         axis_names=take_axis_names(section),
         axis_style=section.take("axis_style", tomlio.choice("paren", "quote"), "paren"),
         step_mm=take_steps(section, machine, max_points),
