@@ -151,8 +151,11 @@ def read_command(
     write_file(out, format_points(where, columns, {"machine": machine.name, "controller": controller}))
     figures = residuals(correction_mm)
     if as_json:
-        print_json({"points": len(where), "controller": controller, **figures.as_dict(), "file": str(out)})
+        said = {"controller": controller, "remarks": list(parsed.remarks)}
+        print_json({"points": len(where), **said, **figures.as_dict(), "file": str(out)})
     else:
+        for remark in parsed.remarks:
+            stdout.print(remark, markup=False, soft_wrap=True)
         text = f"{len(where)} points: correction max {figures.max_um:.2f} um, rms {figures.rms_um:.2f} um -> {out}"
         stdout.print(text, markup=False, soft_wrap=True)
     return 0

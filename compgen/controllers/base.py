@@ -181,6 +181,14 @@ class Controller(ABC, Generic[Settings, Tables]):
         """Return where files that are not needed to read the tables (a plan for their transfer) say something else."""
         return []
 
+    def remarks(self, machine: Machine, settings: Settings, tables: Tables, files: Sequence[SourceFile]) -> list[str]:
+        """Return what reading these files assumed, passed over, or kept apart (tables of other axes), in words.
+
+        For a person who reads the backup of a control. Lines that could change a table and are not understood are not
+        a remark: ``parse`` refuses them.
+        """
+        return []
+
     @abstractmethod
     def resolution_mm(self, settings: Settings) -> float:
         """Return the largest correction error that rounding to the format's quantum may cause on one axis, mm."""

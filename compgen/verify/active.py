@@ -11,6 +11,7 @@ with the exact error e; this is solved for P by least squares over the volume, r
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from compgen.core.lengths import Lengths
 from compgen.core.machine import Axis, Machine
 from compgen.core.names import MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.core.points import Points
-from compgen.errors import ConvergenceError, InputError
+from compgen.errors import CompgenWarning, ConvergenceError, InputError
 from compgen.export.synthesis import Projector, projector
 from compgen.identify.travel import check_travel
 from compgen.model.exact import exact_error
@@ -77,13 +78,20 @@ class ActiveTables:
         return {
             "controller": self.controller,
             "files": [{"name": name, "sha256": digest} for name, digest in self.tables.files],
+            "remarks": list(self.tables.remarks),
             "largest_correction_um": float(np.max(np.abs(self.correction(machine, points)))) / MM_PER_UM,
         }
 
 
 def read_active(machine: Machine, paths: Sequence[str | Path], controller: str) -> ActiveTables:
-    """Parse tables that were active while the machine was measured; InputError as :func:`read_tables` has it."""
-    return ActiveTables(read_tables(machine, paths, controller), tuple(Path(path) for path in paths))
+    """Parse tables that were active while the machine was measured; InputError as :func:`read_tables` has it.
+
+    What reading assumed or kept apart is a CompgenWarning: the file of a control holds more than these tables.
+    """
+    tables = read_tables(machine, paths, controller)
+    for text in tables.remarks:
+        warnings.warn(text, CompgenWarning, stacklevel=2)
+    return ActiveTables(tables, tuple(Path(path) for path in paths))
 
 
 def without_active(

@@ -40,7 +40,8 @@ PARTIAL_SHARE = 0.1
 class ReadTables:
     """Controller tables as they were parsed from text, with the control that understands them.
 
-    ``files`` are names and SHA-256; ``contradictions`` say where a plan beside the tables holds other numbers.
+    ``files`` are names and SHA-256; ``contradictions`` say where a plan beside the tables holds other numbers;
+    ``remarks`` say what reading assumed, passed over and kept apart.
     """
 
     controller: AnyController
@@ -48,6 +49,7 @@ class ReadTables:
     tables: Any
     files: tuple[tuple[str, str], ...]
     contradictions: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def correction(self, machine: Machine, points: Points) -> FloatArray:
         """Return what the control adds to the command at each point, shape (n, 3), mm."""
@@ -93,7 +95,8 @@ def read_tables(machine: Machine, paths: Sequence[str | Path] | str | Path, cont
     tables = control.parse(machine, settings, sources)
     others = tuple(control.contradictions(machine, settings, tables, sources))
     hashes = tuple((path.name, sha256_of(content)) for path, content in contents)
-    return ReadTables(control, settings, tables, hashes, others)
+    remarks = tuple(control.remarks(machine, settings, tables, sources))
+    return ReadTables(control, settings, tables, hashes, others, remarks)
 
 
 def _read_limited(path: Path) -> bytes:
