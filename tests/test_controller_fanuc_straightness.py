@@ -212,18 +212,100 @@ def test_every_style_of_the_sample_means_the_same(name):
     assert parse(machine, text) == parse(machine, SAMPLE)
 
 
+def punched(path, *rows):
+    path.write_bytes("\r\n".join(["%", *rows, "%", ""]).encode("ascii"))
+    return str(path)
+
+
 def test_a_sample_of_the_users_control_is_followed(tmp_path, small_machine, small_errors):
-    path = tmp_path / "PUNCH.TXT"
-    path.write_bytes(b"%\r\nN3620 Q1 A1 P40\r\nN3624 Q1 A1 P50.000\r\nN10040 Q0 P1\r\n%\r\n")
-    machine = small_machine.with_setting("fanuc-straightness", "style_from", str(path))
+    """The points of X, Y and Z are those that stored pitch error compensation has, not others: these would shift it."""
+    rows = ["N3620 Q1 A1 P90 A2 P200 A3 P400", "N3621 Q1 A1 P1 A2 P160 A3 P320", "N3622 Q1 A1 P133 A2 P240 A3 P416"]
+    path = punched(tmp_path / "PUNCH.TXT", *rows, "N3624 Q1 A1 P6.000 A2 P5.000 A3 P2.500", "N10040 Q0 P1")
+    machine = small_machine.with_setting("fanuc-straightness", "style_from", path)
     made = export(machine, small_errors, "fanuc-straightness", allow_unverified=True)
     text = made.files["STRAIGHT.TXT"]
-    assert re.search(r"(?m)^N5711 Q1 P1\r$", text) and re.search(
-        r"(?m)^N3624 Q1 A1 P5\.000 A2 P4\.000 A3 P2\.400\r$", text
-    )
-    plain = export(small_machine, small_errors, "fanuc-straightness", allow_unverified=True)
-    assert parse(machine, text) == parse(small_machine, plain.files["STRAIGHT.TXT"])
+    assert text.split("\r\n")[1:5] == [*rows, "N3624 Q1 A1 P6.000 A2 P5.000 A3 P2.500"]
+    assert re.search(r"(?m)^N5711 Q1 P1\r$", text)
     assert "What was inferred from the sample" in made.preflight
+    assert made.violations == []
+
+
+PATHS = ["N05711Q1L1P{}L2P0L3P2", "N05712Q1L1P4L2P0L3P0", "N05722Q1L1P2L2P0L3P0", "N05713Q1L1P0L2P1L3P0"]
+GRIDS = [
+    "N03620Q1A1P90A2P200A3P400A4P500",
+    "N03621Q1A1P1A2P160A3P320A4P501",
+    "N03622Q1A1P133A2P240A3P416A4P512",
+    "N03624Q1A1P6.0A2P5.0A3P2.5A4P30.0",
+]
+
+
+def test_parameters_of_a_path_have_the_word_L_of_the_sample_and_entries_of_other_axes_stay(
+    tmp_path, small_machine, small_errors
+):
+    """The rotary axis A4 moves Y in the second entry: written are the first and the third one, of path 1 alone."""
+    path = punched(tmp_path / "PUNCH.TXT", *GRIDS, *(row.format(0) for row in PATHS), "N05723Q1L1P0L2P1L3P0")
+    machine = small_machine.with_setting("fanuc-straightness", "style_from", path)
+    made = export(machine, small_errors, "fanuc-straightness", allow_unverified=True)
+    text = made.files["STRAIGHT.TXT"]
+    assert re.search(r"(?m)^N05711Q1L1P[123]\r$", text) and re.search(r"(?m)^N05713Q1L1P[123]\r$", text)
+    assert not re.search(r"(?m)^N0(5712|5722|574\d|577\d)", text)
+    assert not re.search(r"L[23]", text)
+    assert len(parse(machine, text).entries) == 2
+    assert "Of other axes: nothing; entry 2 (A4 moves, 5722 = 2) stays" in made.preflight
+    other = parse(machine.with_setting("fanuc-straightness", "path", 2), text.replace("L1P", "L1P9L2P"))
+    assert other == parse(machine, text)
+
+
+def test_an_entry_that_is_no_longer_used_is_switched_off(tmp_path, small_machine, small_errors):
+    path = punched(tmp_path / "PUNCH.TXT", *GRIDS, "N05713Q1P2", "N05723Q1P3")
+    machine = small_machine.with_setting("fanuc-straightness", "style_from", path)
+    made = export(
+        machine.with_setting("fanuc-straightness", "pairs", ["Y(x)"]),
+        small_errors,
+        "fanuc-straightness",
+        allow_unverified=True,
+    )
+    assert "N05713Q1P0" in made.files["STRAIGHT.TXT"].split()
+
+
+def test_points_that_differ_from_the_sample_are_refused(tmp_path, small_machine):
+    path = punched(tmp_path / "PUNCH.TXT", *GRIDS)
+    machine = small_machine.with_setting("fanuc-straightness", "style_from", path)
+    other = {"X": {"reference": 90, "first": 1, "last": 133, "interval_mm": 5.0}}
+    with pytest.raises(InputError, match="3624 = 6.0 there; other values would shift its pitch table"):
+        CONTROL.read_settings(machine.with_setting("fanuc-straightness", "points", other))
+    same = {"X": {"reference": 90, "first": 1, "last": 133, "interval_mm": 6.0}}
+    assert CONTROL.read_settings(machine.with_setting("fanuc-straightness", "points", same)).grids[0].reference == 90
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ([*GRIDS[:3], "N03624Q1A1P0.0A2P0.0A3P0.0A4P30.0"], "a moving axis needs compensation points"),
+        ([*GRIDS, *(f"N0571{k}Q1P4" for k in (1, 2, 3))], "entries of other axes are never overwritten"),
+        ([*GRIDS[:2], "N03622Q1A1P133A2P240A3P501A4P512", GRIDS[3]], "axis A4 uses the compensation points 500 to 512"),
+        (["N01001Q1P00000001", *GRIDS], "an inch machine"),
+    ],
+)
+def test_a_sample_that_leaves_no_room_is_refused(tmp_path, small_machine, small_errors, rows, words):
+    machine = small_machine.with_setting("fanuc-straightness", "style_from", punched(tmp_path / "P.TXT", *rows))
+    with pytest.raises(InputError, match=words):
+        export(machine, small_errors, "fanuc-straightness", allow_unverified=True)
+
+
+def test_reading_says_what_was_assumed_kept_apart_and_passed_over():
+    machine = machine_of()
+    tables = parse(machine, SAMPLE.replace("%\nN03620", "%\nN00010P00000001\nN05712P7\nN05722P1\nN03620"))
+    with pytest.raises(InputError, match="parameter 5741"):  # an entry that is cut
+        parse(machine, SAMPLE.replace("N05711", "N05712P1\nN05722P1\nN05711"))
+    said = CONTROL.remarks(machine, CONTROL.read_settings(machine), tables, [])
+    assert "taken to be metric" in said[0] and "axis 7 is none of X, Y, Z" in said[1]
+    assert said[2] == "passed over: 1 record that cannot change a straightness table"
+    with pytest.raises(InputError, match="a fourth moving axis") as caught:
+        parse(machine, SAMPLE.replace("N05711", "N05714P1\nN05711"))
+    assert caught.value.line == 6
+    with pytest.raises(InputError, match="an inch machine"):
+        parse(machine, SAMPLE.replace("N03620", "N01001P00000001\nN03620", 1))
 
 
 MALFORMED = [

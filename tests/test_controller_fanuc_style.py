@@ -18,9 +18,11 @@ from compgen.controllers.fanuc.sample import style_of
 from compgen.controllers.fanuc.style import FanucStyle
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Axis, Chain, Machine
+from compgen.core.points import Points
 from compgen.errors import InputError
 from compgen.export import export
 from compgen.export.render import load_format, render_files
+from compgen.verify import read_tables
 
 SAMPLE = (Path(__file__).parent / "golden" / "fanuc-pitch" / "PITCH.TXT").read_text()
 CURVE_MM = np.array([0, 2, 3, 4, 2, 2, 1, 1, 0, 2, 3, 3, 2, 1, -1, -1, 0, 2]) * 1e-3
@@ -119,8 +121,9 @@ def test_what_the_user_states_stands_before_what_the_sample_shows(tmp_path):
 
 
 def test_one_record_per_axis_is_followed_and_told_in_preflight(tmp_path, small_machine, small_errors):
+    """The sample is of a control without tables, so that no points are kept."""
     path = tmp_path / "PUNCH.TXT"
-    rows = [f"N0{n}A{a}P{v}" for n, v in ((3620, 5), (3621, 5), (3622, 6), (3623, 1), (3624, "20.0")) for a in (1, 2)]
+    rows = [f"N0{n}A{a}P{v}" for n, v in ((3620, 0), (3621, 0), (3622, 0), (3623, 0), (3624, "0.0")) for a in (1, 2)]
     path.write_text("\n".join(["%", *rows, "N10005P1", "N10006P-1", "%", ""]))
     made = export(small_machine.with_setting("fanuc-pitch", "style_from", str(path)), small_errors, "fanuc-pitch")
     text = made.files["PITCH.TXT"]
@@ -135,6 +138,141 @@ def test_what_a_sample_does_not_show_is_said():
     assert any("no parameter 3624" in note and "NOT confirmed" in note for note in notes)
     _, notes = style_of(SourceFile(Path("p"), "%\nN03620A1P40\nN03624A1P50.0\n%\n"))
     assert any("no compensation point" in note and "NOT confirmed" in note for note in notes)
+
+
+# --- points and parameters of the control ---------------------------------------------------------------------------
+
+#: A control with five axes: X, Y, Z and a rotary axis A4 have points, A5 has none. Reference point of the machine: 0.
+PARAMETERS = """%
+N01001Q1L1P00000000L2P00000000
+N03605Q1A1P00000010A2P00000010A3P00000010A4P00000010A5P00000000
+N03620Q1A1P40A2P140A3P240A4P300A5P0
+N03621Q1A1P32A2P131A3P231A4P301A5P0
+N03622Q1A1P49A2P145A3P245A4P312A5P0
+N03623Q1A1P10A2P10A3P8A4P1A5P0
+N03624Q1A1P50.0A2P40.0A3P25.0A4P30.0A5P0.0
+N03625Q1A1P0.0A2P0.0A3P0.0A4P360.0A5P0.0
+N10900Q1P3
+%
+"""
+POINTS = "\n".join(["%", *(f"N{10000 + k}Q0P{3 if k == 310 else -3 if k == 311 else 0}" for k in range(400)), "%", ""])
+
+
+@pytest.fixture
+def controls_files(tmp_path):
+    """Parameters and pitch data as the control keeps them: in two files."""
+    (tmp_path / "CNC-PARA.TXT").write_text(PARAMETERS)
+    (tmp_path / "PITCH.TXT").write_text(POINTS)
+    return [str(tmp_path / "CNC-PARA.TXT"), str(tmp_path / "PITCH.TXT")]
+
+
+def controls_machine(files, **options):
+    axes = tuple(Axis(r, np.linspace(*r, 5)) for r in ((-400.0, 450.0), (-400.0, 200.0), (-225.0, 125.0)))
+    machine = Machine("m", Chain("WXYFZT"), axes)
+    for key, value in {"style_from": files, "detection_unit_um": 0.1, **options}.items():
+        machine = machine.with_setting("fanuc-pitch", key, value)
+    return machine
+
+
+def test_points_and_magnification_of_the_sample_are_kept(controls_files, make_errors):
+    """3620 to 3624 are those of the sample, and no point of the rotary axis A4 (300 to 312) is written."""
+    machine = controls_machine(controls_files)
+    made = export(machine, make_errors(machine), "fanuc-pitch")
+    assert made.violations == []
+    rows = made.files["PITCHPRM.TXT"].split("\n")
+    assert rows[1:6] == [
+        "N03620Q1A1P40A2P140A3P240",
+        "N03621Q1A1P32A2P131A3P231",
+        "N03622Q1A1P49A2P145A3P245",
+        "N03623Q1A1P10A2P10A3P8",
+        "N03624Q1A1P50.0A2P40.0A3P25.0",
+    ]
+    written = [int(row[3:6]) for row in made.files["PITCH.TXT"].split("\n")[1:-2]]
+    assert written == [*range(32, 50), *range(131, 146), *range(231, 246)]
+    assert "Of other axes: nothing. The sample has A4: points 300 to 312; they stay." in made.preflight
+    assert "3605" in made.preflight and "X 00000010, Y 00000010, Z 00000010" in made.preflight
+
+
+def test_both_files_are_read_back_as_they_act(controls_files, make_errors, tmp_path):
+    """One count of X is 10 x 0.1 um, of Z 8 x 0.1 um."""
+    machine = controls_machine(controls_files)
+    errors = make_errors(machine)
+    made = export(machine, errors, "fanuc-pitch")
+    paths = made.write(tmp_path / "out")
+    tables = read_tables(machine, paths, "fanuc-pitch")
+    found = tables.correction(machine, Points(np.array([[450.0, 200.0, 125.0], [0.0, 0.0, 0.0]])))
+    sums = [sum(block.values[start:]) for block, start in zip(tables.tables.blocks, (9, 10, 10), strict=True)]
+    np.testing.assert_allclose(found[0] * 1e3, np.array(sums) * [1.0, 1.0, 0.8], atol=1e-9)
+    assert not found[1].any()
+    backup = read_tables(machine, controls_files, "fanuc-pitch")
+    assert backup.tables.others == ((4, 301, 312),)
+    assert any("axis A4 (not X, Y or Z of the machine file)" in text for text in backup.remarks)
+    assert backup.remarks[0].startswith("unit: the machine is metric by 1001#0")
+    assert backup.remarks[-1] == "passed over: 1 record that cannot change a pitch table"
+
+
+def test_new_points_avoid_those_of_every_axis_of_the_sample(controls_files, make_errors):
+    """The user wants other sections of X: they may not meet those of Y, Z and A4, and not their own old ones."""
+    machine = controls_machine(controls_files, interval_mm={"X": 5.0})
+    made = export(machine, make_errors(machine), "fanuc-pitch")
+    numbers = [int(row[1:6]) - 10000 for row in made.files["PITCH.TXT"].split("\n")[1:-2]]
+    assert numbers == [*range(131, 146), *range(231, 246), *range(313, 313 + 170)]
+    assert "3620 = 392 (sample: 40)" in made.preflight
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"first_numbers": {"Z": 290}}, "A4 uses the compensation points 300 to 312; the points 290 to .* of Z"),
+        ({"first_numbers": {"X": 120}, "interval_mm": {"X": 50.0}}, "axis A2 uses the compensation points 131 to 145"),
+    ],
+)
+def test_points_that_meet_those_of_another_axis_are_refused(controls_files, make_errors, options, words):
+    machine = controls_machine(controls_files, **options)
+    with pytest.raises(InputError, match=words) as caught:
+        export(machine, make_errors(machine), "fanuc-pitch")
+    assert (caught.value.file.name, caught.value.line) == ("CNC-PARA.TXT", 5)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("N03605Q1A1P00000010", "N03605Q1A1P00000011", "a table for each direction of travel"),
+        ("N01001Q1L1P00000000", "N01001Q1L1P00000001", "an inch machine"),
+        ("A4P301A5P0\n", "A4P242A5P0\n", "axis A4 uses the compensation points 242 to 312"),
+        ("N03620Q1A1P40", "N03620Q1A1P55", "cannot be kept"),
+    ],
+)
+def test_a_control_that_the_files_would_not_suit_is_refused(controls_files, make_errors, before, after, words):
+    path = Path(controls_files[0])
+    assert before in PARAMETERS
+    path.write_text(PARAMETERS.replace(before, after))
+    machine = controls_machine(controls_files)
+    with pytest.raises(InputError, match=words):
+        export(machine, make_errors(machine), "fanuc-pitch")
+
+
+def test_reading_asks_where_the_file_has_a_table_of_each_direction(controls_files):
+    Path(controls_files[0]).write_text(PARAMETERS.replace("N03605Q1A1P00000010", "N03605Q1A1P00000011"))
+    machine = controls_machine(controls_files)
+    machine.controllers["fanuc-pitch"].data.pop("style_from")
+    with pytest.raises(InputError, match="set bidirectional = true"):
+        read_tables(machine, controls_files, "fanuc-pitch")
+
+
+def test_without_files_of_the_control_preflight_says_that_other_axes_are_not_known(small_machine, small_errors):
+    made = export(small_machine, small_errors, "fanuc-pitch")
+    first = made.preflight.split("## What the files overwrite")[1].strip().split("\n")[0]
+    assert first.startswith("- Of other axes: NOT KNOWN") and "PITCHPRM.TXT" not in made.files
+    assert "metric only: on an inch machine" in made.preflight
+
+
+def test_blanks_that_fill_up_a_record_are_followed(tmp_path):
+    text = SAMPLE.replace("N10036P-2", "N10036P-2 ")
+    text = "\n".join(row if len(row) % 2 == 0 or row == "%" else row.rstrip() + " " for row in text.split("\n"))
+    path = tmp_path / "PUNCH.TXT"
+    path.write_text(text)
+    assert written(sample_machine(style_from=str(path)))[0] == text
 
 
 MALFORMED = [

@@ -37,6 +37,16 @@ def test_a_sample_reaches_only_the_controls_that_take_it(machine, tmp_path, monk
     assert "style_from" not in machine.controller_settings("siemens-eec")
 
 
+def test_several_samples_reach_the_control_together(machine, tmp_path):
+    paths = [tmp_path / "CNC-PARA.TXT", tmp_path / "PITCH.TXT"]
+    for path in paths:
+        path.write_text("%\n%\n")
+    changed = with_samples(machine, ["fanuc-pitch"], {"style_from": tuple(paths)})
+    assert changed.controller_settings("fanuc-pitch").files("style_from") == tuple(paths)
+    with pytest.raises(InputError, match="a list of paths"):
+        machine.with_setting("fanuc-pitch", "style_from", 3).controller_settings("fanuc-pitch").files("style_from")
+
+
 def test_a_sample_in_the_machine_file_is_looked_up_beside_it(machine, tmp_path):
     section = machine.with_setting("siemens-eec", "style_from", "no-such-file.txt").controller_settings("siemens-eec")
     section.path = tmp_path / "machine.toml"

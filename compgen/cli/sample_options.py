@@ -15,7 +15,8 @@ from compgen.core.machine import Machine
 from compgen.errors import InputError
 
 HELP = {
-    "style_from": "A file punched from your own control; the export follows its style (digits, words, line ends).",
+    "style_from": "A file of your own control (may be given several times, e.g. parameters and pitch data): the export follows "
+    "its style, and keeps the points and parameters that it shows, those of other axes above all.",
     "template_from": "An empty table saved on your own control; the export fills in its values.",
 }
 
@@ -28,7 +29,7 @@ def sample_options(command: Command) -> Command:
         *args: Any,
         machine: Machine,
         controller: str | tuple[str, ...],
-        style_from: Path | None,
+        style_from: tuple[Path, ...],
         template_from: Path | None,
         **options: Any,
     ) -> Any:
@@ -38,26 +39,32 @@ def sample_options(command: Command) -> Command:
 
     result: Any = wrapper
     for key, text in HELP.items():
-        flag = "--" + key.replace("_", "-")
-        result = click.option(flag, key, metavar="FILE", type=click.Path(path_type=Path), help=text)(result)
+        flag, several = "--" + key.replace("_", "-"), key == "style_from"
+        kind = click.Path(path_type=Path)
+        result = click.option(flag, key, metavar="FILE", type=kind, multiple=several, help=text)(result)
     return result  # type: ignore[no-any-return]
 
 
-def with_samples(machine: Machine, controllers: Sequence[str], samples: Mapping[str, Path | None]) -> Machine:
-    """Return the machine with each sample file in the settings of the chosen controls that take it.
+def with_samples(
+    machine: Machine, controllers: Sequence[str], samples: Mapping[str, Path | Sequence[Path] | None]
+) -> Machine:
+    """Return the machine with the sample files in the settings of the chosen controls that take them.
 
     Raises InputError for a file that does not exist, and for one that none of the controls takes.
     """
-    for key, path in samples.items():
-        if path is None:
+    for key, given in samples.items():
+        paths = [given] if isinstance(given, Path) else list(given or ())
+        if not paths:
             continue
         flag = "--" + key.replace("_", "-")
-        if not path.is_file():
-            raise InputError(f"{flag}: no such file", file=path)
+        for path in paths:
+            if not path.is_file():
+                raise InputError(f"{flag}: no such file", file=path)
         taking = [name for name in controllers if controller_named(name).sample_setting == key]
         if not taking:
             known = sorted(name for name, control in CONTROLLERS.items() if control.sample_setting == key)
             raise InputError(f"{flag} is for {', '.join(known) or 'no control'}, not for {', '.join(controllers)}")
         for name in taking:
-            machine = machine.with_setting(name, key, str(path.resolve()))
+            names = [str(path.resolve()) for path in paths]
+            machine = machine.with_setting(name, key, names if len(names) > 1 else names[0])
     return machine

@@ -108,8 +108,13 @@ class Section:
     def file(self, key: str) -> Path | None:
         """Return the path of an existing file, None if ``key`` is absent; relative to the folder of the TOML file."""
         name = self.take(key, text_of_path, None)
-        if name is None:
-            return None
+        return None if name is None else self._existing(key, name)
+
+    def files(self, key: str) -> tuple[Path, ...]:
+        """Return the paths of existing files, from one path or a list of paths; none if ``key`` is absent."""
+        return tuple(self._existing(key, name) for name in self.take(key, texts_of_paths, ()))
+
+    def _existing(self, key: str, name: str) -> Path:
         path = (self.path.parent if self.path else Path()) / name
         if not path.is_file():
             raise self.fail(key, f"no such file: {path}; give the path of a file")
@@ -222,6 +227,15 @@ def text_of_path(value: Any) -> str:
     if not isinstance(value, str) or not value.strip() or any(ord(char) < 32 for char in value):
         raise ValueError("the path of a file is expected")
     return value
+
+
+def texts_of_paths(value: Any) -> tuple[str, ...]:
+    """A path, or a list of paths, as text."""
+    if isinstance(value, list) and value:
+        return tuple(text_of_path(item) for item in value)
+    if not isinstance(value, str):
+        raise ValueError("the path of a file, or a list of paths, is expected")
+    return (text_of_path(value),)
 
 
 def choice(*allowed: str) -> Callable[[Any], str]:

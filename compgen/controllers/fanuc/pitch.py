@@ -78,6 +78,12 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         """Say where a plan beside the text differs from it."""
         return plan_contradictions(files, lambda: self.context(machine, settings, tables)["plan"])
 
+    def remarks(
+        self, machine: Machine, settings: PitchSettings, tables: PitchTables, files: Sequence[SourceFile]
+    ) -> list[str]:
+        """Say which unit was assumed, which axes were kept apart, and how many records were passed over."""
+        return list(tables.remarks)
+
     def emulate(self, machine: Machine, settings: PitchSettings, tables: PitchTables, points: Points) -> FloatArray:
         """Return sign * count * A at each point, A held beyond the first and the last section end."""
         added = np.zeros((len(points), 3))
@@ -124,7 +130,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
 
     def resolution_mm(self, settings: PitchSettings) -> float:
         """Return half a count: the bound of :mod:`compgen.controllers.integers` where the limit does not bind."""
-        return 0.5 * settings.count_mm
+        return 0.5 * max(settings.count_mm(axis) for axis in range(3))
 
 
 def _output(settings: PitchSettings, block: PitchBlock, curve: NDArray[np.int64], along_mm: FloatArray) -> FloatArray:

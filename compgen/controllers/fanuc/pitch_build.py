@@ -20,6 +20,7 @@ from compgen.controllers.integers import IntegerCurve, best_integers, section_we
 from compgen.controllers.terms import one_dimensional_name
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
+from compgen.core.names import AXES
 from compgen.core.reversal import WORTH_MM, ReversalCurves
 
 Span = tuple[int, int]
@@ -37,7 +38,7 @@ def wanted_curves(
             nodes_mm = terms[name].nodes_mm
             curve = np.asarray(values[name], dtype=np.float64)
             below = reference_node(machine, axis, nodes_mm)
-            found[axis] = Wanted(nodes_mm, settings.sign * (curve - curve[below]) / settings.count_mm)
+            found[axis] = Wanted(nodes_mm, settings.sign * (curve - curve[below]) / settings.count_mm(axis))
     return found[0], found[1], found[2]
 
 
@@ -79,7 +80,7 @@ def _block(
     half = np.zeros(len(nodes_mm))
     curve = None if reversal is None else reversal.curves.get((axis, axis))
     if settings.bidirectional and curve is not None and np.max(np.abs(curve.value)) >= WORTH_MM:
-        half = 0.5 * settings.sign * curve.at(nodes_mm) / settings.count_mm
+        half = 0.5 * settings.sign * curve.at(nodes_mm) / settings.count_mm(axis)
     towards = settings.reference_return[axis]
     both = {1: wanted.counts - half, -1: wanted.counts + half}
     home = both[towards][below]
@@ -89,14 +90,15 @@ def _block(
     ways = (1, -1) if settings.bidirectional else (1,)
     best = {way: _best(machine, settings, axis, nodes_mm, both[way]) for way in ways}
     limited = [Shortfall(axis, item.largest, item.full_sections) for item in best.values() if item.limited]
+    keep = settings.kept[axis] is not None
     block = PitchBlock(
-        reference=below if settings.total else max(below - 1, 0),
+        reference=below if settings.total else below - 1 if keep else max(below - 1, 0),
         first=0,
-        values=_stored(settings, best[1], below),
+        values=_stored(settings, best[1], below, keep),
         total=settings.total,
-        magnification=settings.magnification,
+        magnification=settings.magnifications[axis],
         interval_mm=_interval_mm(settings, nodes_mm),
-        negative=_stored(settings, best[-1], below) if settings.bidirectional else (),
+        negative=_stored(settings, best[-1], below, keep) if settings.bidirectional else (),
         at_reference=at_reference if settings.bidirectional else 0,
     )
     return block, limited[:1]
@@ -110,11 +112,11 @@ def _best(
     return best_integers(wanted, sections, reference_node(machine, axis, nodes_mm), settings.increment_limit)
 
 
-def _stored(settings: PitchSettings, best: IntegerCurve, below: int) -> tuple[int, ...]:
-    """Numbers as stored; the reference number is always kept, also where no travel lies on its negative side."""
+def _stored(settings: PitchSettings, best: IntegerCurve, below: int, keep: bool) -> tuple[int, ...]:
+    """Numbers as stored; unless the sample has other points, the reference number is among them without travel below it."""
     if settings.total:
         return tuple(int(value) for value in best.counts)
-    steps = np.diff(best.counts, prepend=[0]) if below == 0 else np.diff(best.counts)
+    steps = np.diff(best.counts, prepend=[0]) if below == 0 and not keep else np.diff(best.counts)
     return tuple(int(value) for value in steps)
 
 
@@ -124,20 +126,30 @@ def _interval_mm(settings: PitchSettings, nodes_mm: FloatArray) -> Decimal:
 
 
 def _placed(settings: PitchSettings, blocks: Sequence[PitchBlock | None]) -> list[PitchBlock | None]:
-    """Give every block its numbers: those that the user fixed, else the lowest that are free; likewise both directions."""
-    taken: list[Span] = list(settings.reserved)
+    """Give every block its numbers: those of the sample, those that the user fixed, else the lowest that are free.
+
+    Numbers that the sample shows in use by another axis are never taken; InputError where fixed ones would be.
+    """
+    sample, kept = settings.sample, settings.kept
+    taken: list[Span] = [*settings.reserved, *(span for _, span in sample.others(0))]
     firsts: dict[int, int] = {}
     present = {axis: block for axis, block in enumerate(blocks) if block is not None}
-    for axis in sorted(present, key=lambda k: settings.first_numbers[k] is None):
-        count, fixed = len(present[axis].values), settings.first_numbers[axis]
-        firsts[axis] = lowest_free(taken, settings.first_number, count) if fixed is None else fixed
+    for axis in sorted(present, key=lambda k: kept[k] is None and settings.first_numbers[k] is None):
+        count, grid, fixed = len(present[axis].values), kept[axis], settings.first_numbers[axis]
+        start = fixed if grid is None else grid.first
+        firsts[axis] = lowest_free(taken, settings.first_number, count) if start is None else start
+        sample.check_free(settings.axis_numbers[axis], AXES[axis], firsts[axis], firsts[axis] + count - 1)
         taken.append((firsts[axis], firsts[axis] + count - 1))
     placed: list[PitchBlock | None] = [None, None, None]
     for axis, block in present.items():
         first, negative = firsts[axis], 0
         if block.negative:
-            negative = lowest_free(taken, settings.negative_first_number, len(block.negative))
-            taken.append((negative, negative + len(block.negative) - 1))
+            own = sample.axes.get(settings.axis_numbers[axis])
+            shown = own.negative_first if own is not None and kept[axis] is not None else None
+            count = len(block.negative)
+            negative = lowest_free(taken, settings.negative_first_number, count) if shown is None else shown
+            sample.check_free(settings.axis_numbers[axis], AXES[axis], negative, negative + count - 1)
+            taken.append((negative, negative + count - 1))
         placed[axis] = replace(block, reference=block.reference + first, first=first, negative_first=negative)
     return placed
 

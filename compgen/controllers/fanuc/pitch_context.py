@@ -17,6 +17,7 @@ from compgen.controllers.fanuc.pitch_tables import (
     PitchBlock,
     PitchTables,
 )
+from compgen.controllers.fanuc.sample import Sample
 from compgen.controllers.fanuc.style import Punched
 from compgen.core.csvio import fixed
 from compgen.core.machine import Machine
@@ -51,6 +52,11 @@ def pitch_context(machine: Machine, settings: PitchSettings, tables: PitchTables
         "style": settings,
         "records": records,
         "file": punched,
+        "parameter_file": _parameter_file(settings, present),
+        "container": "separate" if settings.sample.points_style is not None else "one file",
+        "separate": settings.sample.points_style is not None,
+        "overwrites": _overwrites(settings, present),
+        "has_sample": bool(settings.style_notes),
         "style_notes": list(settings.style_notes),
         "bidirectional": settings.bidirectional,
         "points": [{"number": settings.number_base + number, "value": value} for number, value in points.items()],
@@ -83,15 +89,73 @@ def _numbers(settings: PitchSettings) -> tuple[int, ...]:
     return (*PARAMETERS, NEGATIVE_FIRST, AT_REFERENCE) if settings.bidirectional else PARAMETERS
 
 
-def _punched(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> Punched:
-    """Text of the file in its style: parameters by number, points by number."""
+def _parameter_records(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> list[str]:
     style, parameters = settings.style, []
     columns = [(settings.axis_numbers[axis], _parameter_values(settings, block)) for axis, block in present]
     for k, number in enumerate(_numbers(settings)):
         letter = style.real_letter if number == INTERVAL else "P"
         parameters += style.parameter(number, [(axis, values[k]) for axis, values in columns], letter)
-    points = sorted(pair for _, block in present for pair in block.points())
-    return Punched(style.file(parameters if present else [], [style.point(*pair) for pair in points]))
+    return parameters if present else []
+
+
+def _punched(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> Punched:
+    """Text of the file in its style: parameters by number unless they have a file of their own, points by number."""
+    style, separate = settings.style, settings.sample.points_style
+    points = [
+        (separate or style).point(*pair) for pair in sorted(pair for _, block in present for pair in block.points())
+    ]
+    if separate is not None:
+        return Punched(separate.file([], points))
+    return Punched(style.file(_parameter_records(settings, present), points))
+
+
+def _parameter_file(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> Punched | None:
+    """Text of the file of the parameters, where the sample has parameters and points in files of their own."""
+    if settings.sample.points_style is None:
+        return None
+    return Punched(settings.style.file(_parameter_records(settings, present), []))
+
+
+def _overwrites(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> list[str]:
+    """Say what the files overwrite, other axes first."""
+    sample, written = settings.sample, [settings.axis_numbers[axis] for axis, _ in present]
+    others = [
+        f"A{number}: points {low} to {high}"
+        for number, axis in sample.axes.items()
+        if number not in written
+        for low, high in axis.spans
+    ]
+    if settings.style_notes:
+        found = [
+            f"Of other axes: nothing. The sample has {'; '.join(others) or 'no other axis with points'}; they stay."
+        ]
+    else:
+        found = [
+            "Of other axes: NOT KNOWN, no file of this control was given (`--style-from`). An axis whose 3621 to 3622 meet "
+            "the points below loses its table."
+        ]
+    for axis, block in present:
+        number, name = settings.axis_numbers[axis], f"{AXES[axis]} (A{settings.axis_numbers[axis]})"
+        values = zip(_numbers(settings), _parameter_values(settings, block), strict=True)
+        found.append(f"Parameters of {name}: " + ", ".join(_change(sample, p, number, text) for p, text in values))
+        spans = [(block.first, block.last)]
+        if block.negative:
+            spans.append((block.negative_first, block.negative_first + len(block.negative) - 1))
+        texts = [
+            f"{low} to {high} (N{settings.number_base + low} to N{settings.number_base + high})" for low, high in spans
+        ]
+        old = {key: sample.values[key] for key, _ in block.points() if key in sample.values}
+        changed = sum(1 for key, value in block.points() if key in old and old[key] != value)
+        told = f"; {changed} of them differ from the sample" if old else ""
+        found.append(f"Points of {name}: {' and '.join(texts)}{told}")
+    return found
+
+
+def _change(sample: Sample, parameter: int, axis: int, text: str) -> str:
+    """A parameter with its value, and that of the sample if it is another one."""
+    old = sample.parameters.get((parameter, axis))
+    same = old is None or Decimal(old[0]) == Decimal(text)
+    return f"{parameter} = {text}" if same else f"{parameter} = {text} (sample: {old[0] if old else ''})"
 
 
 def _records(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> list[dict[str, Any]]:
@@ -124,12 +188,21 @@ def _preflight_parameters(settings: PitchSettings, present: list[tuple[int, Pitc
             "meaning": "type of the values; which bit value means which is to be read in the parameter manual",
         },
         {
-            "name": "3605#2 (IPP)",
+            "name": "3605, interpolated type",
             "value": "on" if linear else "off",
-            "meaning": f"interpolated pitch compensation; the files were checked as {settings.interpolation}",
+            "meaning": f"interpolated pitch compensation; the files were checked as {settings.interpolation}. Bit 1 is set on "
+            "a 30i that was seen, bit 2 (IPP) is remembered: read the parameter manual, and leave the bits as the backup has them"
+            + _bits_of_sample(settings, present),
         },
     ]
     return rows + (_directional_rows(settings, present) if settings.bidirectional else [])
+
+
+def _bits_of_sample(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> str:
+    """3605 of the axes in the sample, in words."""
+    numbers = [(AXES[axis], settings.axis_numbers[axis]) for axis, _ in present]
+    found = [f"{name} {bits}" for name, number in numbers if (bits := settings.sample.bits(3605, number)) is not None]
+    return f"; the sample has {', '.join(found)} (bit 7 first)" if found else ""
 
 
 def _directional_rows(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:
@@ -153,16 +226,19 @@ def _directional_rows(settings: PitchSettings, present: list[tuple[int, PitchBlo
 
 
 def _sign_statement(settings: PitchSettings) -> str:
-    count_um = settings.count_mm / MM_PER_UM
     stored = "the correction, which the control adds" if settings.stores == "correction" else "the error"
     kind = (
         "A value is the sum up to its point"
         if settings.total
         else "A value is the change over its section, seen in the positive direction"
     )
+    count_um, other = settings.count_mm(0) / MM_PER_UM, ""
+    if len(set(settings.magnifications)) > 1:
+        other = " of X; " + ", ".join(f"{settings.count_mm(k) / MM_PER_UM:g} um of {AXES[k]}" for k in (1, 2))
     return (
-        f"The numbers are {stored}; one count is {count_um:g} um (magnification {settings.magnification} times "
-        f"detection unit {settings.detection_unit_um:g} um). {kind}. An axis that travels {2 * count_um:g} um too "
+        f"The numbers are {stored}; one count is {count_um:g} um{other} (magnification "
+        f"{', '.join(map(str, dict.fromkeys(settings.magnifications)))} times detection unit "
+        f"{settings.detection_unit_um:g} um). {kind}. An X axis that travels {2 * count_um:g} um too "
         f"short over a section in the positive direction gets {2 * settings.sign:+d} there."
         + (_directional_statement(settings) if settings.bidirectional else "")
     )
@@ -172,13 +248,20 @@ def _directional_statement(settings: PitchSettings) -> str:
     return (
         " Points from 3621 to 3622 act in travel in positive direction, as many from 3626 on in negative direction, their "
         "values seen in the positive direction as well. With a reference return in positive direction an axis that stops "
-        f"{settings.count_mm / MM_PER_UM:g} um farther after positive than after negative travel gets "
+        f"{settings.count_mm(0) / MM_PER_UM:g} um farther after positive than after negative travel gets "
         f"{settings.sign:+d} in 3627."
     )
 
 
 def _warnings(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) -> list[str]:
     found = ["The sign of the values is not settled by public documents: check it at one section first (part 3)."]
+    for axis, block in present:
+        if settings.kept[axis] is not None:
+            found.append(
+                f"The points {block.first} to {block.last} of {AXES[axis]}, their interval {block.interval_mm:f} mm and the "
+                f"magnification {block.magnification} are those of the sample; interval_mm or first_numbers in the machine file "
+                f"lay them out anew."
+            )
     if settings.style_notes:
         found.append("The style was taken from the sample: " + "; ".join(settings.style_notes) + ".")
     if settings.bidirectional:
@@ -187,10 +270,10 @@ def _warnings(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) ->
             "the points for negative travel are not settled by public documents; check both directions at the machine."
         )
     if settings.interpolation == "staircase":
-        worst = max((int(np.max(np.abs(np.diff(block.curve)))) for _, block in present), default=0)
+        worst_mm = max((int(np.max(np.abs(np.diff(b.curve)))) * settings.count_mm(k) for k, b in present), default=0.0)
         found.append(
             f"Where inside a section the plain type puts its pulses out is not documented: between section ends the "
-            f"correction may be off by up to {fixed(worst * settings.count_mm / MM_PER_UM, 1)} um."
+            f"correction may be off by up to {fixed(worst_mm / MM_PER_UM, 1)} um."
         )
     if settings.max_feed_mm_min is None and present:
         shortest = min(float(block.interval_mm) for _, block in present)
@@ -237,7 +320,7 @@ def _check(machine: Machine, settings: PitchSettings, axis: int, block: PitchBlo
         "counts": -counts if block.total and not upper else counts,
         "change_um": settings.sign * counts * block.magnification * settings.detection_unit_um,
         "interval_mm": float(block.interval_mm),
-        "short_mm": float(block.interval_mm) - 2 * settings.count_mm,
+        "short_mm": float(block.interval_mm) - 2 * settings.count_mm(axis),
         "short_counts": 2 * settings.sign,
     }
 

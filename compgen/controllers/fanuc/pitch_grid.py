@@ -22,22 +22,28 @@ NEGLIGIBLE_COUNTS = 0.05
 def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, axis: int) -> Grid:
     """Return the section ends of an axis, the reference point among them.
 
-    The user's interval is taken as it is. Otherwise the fewest sections are taken with which linear interpolation of
-    the wanted correction loses nothing that matters and every increment, with a margin, stays within the limit (one
-    count with a staircase), as far as the point numbers of this axis and the least interval permit.
+    Points that the sample of the control shows are kept: their section ends are taken as they are. The user's interval
+    is taken as it is. Otherwise the fewest sections are taken with which linear interpolation of the wanted correction
+    loses nothing that matters and every increment, with a margin, stays within the limit (one count with a staircase),
+    as far as the point numbers of this axis and the least interval permit.
     """
+    kept = settings.kept[axis]
+    if kept is not None:
+        lowest = kept.first if settings.total else kept.first - 1
+        start = Decimal(repr(machine.reference_point_mm[axis])) + (lowest - kept.reference) * kept.interval_mm
+        return Grid(start, kept.interval_mm, kept.last - lowest + 1)
     most = max(3, (settings.last_number - settings.first_number + 1) // 3)
     asked_mm = settings.interval_mm[axis]
     if asked_mm is not None:
         return equidistant_grid(machine, errors, axis, most=most, step_mm=asked_mm, anchor=True)
     nodes_mm = curve_nodes_mm(machine, errors, axis, most)
     wanted_mm = _wanted_mm(machine, errors, axis, nodes_mm)
-    loss_mm = max(worth_mm(errors, axis, settings.loss_mm), NEGLIGIBLE_COUNTS * settings.count_mm)
+    loss_mm = max(worth_mm(errors, axis, settings.loss_mm), NEGLIGIBLE_COUNTS * settings.count_mm(axis))
     flat: list[tuple[float, Grid]] = []
     grids = _grids(machine, settings, errors, axis, most)
     for grid in grids:
         at_ends_mm = _extended(grid.nodes_mm, nodes_mm, wanted_mm)
-        if _is_flat(settings, at_ends_mm):
+        if _is_flat(settings, axis, at_ends_mm):
             lost_mm = float(np.max(np.abs(np.interp(nodes_mm, grid.nodes_mm, at_ends_mm) - wanted_mm)))
             flat.append((lost_mm, grid))
             if lost_mm <= loss_mm:
@@ -77,9 +83,9 @@ def _step_mm(machine: Machine, settings: PitchSettings, axis: int, intervals: in
     return float(max(Decimal(1), steps.to_integral_value(rounding=ROUND_CEILING)) * quantum)
 
 
-def _is_flat(settings: PitchSettings, at_ends_mm: FloatArray) -> bool:
+def _is_flat(settings: PitchSettings, axis: int, at_ends_mm: FloatArray) -> bool:
     """Whether the increments of a correction at the section ends (n,), with a margin, stay within the limit."""
-    largest = float(np.max(np.abs(np.diff(at_ends_mm)))) / settings.count_mm
+    largest = float(np.max(np.abs(np.diff(at_ends_mm)))) / settings.count_mm(axis)
     if settings.interpolation == "staircase":
         return largest <= 1.0
     return STEEPER * largest + 1.0 <= settings.increment_limit

@@ -42,7 +42,7 @@ def shortfall_text(settings: PitchSettings, shortfall: Shortfall) -> str:
     return (
         f"{AXES[shortfall.axis]}: the wanted curve is too steep, the limit is {settings.increment_limit} counts per "
         f"section: {len(shortfall.sections)} sections are full (points {numbers}), and even the best table misses by up "
-        f"to {shortfall.missed_counts * settings.count_mm / MM_PER_UM:.1f} um; a shorter interval or a larger "
+        f"to {shortfall.missed_counts * settings.count_mm(shortfall.axis) / MM_PER_UM:.1f} um; a shorter interval or a larger "
         f"magnification is needed"
     )
 

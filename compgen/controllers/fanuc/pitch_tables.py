@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 
 from compgen.controllers.base import SourceFile
 from compgen.controllers.fanuc.pitch_settings import PitchSettings
-from compgen.controllers.fanuc.text import Record, axis_values, read_records, type_word
+from compgen.controllers.fanuc.sample import (
+    AXIS_PARAMETERS,
+    MOST_NUMBER,
+    UNIT_PARAMETER,
+    Parameters,
+    PunchedRecords,
+    length_of,
+)
+from compgen.controllers.fanuc.text import Record, read_records, type_word
 from compgen.core.csvio import FloatArray
 from compgen.core.names import AXES
 from compgen.errors import InputError
@@ -24,10 +32,10 @@ from compgen.errors import InputError
 REFERENCE, FARTHEST_NEGATIVE, FARTHEST_POSITIVE, MAGNIFICATION, INTERVAL = PARAMETERS = (3620, 3621, 3622, 3623, 3624)
 #: Travel per revolution of a rotary axis; bi-directional: farthest negative number and value at the reference point.
 PER_TURN, NEGATIVE_FIRST, AT_REFERENCE = 3625, 3626, 3627
+#: Bit 0: a table for each direction of travel.
+DIRECTIONS = 3605
 #: Total values travel as 16-bit numbers.
 MOST_TOTAL = 32767
-#: Largest compensation point number that is read at all; what the control takes is checked by the limits.
-MOST_NUMBER = 9999
 
 
 @dataclass(frozen=True)
@@ -114,7 +122,8 @@ class PitchTables:
     """Tables of X, Y, Z (None: the axis has none); ``others`` holds (axis number, first, last) of further axes.
 
     ``turns`` holds (axis number, sum of the values over a revolution) of rotary axes among these. ``shortfalls`` and
-    ``wanted`` are known of tables that were built; tables read from text do not say what was wanted.
+    ``wanted`` are known of tables that were built; tables read from text do not say what was wanted, but what ``remarks``
+    there are on the reading.
     """
 
     blocks: tuple[PitchBlock | None, PitchBlock | None, PitchBlock | None]
@@ -122,52 +131,88 @@ class PitchTables:
     turns: tuple[tuple[int, int], ...] = field(default=(), compare=False)
     shortfalls: tuple[Shortfall, ...] = field(default=(), compare=False)
     wanted: tuple[Wanted | None, Wanted | None, Wanted | None] = field(default=(None, None, None), compare=False)
+    remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
-Parameters = dict[tuple[int, int], tuple[str, Record]]
 Points = dict[int, list[Record]]
 
 
 def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTables:
     """Read the tables from FANUC text; files that end in ``.json`` (the plan beside them) are left out.
 
-    Parameters other than 3620 ... 3624 and points of other axes are passed over. InputError, with file and line, for
-    a missing or doubled parameter of an axis or point of its block, for a cut file and for anything unreadable.
+    Parameters that have nothing to do with compensation are passed over, the points of other axes are kept apart.
+    InputError, with file and line, for a missing or doubled parameter of an axis or point of its block, for a cut file,
+    for an inch machine, for a table of each direction that the machine file does not have, and for anything unreadable.
     """
     texts = [file for file in files if file.path.suffix.lower() != ".json"]
     if not texts:
         raise InputError("no FANUC text file is given; PITCH.TXT (or a file punched from the control) is needed")
-    parameters: Parameters = {}
-    points: Points = {}
+    found, points = PunchedRecords(settings.sample.style.path or 1), Points()
     for file in texts:
         for record in read_records(file):
-            _sort_in(record, settings.number_base, parameters, points)
+            _sort_in(record, settings.number_base, found, points)
+    found.check_metric()
+    parameters = found.axes
+    _check_directions(settings, parameters)
     blocks = [_block(settings, texts[0], axis, parameters, points) for axis in range(3)]
     if not any(blocks):
         numbers = ", ".join(f"A{number}" for number in settings.axis_numbers)
         raise texts[0].fail(f"holds none of the parameters 3620 to 3624 for the axes {numbers}; punch them as well")
     others = _others(settings, parameters)
     turns = _turns(settings, others, parameters, points)
-    return PitchTables((blocks[0], blocks[1], blocks[2]), others, turns)
+    return PitchTables(
+        (blocks[0], blocks[1], blocks[2]), others, turns, remarks=_remarks(settings, found, others, points)
+    )
 
 
-def _sort_in(record: Record, base: int, parameters: Parameters, points: Points) -> None:
-    """Put a record where it belongs; one of another number is passed over."""
-    point = record.number - base
-    if 0 <= point <= MOST_NUMBER:
+def _sort_in(record: Record, base: int, found: PunchedRecords, points: Points) -> None:
+    """Put a record where it belongs: among the points (a parameter of the same number is told later), or parameters."""
+    point, parameter = record.number - base, record.number in (*AXIS_PARAMETERS, UNIT_PARAMETER)
+    kind = type_word(record, record.words())[0]
+    if 0 <= point <= MOST_NUMBER and kind != 1:
         points.setdefault(point, []).append(record)
-    if record.number not in (*PARAMETERS, PER_TURN, NEGATIVE_FIRST, AT_REFERENCE):
-        return
-    kind, words = type_word(record, record.words())
-    if kind == 0 and base < 10000:
-        return
-    if kind not in (None, 1):
-        raise record.fail(f"the type word Q{kind} stands at a parameter; Q1 is due")
-    for axis, text in axis_values(record, words):
-        if (record.number, axis) in parameters:
-            first = parameters[record.number, axis][1]
-            raise record.fail(f"axis A{axis} stands here a second time (first in {first.file.path}:{first.line})")
-        parameters[record.number, axis] = text, record
+    elif not parameter:
+        found.passed_over += 1
+    if parameter and not (base < 10000 and kind == 0):
+        found.take(record, is_point=False)
+
+
+def _check_directions(settings: PitchSettings, parameters: Parameters) -> None:
+    """Refuse a file whose 3605#0 says otherwise than ``bidirectional``: half of its tables would be read wrongly."""
+    for letter, number in zip(AXES, settings.axis_numbers, strict=True):
+        text, record = parameters.get((DIRECTIONS, number), ("", None))
+        if record is not None and text.endswith("1") != settings.bidirectional:
+            word = "true" if text.endswith("1") else "false"
+            raise record.fail(
+                f"bit 0 of {letter} (A{number}) is {text[-1:]}: set bidirectional = {word} in [controllers.fanuc-pitch] to "
+                f"read this file"
+            )
+
+
+def _remarks(
+    settings: PitchSettings, found: PunchedRecords, others: Sequence[tuple[int, int, int]], points: Points
+) -> tuple[str, ...]:
+    """Say what was assumed of the unit, which axes are kept apart, and how many records were passed over."""
+    said = [found.unit_remark(settings.detection_unit_um)]
+    for axis, first, last in others:
+        said.append(
+            f"axis A{axis} (not X, Y or Z of the machine file) has the compensation points {first} to {last}: kept apart"
+        )
+    bits = sorted(
+        {
+            text
+            for (number, axis), (text, _) in found.axes.items()
+            if number == DIRECTIONS and axis in settings.axis_numbers
+        }
+    )
+    if bits:
+        said.append(
+            f"3605 of X, Y, Z is {', '.join(bits)} (bit 7 first); which bit makes the compensation interpolated is not settled, "
+            f"read as {settings.interpolation}"
+        )
+    if found.passed_over:
+        said.append(found.passed_over_remark("pitch"))
+    return tuple(said)
 
 
 def _point_values(settings: PitchSettings, records: Sequence[Record]) -> list[tuple[int, Record]]:
@@ -214,7 +259,9 @@ def _block(
         values=_values(settings, (first, last), parameters[FARTHEST_POSITIVE, number][1], points),
         total=settings.total,
         magnification=whole(MAGNIFICATION, 100),
-        interval_mm=_interval(settings, *parameters[INTERVAL, number]),
+        interval_mm=length_of(
+            parameters[INTERVAL, number][1], parameters[INTERVAL, number][0], settings.interval_unit_mm
+        ),
     )
     if not settings.bidirectional:
         return block
@@ -241,14 +288,6 @@ def _values(settings: PitchSettings, span: tuple[int, int], who: Record, points:
     return tuple(values)
 
 
-def _interval(settings: PitchSettings, text: str, record: Record) -> Decimal:
-    """Interval in mm: a number with a decimal point is in mm, one without counts in the machine file's unit."""
-    value = Decimal(text) if "." in text else Decimal(text) * Decimal(repr(settings.interval_unit_mm))
-    if not 0 < value < 100000:
-        raise record.fail(f"the interval {value} mm is not possible; it is the positive length of a section")
-    return value
-
-
 def _others(settings: PitchSettings, parameters: Parameters) -> tuple[tuple[int, int, int], ...]:
     """Blocks of axes other than X, Y, Z that are switched on (magnification above zero)."""
     found = []
@@ -272,6 +311,7 @@ def _turns(
     for axis, first, last in others:
         text, record = parameters.get((PER_TURN, axis), ("0", None))
         interval = Decimal(parameters[INTERVAL, axis][0]) if (INTERVAL, axis) in parameters else Decimal(0)
-        if record is not None and interval > 0 and Decimal(text) == (last - first) * interval:
+        there = all(number in points for number in range(first + 1, last + 1))
+        if there and record is not None and interval > 0 and Decimal(text) == (last - first) * interval:
             found.append((axis, sum(_values(settings, (first + 1, last), record, points))))
     return tuple(found)

@@ -1,14 +1,17 @@
-"""The style of a file that was punched from the user's own control, found out from its text.
+"""What files that were punched from the user's own control show: their style, and the points of every axis.
 
-No public document shows a file of a 0i-F or 30i, so such a sample is the best description of the style that it reads.
+No public document shows a file of a 0i-F or 30i, so such a sample is the best description of the style that it reads. It
+also says which compensation points each axis has; those of other axes must never be written over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 from compgen.controllers.base import SourceFile
 from compgen.controllers.fanuc.style import FanucStyle
@@ -18,30 +21,279 @@ from compgen.core.files import read_bytes
 
 #: Parameters whose values are whole numbers, and the one that is a length.
 WHOLE_PARAMETERS, LENGTH_PARAMETER = (3620, 3621, 3622, 3623, 3626, 3627), 3624
+#: What the sample may say of an axis: how its table works, its points. Of a path: unit of the machine, straightness.
+AXIS_PARAMETERS, UNIT_PARAMETER, STRAIGHTNESS_PARAMETERS = (3605, *range(3620, 3628)), 1001, range(5700, 5800)
+#: Largest compensation point number, and value of a point, that is read at all.
+MOST_NUMBER, MOST_VALUE = 9999, 10_000_000
 #: Line ends of controls; LF CR CR is the end of block in ISO code.
 LINE_ENDS = {"\n\r\r": "LF CR CR", "\r\n": "CR LF", "\n": "LF", "\r": "CR"}
 
+Span = tuple[int, int]
+#: (number, axis number) -> value as text and the record that it is in.
+Parameters = dict[tuple[int, int], tuple[str, Record]]
 
-def take_style(section: tomlio.Section) -> tuple[FanucStyle, tuple[str, ...]]:
-    """Take ``style_from`` from a control's settings, and the keys of the style, which stand before what a sample shows.
 
-    Returns the style, and in words what was taken from the sample (nothing without one).
+@dataclass(frozen=True)
+class PointGrid:
+    """Compensation points of one axis: point n stands at the reference point plus (n - ``reference``) intervals.
+
+    Parameters 3620 (``reference``), 3621 and 3622 (``first`` and ``last``), 3624 (``interval_mm``).
     """
-    path = section.file("style_from")
-    style, notes = (FanucStyle(), ()) if path is None else read_style(path)
+
+    reference: int
+    first: int
+    last: int
+    interval_mm: Decimal
+
+    def along_mm(self, number: int) -> float:
+        """Position of a point from the reference point, mm."""
+        return float((number - self.reference) * self.interval_mm)
+
+
+@dataclass(frozen=True)
+class AxisPoints:
+    """What the sample says of one controlled axis.
+
+    ``grid`` are its compensation points (of a rotary axis in degrees), ``magnification`` is parameter 3623,
+    ``negative_first`` the first number for travel in negative direction, None unless 3605#0 is set. ``record`` is 3621.
+    """
+
+    number: int
+    grid: PointGrid
+    magnification: int
+    negative_first: int | None
+    record: Record
+
+    @property
+    def spans(self) -> tuple[Span, ...]:
+        """Blocks (first, last) of point numbers that the axis uses, the number of its reference point among them."""
+        low, high = min(self.grid.first, self.grid.reference), max(self.grid.last, self.grid.reference)
+        if self.negative_first is None:
+            return ((low, high),)
+        return (low, high), (self.negative_first, self.negative_first + self.grid.last - self.grid.first)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What punched files of the user's control show; without any it is empty, with the default style.
+
+    Parameters
+    ----------
+    style : how records are written; ``points_style`` is that of the file of the points if they have one of their own.
+    notes : in words what was taken from the sample.
+    interval_unit_mm : unit of parameter 3624 without a decimal point.
+    axes : compensation points by controlled axis number, of all axes that have some, also those that are switched off.
+    parameters : (number, axis number) -> (value as text, record) of the parameters that compensation needs.
+    values : compensation point number -> value.
+    common : parameters of the path from 5700 to 5799, number -> (value as text, record).
+    """
+
+    style: FanucStyle = FanucStyle()
+    points_style: FanucStyle | None = None
+    notes: tuple[str, ...] = ()
+    interval_unit_mm: float = 1.0
+    axes: Mapping[int, AxisPoints] = field(default_factory=dict)
+    parameters: Parameters = field(default_factory=dict)
+    values: Mapping[int, int] = field(default_factory=dict)
+    common: Mapping[int, tuple[str, Record]] = field(default_factory=dict)
+
+    def others(self, number: int) -> list[tuple[AxisPoints, Span]]:
+        """Return the blocks of every axis but ``number``."""
+        return [(axis, span) for key, axis in self.axes.items() if key != number for span in axis.spans]
+
+    def check_free(self, number: int, name: str, first: int, last: int) -> None:
+        """Raise InputError if the points ``first`` to ``last`` of an axis are in use by another axis of the sample."""
+        for axis, (low, high) in self.others(number):
+            if first <= high and last >= low:
+                raise axis.record.fail(
+                    f"axis A{axis.number} uses the compensation points {low} to {high}; the points {first} to {last} of "
+                    f"{name} (A{number}) would overwrite them. Set first_numbers or reserved_numbers so that they do not meet"
+                )
+
+    def bits(self, parameter: int, number: int) -> str | None:
+        """Return a parameter of the bit type of an axis as eight binary digits, bit 7 first; None if it is not there."""
+        found = self.parameters.get((parameter, number))
+        if found is None:
+            return None
+        if not re.fullmatch("[01]{8}", found[0]):
+            raise found[1].fail(f"{found[0]} is given for A{number}; eight binary digits are expected, bit 7 first")
+        return found[0]
+
+
+def take_sample(section: tomlio.Section, *, path: int = 1) -> Sample:
+    """Take ``style_from`` from a control's settings, and the keys of the style, which go before what the sample shows.
+
+    ``path`` is the path of the control whose parameters count, where there are several (word L).
+    """
+    files = [punched_file(name) for name in section.files("style_from")]
+    sample = sample_of(files, path)
     ends = {"lf": "\n", "crlf": "\r\n"}
     eol = section.take("eol", tomlio.choice(*ends), None)
     digits = section.take("digits", tomlio.whole(1, 8), None)
     style = replace(
-        style,
-        q_word=section.take("q_word", tomlio.flag, style.q_word),
-        real_point=section.take("real_point", tomlio.flag, style.real_point),
-        number_base=section.take("number_base", tomlio.whole(0, 90000), style.number_base),
-        digits=style.digits if digits is None else digits,
-        point_digits=style.point_digits if digits is None else digits,
-        eol=style.eol if eol is None else ends[eol],
+        sample.style,
+        q_word=section.take("q_word", tomlio.flag, sample.style.q_word),
+        real_point=section.take("real_point", tomlio.flag, sample.style.real_point),
+        number_base=section.take("number_base", tomlio.whole(0, 90000), sample.style.number_base),
+        digits=sample.style.digits if digits is None else digits,
+        point_digits=sample.style.point_digits if digits is None else digits,
+        eol=sample.style.eol if eol is None else ends[eol],
     )
-    return style, notes
+    if sample.points_style is not None:
+        own = {key: getattr(style, key) for key in ("q_word", "number_base", "point_digits", "eol")}
+        sample = replace(sample, points_style=replace(sample.points_style, **own))
+    unit_mm = take_length_unit_mm(section, style)
+    points = _axes_of(sample.parameters, unit_mm)
+    return replace(sample, style=style, interval_unit_mm=unit_mm, axes=points)
+
+
+def sample_of(files: Sequence[SourceFile], path: int = 1) -> Sample:
+    """Return what punched files show but for the points of the axes, which need the unit of lengths.
+
+    InputError with the line for whatever is not understood, for a style that changes within a file, and for a machine
+    whose unit is the inch.
+    """
+    if not files:
+        return Sample()
+    read = [(file, list(read_records(file))) for file in files]
+    with_points = [file for file, records in read if any(map(is_point, records))]
+    with_parameters = [file for file, records in read if any(map(_is_pitch_parameter, records))]
+    main = (with_parameters or with_points or list(files))[0]
+    style, notes = style_of(main)
+    sorted_in = PunchedRecords(path)
+    for _, records in read:
+        for record in records:
+            sorted_in.take(record, is_point(record))
+    sorted_in.check_metric()
+    points_style = None
+    if with_points and main not in with_points:
+        points_style, point_notes = style_of(with_points[0])
+        shown = ("q_word", "point_digits", "number_base", "whole_point", "plus", "zeros")
+        style = replace(style, **{key: getattr(points_style, key) for key in shown})
+        kept = [note for note in notes if "compensation point" not in note]
+        notes = (
+            *kept,
+            *(n for n in point_notes if "compensation point" in n),
+            "parameters and points in files of their own",
+        )
+    if any("L" in dict(record.words()) for _, record in sorted_in.common.values()):
+        style = replace(style, path=path)
+        notes = (*notes, f"parameters of a path with a word L; those of path {path} are written")
+    base = (points_style or style).number_base
+    values = {record.number - base: record.whole(text, -MOST_VALUE, MOST_VALUE) for text, record in sorted_in.points}
+    return Sample(style, points_style, notes, 1.0, {}, sorted_in.axes, values, sorted_in.common)
+
+
+class PunchedRecords:
+    """Records of punched files sorted by what they are: parameters of axes, of a path, compensation points."""
+
+    def __init__(self, path: int) -> None:
+        self.path = path
+        self.axes: Parameters = {}
+        self.common: dict[int, tuple[str, Record]] = {}
+        self.points: list[tuple[str, Record]] = []
+        self.passed_over = 0
+
+    def take(self, record: Record, is_point: bool) -> None:
+        """Sort a record in; one that says nothing of compensation is counted."""
+        if is_point:
+            words = type_word(record, record.words())[1]
+            self.points += [(words[0][1], record)] if words else []
+        elif record.number in AXIS_PARAMETERS:
+            kind, words = type_word(record, record.words())
+            if kind not in (None, 1):
+                raise record.fail(f"the type word Q{kind} is given for a parameter; use Q1")
+            for axis, text in axis_values(record, words):
+                self._once(self.axes, (record.number, axis), text, record, f"axis A{axis}")
+        elif record.number == UNIT_PARAMETER or record.number in STRAIGHTNESS_PARAMETERS:
+            value = path_value(record, self.path)
+            if value is not None:
+                self._once(self.common, record.number, value, record, "the parameter")
+        else:
+            self.passed_over += 1
+
+    def _once(self, into: dict[Any, tuple[str, Record]], key: Any, text: str, record: Record, what: str) -> None:
+        if key in into:
+            before = into[key][1]
+            raise record.fail(f"{what} stands here a second time (first in {before.file.path}:{before.line})")
+        into[key] = text, record
+
+    def unit_remark(self, detection_unit_um: float) -> str:
+        """Say which unit the machine is taken to have."""
+        known = UNIT_PARAMETER in self.common
+        unit = "metric by 1001#0 (INM)" if known else "taken to be metric, 1001#0 (INM) is not in the file"
+        return (
+            f"unit: the machine is {unit}; parameter 3624 counts in mm, one detection unit is {detection_unit_um:g} um by the "
+            "machine file"
+        )
+
+    def passed_over_remark(self, kind: str) -> str:
+        """Count the records that were passed over."""
+        records = "1 record" if self.passed_over == 1 else f"{self.passed_over} records"
+        return f"passed over: {records} that cannot change a {kind} table"
+
+    def check_metric(self) -> None:
+        """Refuse a machine whose least command increment is in inch (1001#0, INM)."""
+        found = self.common.get(UNIT_PARAMETER)
+        if found is not None and found[0][-1:] == "1":
+            raise found[1].fail(
+                "bit 0 (INM) is 1: an inch machine, whose parameter 3624 and detection unit are in inch. Only metric "
+                "machines are read and written"
+            )
+
+
+def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:
+    """Compensation points of each axis that has some: an interval, or a number that is not 0."""
+    found = {}
+    for axis in sorted({axis for _, axis in parameters}):
+        entries = [parameters.get((number, axis)) for number in (3620, 3621, 3622, 3624)]
+        if any(entry is None for entry in entries):
+            continue
+        (reference, first, last), record = _numbers(entries[:3]), entries[1][1]  # type: ignore[index]
+        text, at = entries[3]  # type: ignore[misc]
+        interval = length_of(at, text, unit_mm) if Decimal(text) else Decimal(0)
+        magnification = parameters.get((3623, axis), ("1", record))
+        factor = magnification[1].whole(magnification[0], 0, 100)
+        if not interval and not factor and not any((reference, first, last)):
+            continue
+        if last < first:
+            raise record.fail(f"axis A{axis} has the points {first} to {last}; the first must not lie behind the last")
+        both = parameters.get((3605, axis), ("0", record))[0].endswith("1")
+        start = parameters.get((3626, axis)) if both else None
+        negative = None if start is None else start[1].whole(start[0], 0, MOST_NUMBER)
+        grid = PointGrid(reference, first, last, interval)
+        found[axis] = AxisPoints(axis, grid, factor, negative, record)
+    return found
+
+
+def _numbers(entries: Sequence[tuple[str, Record] | None]) -> tuple[int, ...]:
+    return tuple(record.whole(text, 0, MOST_NUMBER) for text, record in (entry for entry in entries if entry))
+
+
+def length_of(record: Record, text: str, unit_mm: float) -> Decimal:
+    """Return an interval in mm: a number with a decimal point is in mm, one without counts in ``unit_mm``."""
+    value = Decimal(text) if "." in text else Decimal(text) * Decimal(repr(unit_mm))
+    if not 0 < value < 100000:
+        raise record.fail(f"the interval {value} mm is not possible; it is the positive length of a section")
+    return value
+
+
+def path_value(record: Record, path: int) -> str | None:
+    """Return the value of a parameter of a path: ``P2``, or that of the word ``L`` before it (``L1P0L2P3``).
+
+    None if the record has no value for this path.
+    """
+    kind, words = type_word(record, record.words())
+    if kind not in (None, 1):
+        raise record.fail(f"the type word Q{kind} is given for a parameter; use Q1")
+    if len(words) == 1 and words[0][0] == "P":
+        return words[0][1]
+    if not words or len(words) % 2 or any(word[0] != "LP"[k % 2] for k, word in enumerate(words)):
+        raise record.fail("a single value word P is expected, e.g. P2, or pairs of a path word L and P, e.g. L1P2L2P0")
+    values = {record.whole(one[1], 1, 99): value[1] for one, value in zip(words[::2], words[1::2], strict=True)}
+    if 2 * len(values) != len(words):
+        raise record.fail("a path is given twice")
+    return values.get(path)
 
 
 def take_length_unit_mm(section: tomlio.Section, style: FanucStyle) -> float:
@@ -55,14 +307,6 @@ def take_length_unit_mm(section: tomlio.Section, style: FanucStyle) -> float:
     return section.take("interval_unit_mm", tomlio.positive, 1.0)
 
 
-def read_style(path: Path) -> tuple[FanucStyle, tuple[str, ...]]:
-    """Return the style of a file that was punched from a control, and in words what was taken from it.
-
-    InputError with the line for whatever is no FANUC record, and for a style that changes within the file.
-    """
-    return style_of(punched_file(path))
-
-
 def punched_file(path: Path) -> SourceFile:
     """Read a punched file with its line ends as they are; InputError for bytes that are not ASCII."""
     content = read_bytes(path)
@@ -74,7 +318,7 @@ def punched_file(path: Path) -> SourceFile:
 
 
 def style_of(file: SourceFile) -> tuple[FanucStyle, tuple[str, ...]]:
-    """Return the style of a punched file's text, and the notes; see :func:`read_style`."""
+    """Return the style of a punched file's text, and in words what was taken from it; InputError as :func:`sample_of`."""
     records = list(read_records(file))
     points = [record for record in records if is_point(record)]
     others = [record for record in records if not is_point(record)]
@@ -107,6 +351,8 @@ def frame_of(file: SourceFile, records: Sequence[Record], points: Sequence[Recor
             raise file.fail(f"this line does not end with {LINE_ENDS[eol]} as others do; punch the file again", number)
     marks = [k for k, piece in enumerate(pieces) if piece.strip().rstrip(";") == "%"]
     lines = sorted({record.line for record in records})
+    own = [pieces[line - 1] for line in lines]
+    padded = any(piece.endswith(" ") for piece in own) and all(len(piece) % 2 == 0 for piece in own)
     comments = [(k + 1, piece.strip()) for k, piece in enumerate(pieces) if piece.strip().startswith("(")]
     first_point = points[0].line if points else 0
     first_other = next((record.line for record in records if record not in points), 0)
@@ -119,6 +365,7 @@ def frame_of(file: SourceFile, records: Sequence[Record], points: Sequence[Recor
         containers=2 if len(marks) >= 4 else 1,
         block_end=";" if any(piece.rstrip().endswith(";") for piece in pieces) else "",
         mark=pieces[marks[0]].strip() if marks else "%",
+        even=padded,
     )
 
 

@@ -16,8 +16,11 @@ from compgen.controllers.fanuc.polyline import Polyline, best_polyline
 from compgen.controllers.fanuc.straightness_context import straightness_context
 from compgen.controllers.fanuc.straightness_settings import StraightnessSettings, read_straightness_settings
 from compgen.controllers.fanuc.straightness_tables import (
+    MOVING,
+    POINTS,
     StraightTable,
     StraightTables,
+    free_entries,
     parse_straightness,
     straightness_usage,
     straightness_violations,
@@ -29,6 +32,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.points import Points
+from compgen.errors import InputError
 
 
 class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
@@ -67,6 +71,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         for term in basis:
             assert term.axis is not None
             grid = settings.grids[term.axis]
+            assert grid is not None
             steps = (term.nodes_mm - machine.reference_point_mm[term.axis]) / float(grid.interval_mm)
             a, b, c, d = (grid.reference + round(float(step)) for step in steps)
             counts = np.floor(settings.sign * np.asarray(values[term.name]) / settings.count_mm + 0.5)
@@ -92,6 +97,12 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         plan = self.context(machine, settings, tables)["plan"]
         same = {key: plan[key] for key in ("stores", "detection_unit_um")}
         return {**same, "axis_parameters": plan["axes"], "parameters": plan["common"]}
+
+    def remarks(
+        self, machine: Machine, settings: StraightnessSettings, tables: StraightTables, files: Sequence[SourceFile]
+    ) -> list[str]:
+        """Say which unit was assumed, which entries were kept apart, and how many records were passed over."""
+        return list(tables.remarks)
 
     def emulate(
         self, machine: Machine, settings: StraightnessSettings, tables: StraightTables, points: Points
@@ -135,6 +146,7 @@ def _most_on_one_axis(settings: StraightnessSettings) -> int:
 def _candidates_mm(machine: Machine, settings: StraightnessSettings, axis: int) -> FloatArray:
     """Positions of the compensation points that may be knots: those within the travel, and one beyond either end."""
     grid = settings.grids[axis]
+    assert grid is not None
     numbers = range(grid.first, grid.last + 1)
     positions = machine.reference_point_mm[axis] + np.array([grid.along_mm(number) for number in numbers])
     low, high = machine.axes[axis].range_mm
@@ -170,14 +182,27 @@ def _weights(machine: Machine, axis: int, position_mm: FloatArray) -> FloatArray
 
 def _chosen(machine: Machine, settings: StraightnessSettings, errors: ErrorTable) -> tuple[tuple[int, int], ...]:
     """Return the pairs of the settings, else for each moving axis the one that takes away most, by mean square."""
+    free, taken = free_entries(settings)
+    possible = [axis for axis in range(3) if settings.grids[axis] is not None and axis not in taken]
+    asked = settings.pairs or ()
+    if any(axis in taken for _, axis in asked) or len(asked) > len(free) or not possible or not free:
+        sample = ", ".join(
+            f"{k} = {text}" for k, (text, _) in sorted(settings.sample.common.items()) if MOVING <= k < POINTS
+        )
+        raise InputError(
+            "the sample leaves no room for the straightness tables: entries of other axes are never overwritten, and a "
+            f"moving axis needs compensation points (3620 to 3624). The sample has {sample or 'none of 5711 to 5723'}"
+        )
     if settings.pairs is not None:
         return settings.pairs
-    gain = {pair: _gain(machine, settings, errors, *pair) for pair in product(range(3), repeat=2) if pair[0] != pair[1]}
+    gain = {
+        (k, axis): _gain(machine, settings, errors, k, axis) for k, axis in product(range(3), possible) if k != axis
+    }
     found = []
-    for axis in range(3):
+    for axis in possible:
         output = max((k for k in range(3) if k != axis), key=lambda k: gain[k, axis])
         found.append((output, axis))
-    return tuple(found)
+    return tuple(sorted(found, key=lambda pair: -gain[pair])[: len(free)])
 
 
 def _gain(machine: Machine, settings: StraightnessSettings, errors: ErrorTable, output: int, axis: int) -> float:

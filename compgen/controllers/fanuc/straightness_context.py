@@ -9,12 +9,14 @@ import numpy as np
 
 from compgen.controllers.fanuc.straightness_settings import StraightnessSettings
 from compgen.controllers.fanuc.straightness_tables import (
+    COMPENSATED,
     ENTRIES,
     GRID_PARAMETERS,
     MOVING,
     StraightTable,
     StraightTables,
     entry_numbers,
+    free_entries,
 )
 from compgen.controllers.fanuc.style import Punched
 from compgen.core.csvio import fixed
@@ -32,7 +34,8 @@ def straightness_context(machine: Machine, settings: StraightnessSettings, table
         "warnings": _warnings(settings, tables),
         "tables": [_summary(machine, settings, entry) for entry in tables.entries],
         "settings": settings,
-        "style_notes": list(settings.style_notes),
+        "style_notes": list(settings.sample.notes),
+        "overwrites": _overwrites(settings, common, grids),
         "file": _punched(settings, common, grids),
         "plan": {
             "common": common,
@@ -45,12 +48,46 @@ def straightness_context(machine: Machine, settings: StraightnessSettings, table
 
 
 def _common(settings: StraightnessSettings, tables: StraightTables) -> dict[int, int]:
-    """Parameter number -> value of the entries."""
+    """Parameter number -> value of the entries; one of X, Y, Z in the sample that is no longer used gets 0."""
     found: dict[int, int] = {}
-    for k, entry in enumerate(tables.entries):
+    free, _ = free_entries(settings)
+    for k, entry in zip(free, tables.entries, strict=False):
         axes = (settings.axis_numbers[entry.moving], settings.axis_numbers[entry.compensated])
         found.update(zip(entry_numbers(k), (*axes, *entry.numbers, *entry.amounts), strict=True))
+    for k in free[len(tables.entries) :]:
+        if Decimal(settings.sample.common.get(MOVING + k, ("0",))[0]):
+            found[MOVING + k] = 0
     return dict(sorted(found.items()))
+
+
+def _overwrites(
+    settings: StraightnessSettings, common: dict[int, int], grids: dict[int, list[tuple[int, str]]]
+) -> list[str]:
+    """Say what the file overwrites, other axes first."""
+    sample, names = settings.sample, dict(zip(settings.axis_numbers, AXES, strict=True))
+    kept = [
+        f"entry {k + 1} (A{sample.common[MOVING + k][0]} moves, {COMPENSATED + k} = {sample.common[COMPENSATED + k][0]})"
+        for k in ENTRIES
+        if k not in free_entries(settings)[0] and COMPENSATED + k in sample.common
+    ]
+    if sample.notes:
+        found = [f"Of other axes: nothing{'; ' + ', '.join(kept) + ' stays' if kept else ''}."]
+    else:
+        found = ["Of other axes: NOT KNOWN, no file of this control was given (`--style-from`): look at 5711 to 5723."]
+    for number, values in grids.items():
+        texts = [f"{names[axis]} (A{axis}) = {text}" for axis, text in values]
+        where = ", as in the sample" if sample.notes else ""
+        found.append(f"{number}, which pitch error compensation uses as well: {', '.join(texts)}{where}")
+    old = {number: sample.common[number][0] for number in common if number in sample.common}
+    changed = [
+        f"{number} = {common[number]} (sample: {old[number]})"
+        for number in common
+        if number in old and Decimal(old[number]) != common[number]
+    ]
+    found.append(
+        f"Straightness: {', '.join(map(str, common))}" + (f"; changed: {', '.join(changed)}" if changed else "")
+    )
+    return found
 
 
 def _grids(settings: StraightnessSettings, tables: StraightTables) -> dict[int, list[tuple[int, str]]]:
@@ -113,7 +150,8 @@ def _rows(
         for number, values in grids.items()
         for axis, text in values
     ]
-    for k, entry in enumerate(tables.entries):
+    free, _ = free_entries(settings)
+    for k, entry in zip(free, tables.entries, strict=False):
         words = [
             "moving axis",
             "compensated axis",
@@ -126,15 +164,17 @@ def _rows(
         ]
     rows += [
         {"name": str(MOVING + k), "value": "0", "meaning": "no moving axis: this entry is not used"}
-        for k in ENTRIES[len(tables.entries) :]
+        for k in free[len(tables.entries) :]
     ]
     return rows
 
 
 def _warnings(settings: StraightnessSettings, tables: StraightTables) -> list[str]:
     found = ["Sign, range and parameter numbers are not settled by public documents: check one entry first (part 3)."]
-    if settings.style_notes:
-        found.append("The style was taken from the sample: " + "; ".join(settings.style_notes) + ".")
+    if settings.sample.notes:
+        found.append("The style was taken from the sample: " + "; ".join(settings.sample.notes) + ".")
+        if not settings.sample.common:
+            found.append("The sample has no parameters 5711 to 5799: whether they need a word L is NOT confirmed.")
     for entry in tables.entries:
         grid = entry.grid
         if not settings.stated[entry.moving]:

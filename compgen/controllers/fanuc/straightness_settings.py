@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import ROUND_CEILING, Decimal
 from typing import Any, Literal
 
-from compgen.controllers.fanuc.sample import take_length_unit_mm, take_style
+from compgen.controllers.fanuc.sample import PointGrid, Sample, take_sample
 from compgen.controllers.fanuc.style import FanucStyle
 from compgen.core import tomlio
 from compgen.core.machine import Machine
@@ -15,24 +15,6 @@ from compgen.core.names import AXES, MM_PER_UM
 
 #: Sections of a travel where the user does not say which compensation points the control has.
 SECTIONS = 100
-
-
-@dataclass(frozen=True)
-class PointGrid:
-    """Compensation points of one axis: point n stands at the reference point plus (n - ``reference``) intervals.
-
-    The same numbers as in stored pitch error compensation: parameters 3620 (``reference``), 3621 and 3622 (``first`` and
-    ``last``), 3624 (``interval_mm``).
-    """
-
-    reference: int
-    first: int
-    last: int
-    interval_mm: Decimal
-
-    def along_mm(self, number: int) -> float:
-        """Position of a point from the reference point, mm."""
-        return float((number - self.reference) * self.interval_mm)
 
 
 @dataclass(frozen=True)
@@ -44,22 +26,33 @@ class StraightnessSettings:
     detection_unit_um : one count of the compensation amounts.
     stores : whether the amounts are the correction (added to the command) or the error.
     pairs : (compensated axis, moving axis), 0..2; None: the best ones are chosen.
-    grids : compensation points of X, Y, Z; ``stated`` tells which of them the user gave.
+    grids : compensation points of X, Y, Z; None where the sample shows that the axis has none. ``stated`` tells which of
+        them the user or the sample gave.
     amount_limit : largest magnitude of an amount.
     axis_numbers : controlled axis numbers of X, Y, Z.
-    style, style_notes, interval_unit_mm : as in :class:`compgen.controllers.fanuc.pitch_settings.PitchSettings`.
+    path : path of the control, for parameters with a word L.
+    sample : what files of the user's control show.
     """
 
     detection_unit_um: float
     stores: Literal["correction", "error"]
     pairs: tuple[tuple[int, int], ...] | None
-    grids: tuple[PointGrid, PointGrid, PointGrid]
+    grids: tuple[PointGrid | None, PointGrid | None, PointGrid | None]
     stated: tuple[bool, bool, bool]
     amount_limit: int
     axis_numbers: tuple[int, int, int]
-    style: FanucStyle
-    style_notes: tuple[str, ...]
-    interval_unit_mm: float
+    path: int
+    sample: Sample = field(default_factory=Sample, compare=False)
+
+    @property
+    def style(self) -> FanucStyle:
+        """How the file is written."""
+        return self.sample.style
+
+    @property
+    def interval_unit_mm(self) -> float:
+        """Unit of 3624 without a decimal point."""
+        return self.sample.interval_unit_mm
 
     @property
     def sign(self) -> int:
@@ -75,35 +68,66 @@ class StraightnessSettings:
 def read_straightness_settings(machine: Machine) -> StraightnessSettings:
     """Read and check ``[controllers.fanuc-straightness]``; every key has a default."""
     section = machine.controller_settings("fanuc-straightness")
-    style, notes = take_style(section)
-    unit_mm = take_length_unit_mm(section, style)
+    path = section.take("path", tomlio.whole(1, 99), 1)
+    sample = take_sample(section, path=path)
     points = section.section("points", required=False)
-    stated = (AXES[0] in points, AXES[1] in points, AXES[2] in points)
-    quantum = Decimal("0.001") if style.real_point else Decimal(repr(unit_mm))
-    grids: list[PointGrid] = []
-    for axis, letter in enumerate(AXES):
-        free = grids[-1].last + 1 if grids else 1
-        grids.append(
-            _grid(points.section(letter)) if stated[axis] else default_grid(machine, axis, free, quantum=quantum)
-        )
-    points.finish()
-    numbers = section.section("axis_numbers", required=False)
+    axis_numbers = _axis_numbers(section.section("axis_numbers", required=False))
+    if len(set(axis_numbers)) < 3:
+        raise section.fail("axis_numbers", f"{axis_numbers} gives two axes the same number")
+    grids, stated = _grids(machine, sample, points, axis_numbers)
     settings = StraightnessSettings(
         detection_unit_um=section.take("detection_unit_um", tomlio.positive, 1.0),
         stores=_stores(section.take("stores", tomlio.choice("correction", "error"), "correction")),
         pairs=section.take("pairs", _pairs, None),
-        grids=(grids[0], grids[1], grids[2]),
+        grids=grids,
         stated=stated,
         amount_limit=section.take("amount_limit", tomlio.whole(1, 32767), 32767),
-        axis_numbers=_axis_numbers(numbers),
-        style=style,
-        style_notes=notes,
-        interval_unit_mm=unit_mm,
+        axis_numbers=axis_numbers,
+        path=path,
+        sample=sample,
     )
-    if len(set(settings.axis_numbers)) < 3:
-        raise section.fail("axis_numbers", f"{settings.axis_numbers} gives two axes the same number")
+    for _, moving in settings.pairs or ():
+        if settings.grids[moving] is None:
+            raise section.fail(
+                "pairs",
+                f"{AXES[moving]} (A{axis_numbers[moving]}) has no compensation points in the sample (3620 to 3622 and 3624), "
+                f"and other axes must keep theirs; leave its table out, or state points.{AXES[moving]}",
+            )
     section.finish()
     return settings
+
+
+def _grids(machine: Machine, sample: Sample, points: tomlio.Section, axis_numbers: tuple[int, int, int]) -> Any:
+    """Compensation points of X, Y, Z and which of them are known: stated ones, those of the sample, else assumed ones.
+
+    The numbers belong to pitch error compensation as well: with a sample no others than its own are written.
+    """
+    quantum = Decimal("0.001") if sample.style.real_point else Decimal(repr(sample.interval_unit_mm))
+    grids: list[PointGrid | None] = []
+    for axis, letter in enumerate(AXES):
+        shown = sample.axes.get(axis_numbers[axis])
+        known = None if shown is None or not shown.grid.interval_mm else shown.grid
+        if letter in points:
+            grid = _grid(points.section(letter))
+            if known is not None and grid != known:
+                raise points.fail(
+                    letter,
+                    f"differs from the sample: A{axis_numbers[axis]} has 3620 = {known.reference}, 3621 = {known.first}, 3622 = "
+                    f"{known.last}, 3624 = {known.interval_mm:f} there; other values would shift its pitch table",
+                )
+            sample.check_free(axis_numbers[axis], letter, grid.first, grid.last)
+            grids.append(grid)
+        elif known is not None:
+            sample.check_free(axis_numbers[axis], letter, known.first, known.last)
+            grids.append(known if known.last >= known.first + 3 else None)
+        elif any((number, axis_numbers[axis]) in sample.parameters for number in (3620, 3621, 3622, 3624)):
+            grids.append(None)
+        else:
+            used = [grid.last for grid in grids if grid is not None] + [span[1] for _, span in sample.others(0)]
+            grids.append(default_grid(machine, axis, max(used, default=0) + 1, quantum=quantum))
+    stated = tuple(letter in points or axis_numbers[k] in sample.axes for k, letter in enumerate(AXES))
+    points.finish()
+    return tuple(grids), stated
 
 
 def _stores(word: str) -> Literal["correction", "error"]:

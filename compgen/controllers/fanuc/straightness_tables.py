@@ -8,14 +8,15 @@ a < b < c < d from 5731 + 10 k on and four amounts from 5761 + 10 k on. Points a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 
 import numpy as np
 
 from compgen.controllers.base import SourceFile, Usage, coverage_violations
-from compgen.controllers.fanuc.straightness_settings import PointGrid, StraightnessSettings
-from compgen.controllers.fanuc.text import Record, axis_values, read_records, type_word
+from compgen.controllers.fanuc.sample import PointGrid, PunchedRecords, length_of
+from compgen.controllers.fanuc.straightness_settings import StraightnessSettings
+from compgen.controllers.fanuc.text import read_records, type_word
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
@@ -23,6 +24,8 @@ from compgen.errors import InputError
 
 ENTRIES = range(3)
 MOVING, COMPENSATED, POINTS, AMOUNTS = 5711, 5721, 5731, 5761
+#: Further moving axes, which controls with more entries have.
+FURTHER_MOVING = range(5714, 5721)
 #: Reference, first, last number and interval of the compensation points.
 GRID_PARAMETERS = (3620, 3621, 3622, 3624)
 #: Positions closer than this are the same, mm.
@@ -64,89 +67,87 @@ class StraightTable:
 
 @dataclass(frozen=True)
 class StraightTables:
-    """The entries in use, in their order."""
+    """The entries in use, in their order; ``remarks`` say what reading them assumed and kept apart."""
 
     entries: tuple[StraightTable, ...]
+    remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
-@dataclass(frozen=True)
-class _Found:
-    """Values in the text: common parameters by number, those of axes by (number, axis number)."""
+def free_entries(settings: StraightnessSettings) -> tuple[list[int], set[int]]:
+    """Return the entries 0 ... 2 that the sample leaves free, and the moving axes 0 ... 2 that it uses for other axes.
 
-    common: dict[int, tuple[str, Record]]
-    axes: dict[tuple[int, int], tuple[str, Record]]
+    An entry that has an axis other than X, Y, Z as moving or compensated axis is never written over.
+    """
+    free, taken = [], set()
+    for k in ENTRIES:
+        axes = [int(Decimal(settings.sample.common.get(number, ("0",))[0])) for number in entry_numbers(k)[:2]]
+        if axes[0] and not set(axes) <= {0, *settings.axis_numbers}:
+            taken |= {settings.axis_numbers.index(axes[0])} if axes[0] in settings.axis_numbers else set()
+        else:
+            free.append(k)
+    return free, taken
 
 
 def parse_straightness(settings: StraightnessSettings, files: Sequence[SourceFile]) -> StraightTables:
-    """Read the entries from FANUC text; files that end in ``.json`` (the plan beside them) are left out."""
+    """Read the entries from FANUC text; files that end in ``.json`` (the plan beside them) are left out.
+
+    Entries of other axes are kept apart; a fourth moving axis, which is not understood, is refused with its line.
+    """
     texts = [file for file in files if file.path.suffix.lower() != ".json"]
     if not texts:
         raise InputError("no FANUC text file is given; STRAIGHT.TXT (or a punched parameter file) is needed")
-    found = _Found({}, {})
-    wanted = {number for entry in ENTRIES for number in entry_numbers(entry)}
+    found = PunchedRecords(settings.path)
     for file in texts:
         for record in read_records(file):
-            if record.number in wanted:
-                _take_common(record, found)
-            elif record.number in GRID_PARAMETERS:
-                _take_axes(record, found)
-    entries = tuple(entry for k in ENTRIES if (entry := _entry(settings, texts[0], k, found)) is not None)
+            if type_word(record, record.words())[0] != 0:
+                found.take(record, is_point=False)
+    found.check_metric()
+    for number in FURTHER_MOVING:
+        text, further = found.common.get(number, ("0", None))
+        if further is not None and Decimal(text):
+            raise further.fail(
+                f"{text} is given: a fourth moving axis, whose points and amounts are not known; set it to 0"
+            )
+    apart: list[InputError] = []
+    entries = tuple(entry for k in ENTRIES if (entry := _entry(settings, texts[0], k, found, apart)) is not None)
+    if apart and not entries:
+        raise apart[0]
     if not entries:
         raise texts[0].fail("holds no moving axis (parameters 5711 to 5713); punch the parameters from 5711 on as well")
     moving = [entry.moving for entry in entries]
     for k, entry in enumerate(entries):
         if entry.moving in moving[:k]:
             raise texts[0].fail(f"{AXES[entry.moving]} is the moving axis of two entries; each may have one")
-    return StraightTables(entries)
+    remarks = [found.unit_remark(settings.detection_unit_um), *map(str, apart)]
+    if found.passed_over:
+        remarks.append(found.passed_over_remark("straightness"))
+    return StraightTables(entries, tuple(remarks))
 
 
-def _take_common(record: Record, found: _Found) -> None:
-    kind, words = type_word(record, record.words())
-    if kind == 0:
-        return
-    if kind not in (None, 1):
-        raise record.fail(f"the type word Q{kind} stands at a parameter; Q1 is due")
-    if len(words) != 1 or words[0][0] != "P":
-        raise record.fail("a single value word P is due, e.g. P2")
-    if record.number in found.common:
-        first = found.common[record.number][1]
-        raise record.fail(f"stands here a second time (first in {first.file.path}:{first.line})")
-    found.common[record.number] = words[0][1], record
-
-
-def _take_axes(record: Record, found: _Found) -> None:
-    kind, words = type_word(record, record.words())
-    if kind == 0:
-        return
-    if kind not in (None, 1):
-        raise record.fail(f"the type word Q{kind} stands at a parameter; Q1 is due")
-    for axis, text in axis_values(record, words):
-        if (record.number, axis) in found.axes:
-            first = found.axes[record.number, axis][1]
-            raise record.fail(f"axis A{axis} stands here a second time (first in {first.file.path}:{first.line})")
-        found.axes[record.number, axis] = text, record
-
-
-def _entry(settings: StraightnessSettings, file: SourceFile, k: int, found: _Found) -> StraightTable | None:
+def _entry(
+    settings: StraightnessSettings, file: SourceFile, k: int, found: PunchedRecords, apart: list[InputError]
+) -> StraightTable | None:
     numbers = entry_numbers(k)
     if numbers[0] not in found.common or Decimal(found.common[numbers[0]][0]) == 0:
         return None
-    missing = [str(number) for number in numbers if number not in found.common]
-    if missing:
-        raise found.common[numbers[0]][1].fail(f"names a moving axis, but parameter {', '.join(missing)} is missing")
 
     def whole(number: int, low: int, high: int) -> int:
         text, record = found.common[number]
         return record.whole(text, low, high)
 
-    axes = []
-    for number in numbers[:2]:
-        controlled = whole(number, 1, 99)
-        if controlled not in settings.axis_numbers:
-            known = ", ".join(map(str, settings.axis_numbers))
-            raise found.common[number][1].fail(f"axis {controlled} is none of X, Y, Z (axis numbers {known})")
-        axes.append(settings.axis_numbers.index(controlled))
-    moving, compensated = axes
+    controlled = [whole(number, 1, 99) for number in numbers[:2] if number in found.common]
+    if not set(controlled) <= set(settings.axis_numbers):
+        number, axis = next(
+            pair for pair in zip(numbers, controlled, strict=False) if pair[1] not in settings.axis_numbers
+        )
+        known = ", ".join(map(str, settings.axis_numbers))
+        text = f"axis {axis} is none of X, Y, Z (axis numbers {known}): its straightness table is kept apart"
+        apart.append(found.common[number][1].fail(text))
+        return None
+    missing = [str(number) for number in numbers if number not in found.common]
+    if missing:
+        raise found.common[numbers[0]][1].fail(f"names a moving axis, but parameter {', '.join(missing)} is missing")
+    moving, compensated = (settings.axis_numbers.index(number) for number in controlled)
     if moving == compensated:
         raise found.common[numbers[1]][1].fail(f"{AXES[moving]} is both moving and compensated axis")
     grid = _read_grid(settings, file, moving, found)
@@ -163,7 +164,7 @@ def _entry(settings: StraightnessSettings, file: SourceFile, k: int, found: _Fou
     return StraightTable(compensated, moving, (a, b, c, d), (p, q, r, s), grid)
 
 
-def _read_grid(settings: StraightnessSettings, file: SourceFile, axis: int, found: _Found) -> PointGrid:
+def _read_grid(settings: StraightnessSettings, file: SourceFile, axis: int, found: PunchedRecords) -> PointGrid:
     number = settings.axis_numbers[axis]
     missing = [str(parameter) for parameter in GRID_PARAMETERS if (parameter, number) not in found.axes]
     if missing:
@@ -173,10 +174,7 @@ def _read_grid(settings: StraightnessSettings, file: SourceFile, axis: int, foun
         for parameter in GRID_PARAMETERS[:3]
     )
     text, record = found.axes[GRID_PARAMETERS[3], number]
-    interval = Decimal(text) if "." in text else Decimal(text) * Decimal(repr(settings.interval_unit_mm))
-    if not 0 < interval < 100000:
-        raise record.fail(f"the interval {interval} mm is not possible; it is the positive length of a section")
-    return PointGrid(reference, first, last, interval)
+    return PointGrid(reference, first, last, length_of(record, text, settings.interval_unit_mm))
 
 
 def straightness_violations(machine: Machine, settings: StraightnessSettings, tables: StraightTables) -> list[str]:
@@ -188,10 +186,11 @@ def straightness_violations(machine: Machine, settings: StraightnessSettings, ta
             messages.append(f"{entry.name}: an amount of {most} counts, the limit is {settings.amount_limit}")
         knots = machine.reference_point_mm[entry.moving] + entry.along_mm
         messages += coverage_violations(machine, entry.moving, knots[0], knots[-1], f"the polyline {entry.name}")
-        if settings.stated[entry.moving] and entry.grid != settings.grids[entry.moving]:
+        known = settings.grids[entry.moving]
+        if known is not None and settings.stated[entry.moving] and entry.grid != known:
             messages.append(
                 f"{entry.name}: the file has the points {entry.grid.first} to {entry.grid.last} every "
-                f"{entry.grid.interval_mm:f} mm, which are not those of the machine file"
+                f"{entry.grid.interval_mm:f} mm, which are not those of the machine file or of the sample"
             )
     return messages
 

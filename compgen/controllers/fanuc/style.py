@@ -26,6 +26,8 @@ class FanucStyle:
     points_first, containers : points before parameters; 1, or 2: each in a pair of ``%`` of its own.
     header, footer : lines behind the first ``%`` and before the last one.
     last_eol : whether a line end follows the last ``%``.
+    even : a blank makes the number of characters of a record even.
+    path : path of the control that parameters without axis belong to, written as a word L; 0: no such word.
     """
 
     eol: str = "\n"
@@ -50,6 +52,8 @@ class FanucStyle:
     header: tuple[str, ...] = ()
     footer: tuple[str, ...] = ()
     last_eol: bool = True
+    even: bool = False
+    path: int = 0
 
     def whole(self, value: int) -> str:
         """Return a whole number as it is written."""
@@ -70,7 +74,8 @@ class FanucStyle:
         """Return a record: N word, words, and the type word ``kind`` if the style has one."""
         name = f"N{number:0{self.point_digits if point else self.digits}d}"
         own = [f"Q{kind}"] if self.q_word else []
-        return self.space.join([name, *words, *own] if self.q_last else [name, *own, *words]) + self.block_end
+        text = self.space.join([name, *words, *own] if self.q_last else [name, *own, *words]) + self.block_end
+        return text + " " if self.even and len(text) % 2 else text
 
     def parameter(self, number: int, values: Iterable[tuple[int, str]], letter: str = "P") -> list[str]:
         """Return the records of a parameter of the axis type from (axis number, value as text), axes ascending."""
@@ -83,8 +88,9 @@ class FanucStyle:
         return [self.record(number, pair, 1) for pair in pairs]
 
     def common(self, number: int, value: int) -> str:
-        """Return the record of a parameter without axis."""
-        return self.record(number, [f"P{self.whole(value)}"], 1)
+        """Return the record of a parameter of a path."""
+        path = [f"L{self.path}"] if self.path else []
+        return self.record(number, [*path, f"P{self.whole(value)}"], 1)
 
     def point(self, number: int, value: int) -> str:
         """Return the record of a compensation point."""

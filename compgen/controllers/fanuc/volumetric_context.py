@@ -33,6 +33,12 @@ def volume_context(machine: Machine, settings: VolumeSettings, table: VolumeTabl
             for number, text in parameters.items()
         ],
         "warnings": _warnings(settings),
+        "overwrites": [
+            "Of other axes: nothing, if the numbers below are right. The table of three-dimensional compensation that the "
+            "control has for its axes is lost as a whole.",
+            f"Parameters {', '.join(map(str, parameters))}",
+            f"Points 1 to {len(vertices)}, three values each",
+        ],
         "settings": settings,
         "order": "".join(AXES[axis] for axis in settings.order),
         "magnification": " ".join(map(str, table.magnification)),
