@@ -4,6 +4,7 @@ import errno
 import importlib.util
 import json
 import os
+import re
 import resource
 import shutil
 import sqlite3
@@ -23,7 +24,7 @@ import sqlalchemy as sa
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
-from compgen.recal import claims, database, publish, results, runner, schema
+from compgen.recal import claims, database, fleet, publish, results, runner, schema
 from compgen.recal.claims import Claim, Renewal
 from compgen.recal.records import NewMeasurement, NewResult, TableFile
 from compgen.recal.runner import MachineOutcome, run_jobs
@@ -32,6 +33,7 @@ from compgen.recal.watch import Watch
 
 PATH = Path(__file__).resolve().parents[1] / "benchmarks" / "recal_faults.py"
 NOBODY = 65534
+REAL_PROCESS = runner.process
 DAY = datetime(2026, 3, 1, 12, tzinfo=UTC)
 
 
@@ -694,3 +696,102 @@ def test_publishing_needs_no_pointer_that_it_may_not_move(site):
     assert publish.publish(store, machine, site.out).version == 2
     store.close()
     assert os.readlink(site.out / "active") == "v0002"
+
+
+# --- measurements that bring their process down ---------------------------------------------------------------------
+
+
+def two_machines(site):
+    """The job gains a machine after the first, with an inbox of its own; each has one measurement."""
+    path = site.folder / "recal.toml"
+    own = path.read_text()
+    more = own[own.index("[machines.mill]") :].replace("[machines.mill]", "[machines.next]")
+    path.write_text(own + more.replace('"inbox"', '"inbox2"').replace('"out"', '"out2"'))
+    site.measure()
+    (site.folder / "inbox2").mkdir()
+    shutil.copy(site.inbox / "0001.deviations.csv", site.folder / "inbox2")
+    return site.inbox / "0001.deviations.csv"
+
+
+def ends_its_process(store, job, *_):
+    """Stands for a library that crashes, or the system's answer to too little memory, over the first machine."""
+    if job.name == "mill":
+        os.kill(os.getpid(), 9)
+    return REAL_PROCESS(store, job, *_)
+
+
+def never_ends(store, job, *_):
+    """Stands for a loop inside a library: no other thread of the process gets its turn."""
+    if job.name == "mill":
+        re.match("(a+)+$", "a" * 60 + "b")
+    return REAL_PROCESS(store, job, *_)
+
+
+def results_of(site, capsys):
+    """Make one pass by the command; exit code, and what it says about each machine."""
+    capsys.readouterr()
+    code = command(site, "run", "--json")
+    return code, {item["machine"]: item for item in json.loads(capsys.readouterr().out)["machines"]}
+
+
+def test_a_measurement_that_kills_its_process_keeps_nobody_waiting_and_is_set_aside_after_three_times(
+    site, capsys, monkeypatch
+):
+    two_machines(site)
+    monkeypatch.setattr(runner, "process", ends_its_process)
+    code, found = results_of(site, capsys)
+    assert code == 1
+    assert found["next"]["processed"] == ["0001.deviations.csv"]
+    assert found["mill"]["state"] == "failed" and "killed, twice" in found["mill"]["messages"][0]
+    code, found = results_of(site, capsys)  # the third time, then the machine has its pass
+    assert code == 1 and found["next"]["state"] == "ok"
+    assert "killed or crashed, 3 of 3 times; it is set aside until" in found["mill"]["messages"][0]
+    _, again = results_of(site, capsys)
+    assert again["mill"]["messages"] == found["mill"]["messages"]
+    store = site.store()
+    assert [item.outcome for item in store.attempts(store.machine("mill"))] == ["failed"]
+    assert sum(item.kind == "process ended" for item in store.events()) == 3
+    store.close()
+    monkeypatch.setattr(runner, "process", REAL_PROCESS)
+    path = site.folder / "recal.toml"
+    path.write_text(path.read_text().replace("[machines.next]", "policy = {confidence = 0.9}\n[machines.next]"))
+    assert results_of(site, capsys)[1]["mill"]["processed"] == ["0001.deviations.csv"]
+
+
+def test_a_measurement_that_takes_too_long_is_ended_and_set_aside(site, capsys, monkeypatch):
+    two_machines(site)
+    path = site.folder / "recal.toml"
+    path.write_text(path.read_text().replace("[machines.mill]", "[machines.mill]\nmax_minutes = 0.03"))
+    monkeypatch.setattr(runner, "process", never_ends)
+    began = time.monotonic()
+    code, found = results_of(site, capsys)
+    assert time.monotonic() - began < 60.0
+    assert code == 1
+    assert found["next"]["processed"] == ["0001.deviations.csv"]
+    assert "took too long" in found["mill"]["messages"][0]
+    code, found = results_of(site, capsys)
+    assert code == 1 and "took longer than 0.03 minutes and was ended; it is set aside" in found["mill"]["messages"][0]
+
+
+def test_runners_that_are_killed_from_outside_do_not_count_and_the_others_have_their_turn_first(
+    site, capsys, monkeypatch
+):
+    two_machines(site)
+    monkeypatch.setattr(runner, "process", ends_its_process)
+    for _ in range(5):  # as the system does that ends everything of a service: runner and process at once
+        child = os.fork()
+        if child == 0:
+            run_jobs(site.job)
+            os._exit(99)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -9
+    order = []
+    real = fleet.spread
+    monkeypatch.setattr(
+        fleet, "spread", lambda w, f, items, **o: real(w, f, [order.append(i.name) or i for i in items], **o)
+    )
+    _, found = results_of(site, capsys)
+    assert order == ["next", "mill"]
+    assert list(found) == ["mill", "next"]
+    store = site.store()
+    assert store.attempts(store.machine("mill")) == []
+    store.close()

@@ -5,8 +5,10 @@ import os
 import sqlite3
 import subprocess
 import sys
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,14 +19,16 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 
 from compgen.core.error_table import Curve
+from compgen.core.files import sha256_of
 from compgen.core.names import ERROR_INDEX
 from compgen.errors import InputError
 from compgen.model.gauge import gauge_directions
-from compgen.recal import change, claims, database, decisions, results, schema
+from compgen.recal import change, claims, database, decisions, exclude, notify, overview, results, schema
 from compgen.recal.backup import backup, restore
 from compgen.recal.database import StoreError
 from compgen.recal.records import NewMeasurement, NewResult, TableFile
-from compgen.recal.store import open_store
+from compgen.recal.store import Store, open_store
+from compgen.serve import history as serve_history
 
 DAY = datetime(2026, 3, 1, 12, tzinfo=UTC)
 ERRORS = b"error,position_mm,value\nEC0Y,,12.0\n"
@@ -352,3 +356,133 @@ def test_records_hold_numbers_that_json_can_hold():
         "a": [None, 1.5],
         "b": [2.0],
     }
+
+
+# --- reads that belong together, a file that is moved, damaged contents -----------------------------------------------
+
+
+def damage(store, content):
+    """Overwrite kept contents with others, as a failing disk does, past the triggers."""
+    digest = sha256_of(content)
+    with store.engine.begin() as connection:
+        connection.exec_driver_sql("DROP TRIGGER append_only_blobs_update")
+        kept = zlib.compress(b"something else")
+        connection.execute(sa.update(schema.blobs).where(schema.blobs.c.sha256 == digest).values(deflated=kept))
+
+
+@pytest.mark.parametrize("read", ["history", "status", "news", "page", "excluded"])
+def test_a_result_that_comes_between_two_reads_is_in_both_or_in_none(store, monkeypatch, read):
+    machine = store.add_machine("mill")
+    processed(store, machine, 1)
+    other = open_store(store.url)
+    real, numbers = Store._rows, iter(range(2, 1000))
+
+    def rows(self, query):
+        """Every read is followed by a new result with its decisions of somebody else."""
+        found = real(self, query)
+        if self is store:
+            processed(other, machine, next(numbers), approve=True)
+        return found
+
+    monkeypatch.setattr(Store, "_rows", rows)
+    job = SimpleNamespace(machines={"mill": SimpleNamespace(name="mill", schedule=None)})
+    if read == "history":
+        entries = overview.history(store, machine)
+        assert {entry.version for entry in entries} == {None, 1}
+    elif read == "status":
+        (found,) = overview.status(store, job)
+        assert (found.measurements, found.waiting, found.active) == (1, (1,), None)
+    elif read == "news":
+        assert [message["version"] for _, message in notify._news(store, machine)] == [1]
+    elif read == "page":
+        found = serve_history.history(store, serve_history.ErrorCache(store), machine)
+        assert [table.version for table in found.tables] == [1]
+        assert len(found.measurements) == len(found.decisions) == 1
+        assert found.measurements[0].files
+    else:
+        assert exclude.excluded(store, machine) == {}
+    other.close()
+
+
+def test_a_store_file_that_is_moved_or_replaced_is_noticed_and_no_decision_is_lost(store, tmp_path):
+    machine = store.add_machine("mill")
+    processed(store, machine, 1)
+    path = tmp_path / "recal.sqlite"
+    path.rename(tmp_path / "away.sqlite")
+    for action in (
+        lambda: decisions.approve(store, machine, 1, "ada"),
+        store.machines,
+        store.version,
+        lambda: overview.history(store),
+    ):
+        with pytest.raises(StoreError, match="was moved, removed or replaced"):
+            action()
+    assert not path.exists()
+    path.write_bytes((tmp_path / "away.sqlite").read_bytes())
+    with pytest.raises(StoreError, match="was moved, removed or replaced"):
+        decisions.approve(store, machine, 1, "ada")
+    path.unlink()
+    (tmp_path / "away.sqlite").rename(path)
+    assert decisions.approve(store, machine, 1, "ada").kind == "approve"
+    assert [item.kind for item in store.decisions(machine)] == ["propose", "approve"]
+
+
+def test_a_file_that_is_moved_while_it_is_written_to_takes_nothing_along(store, tmp_path):
+    machine = store.add_machine("mill")
+    processed(store, machine, 1)
+
+    def move(connection):
+        decisions.add_decision(store, connection, machine, "reject", 1, "ada", "late")
+        (tmp_path / "recal.sqlite").rename(tmp_path / "away.sqlite")
+
+    with pytest.raises(StoreError, match="nothing was written"):
+        store.write(move)
+    (tmp_path / "away.sqlite").rename(tmp_path / "recal.sqlite")
+    assert [item.kind for item in store.decisions(machine)] == ["propose"]
+
+
+def test_a_backup_of_damaged_contents_is_refused_and_no_file_is_left(store, tmp_path):
+    machine = store.add_machine("mill")
+    processed(store, machine, 1)
+    backup(store.url, tmp_path / "good.sqlite")
+    damage(store, b"table 1")
+    with pytest.raises(StoreError, match="missing or damaged"):
+        backup(store.url, tmp_path / "copy.sqlite")
+    assert sorted(path.name for path in tmp_path.iterdir() if "copy" in path.name) == []
+    damaged = open_store(f"sqlite:///{tmp_path}/good.sqlite")
+    damage(damaged, b"table 1")
+    damaged.close()
+    with pytest.raises(StoreError, match="missing or damaged"):
+        restore(tmp_path / "good.sqlite", f"sqlite:///{tmp_path}/new.sqlite")
+    assert open_store(f"sqlite:///{tmp_path}/new.sqlite").machines() == []
+
+
+@pytest.mark.parametrize("kind", ["approve", "rollback"])
+def test_nothing_is_decided_for_tables_whose_contents_are_damaged(store, kind):
+    machine = store.add_machine("mill")
+    for number in (1, 2, 3):
+        processed(store, machine, number, approve=number < 3)
+    damage(store, b"table 3" if kind == "approve" else b"table 1")
+    before = store.decisions(machine)
+    with pytest.raises(StoreError, match="missing or damaged"):
+        if kind == "approve":
+            decisions.approve(store, machine, 3, "ada")
+        else:
+            decisions.rollback(store, machine, "ada", "worse")
+    assert store.decisions(machine) == before
+    assert decisions.active_table(store, machine).version == 2
+
+
+def test_the_version_of_a_store_changes_with_everything_that_is_added(store):
+    machine = store.add_machine("mill")
+    seen = {store.version()}
+    measured(store, machine, 1)
+    seen.add(store.version())
+    processed(store, machine, 2)
+    seen.add(store.version())
+    decisions.approve(store, machine, 1, "ada")
+    seen.add(store.version())
+    store.add_event("clock", "clock", "text", machine)
+    seen.add(store.version())
+    assert len(seen) == 5
+    assert store.version() in seen

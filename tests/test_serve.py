@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,10 +15,12 @@ pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed:
 
 import serve_site as helper
 import sqlalchemy as sa
+from markupsafe import escape
 from prometheus_client.parser import text_string_to_metric_families
 
 from compgen.errors import InputError
 from compgen.recal import decisions
+from compgen.recal.store import open_store
 from compgen.serve import background, limits, reading, sessions
 from compgen.serve.fleet import fleet
 from compgen.serve.settings import Settings, check_settings, default_users
@@ -705,3 +708,71 @@ def test_the_store_refuses_what_the_pages_never_do(site):
     """Even a fault of the dashboard could not rewrite the audit trail."""
     with pytest.raises(Exception, match="(?i)append|change|never"):
         site.store.write(lambda c: c.execute(sa.text("UPDATE decisions SET actor = 'nobody'")))
+
+
+# --- pages that are kept, a store that is moved ---------------------------------------------------------------------
+
+
+def test_a_page_is_made_once_for_all_and_each_reader_sees_the_own_name_and_token(site, monkeypatch):
+    made = []
+    real = reading.history
+    monkeypatch.setattr(reading, "history", lambda *parts: made.append(1) or real(*parts))
+    site.users.add("o.hara@x", helper.PASSWORD)
+    for _ in range(3):
+        assert "Logged in" not in site.get("/machines/1").text
+    assert len(made) == 1
+    tokens = set()
+    for name in ("meyer", "o.hara@x"):
+        site.client = site.app.test_client()
+        site.login(name)
+        pages = [site.get("/machines/1").text for _ in range(3)]
+        assert len(set(pages)) == 1
+        assert pages[0].count("Logged in as") == 1
+        assert f"<strong>{escape(name)}</strong>" in pages[0]
+        found = set(re.findall(r'name="csrf" value="([^"]+)"', pages[0]))
+        assert len(found) == 1
+        tokens |= found
+        assert not any(place in pages[0] for place in reading.PLACES.values())
+    assert len(tokens) == 2
+    assert len(made) == 2  # once for readers, once for who may decide
+    site.client = site.app.test_client()
+    site.login("reader")
+    assert "rollback" not in site.get("/machines/1").text
+
+
+def test_a_page_is_made_anew_after_every_change_and_after_a_while(site, monkeypatch):
+    monkeypatch.setattr(background, "SHOWN_S", 2.0)
+    assert "a new name" not in site.get("/").text
+    open_store(site.settings.store_url).add_machine("a new name")
+    assert "a new name" in site.get("/").text
+    made = []
+    real = reading.fleet
+    monkeypatch.setattr(reading, "fleet", lambda *parts: made.append(1) or real(*parts))
+    site.get("/")
+    assert made == []
+    time.sleep(2.0)  # "today" has its day
+    site.get("/")
+    assert made == [1]
+
+
+def test_no_more_pages_are_kept_than_a_server_can_hold(site):
+    for k in range(500):
+        site.get(f"/?q={k}")
+    assert len(site.app.extensions["compgen"].pages._pages) <= 200
+
+
+def test_a_store_that_was_moved_away_is_told_and_no_decision_goes_into_the_moved_file(site, tmp_path):
+    site.login()
+    csrf = site.token("/machines/1/tables/3")
+    assert site.get("/healthz").status_code == 200
+    path = Path(site.settings.store_url)
+    away = path.rename(path.with_name("away.sqlite"))
+    assert site.get("/healthz").status_code == 503
+    answer = site.post("/machines/1/tables/3/approve", {"reason": "fine", "seen": "2", "csrf": csrf})
+    assert answer.status_code == 503
+    assert not path.exists()
+    away.rename(path)
+    assert site.get("/healthz").status_code == 200
+    assert site.store.tables(site.store.machines()[0])[-1].state != "active"
+    answer = site.post("/machines/1/tables/3/approve", {"reason": "fine", "seen": "2", "csrf": csrf})
+    assert answer.status_code == 303

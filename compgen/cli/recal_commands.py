@@ -173,11 +173,9 @@ def watch_command(
     from compgen.recal.watch import Watch
 
     with contextlib.ExitStack() as left:
-        options: dict[str, Any] = {}
         fleet = open_fleet(job.store, workers, cluster)
-        if fleet is not None:
-            left.callback(fleet.close)
-            options |= {"work": work_of(fleet), "threads": fleet.size}
+        left.callback(fleet.close)
+        options: dict[str, Any] = {"work": work_of(fleet), "threads": fleet.size}
         if metrics_port is not None:
             options["on_outcome"] = _counted(job, metrics_port, left)
         Watch(job.path, poll_s=poll_s, notify=_words(command), **options).run()

@@ -11,17 +11,19 @@ import os
 import pickle
 import queue
 import signal
+import sys
 import threading
+import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import get_context, parent_process
-from multiprocessing.context import SpawnContext
+from multiprocessing.context import BaseContext
 from typing import Any, Protocol, TypeVar
 
 from compgen.core.steady import steady
@@ -106,6 +108,8 @@ class Workers(Protocol):
 
 _BUSY = threading.Lock()
 _STOP: list[Any] = []
+#: What this process tells the one that started it: its number, and until when it may work (0: no limit), s.
+_TOLD: list[Any] = []
 
 
 @lru_cache(maxsize=4)
@@ -143,9 +147,22 @@ def stopping() -> bool:
     return bool(_STOP and _STOP[0].value)
 
 
-def _begin(stop: Any) -> None:
+@contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """Have this process killed if the block takes longer, whatever it does; only one that :class:`Processes` started."""
+    for told in _TOLD:
+        told[1] = time.monotonic() + seconds
+    try:
+        yield
+    finally:
+        for told in _TOLD:
+            told[1] = 0.0
+
+
+def _begin(stop: Any, told: Any) -> None:
     """Make this process leave signals to the one that started it, and end with it."""
-    _STOP[:] = [stop]
+    _STOP[:], _TOLD[:] = [stop], [told]
+    told[0] = os.getpid()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)  # no SIG_IGN, which commands started here would inherit
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -173,14 +190,30 @@ def _end_with_parent() -> None:
 class _Lane:
     """One process, and a new one when it is killed."""
 
-    def __init__(self, context: SpawnContext, stop: Any) -> None:
-        self._context, self._stop = context, stop
+    def __init__(self, context: BaseContext, stop: Any, told: Any) -> None:
+        self._context, self._stop, self._told = context, stop, told
         self._pool: ProcessPoolExecutor | None = None
 
     def perform(self, function: Packed, item: Packed) -> Future[Answer]:
         if self._pool is None:
-            self._pool = ProcessPoolExecutor(1, self._context, initializer=_begin, initargs=(self._stop,))
+            self._told[:] = (0.0, 0.0)
+            options: Any = {"initializer": _begin, "initargs": (self._stop, self._told)}
+            self._pool = ProcessPoolExecutor(1, self._context, **options)
         return self._pool.submit(perform, function, item)
+
+    @property
+    def pid(self) -> int:
+        """Number of the process, 0 if it did not come so far."""
+        return int(self._told[0])
+
+    def overdue(self) -> bool:
+        """Whether the process works for longer than it may."""
+        return bool(0.0 < self._told[1] < time.monotonic())
+
+    def kill(self) -> None:
+        """End the process, whatever it does."""
+        with suppress(OSError):
+            os.kill(self.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
 
     def close(self) -> None:
         if self._pool is not None:
@@ -189,13 +222,26 @@ class _Lane:
 
 
 class Processes:
-    """Fresh processes of this machine; one that is killed is replaced, and its item tried once more."""
+    """Processes of this machine; one that is killed is replaced, and its item tried once more.
 
-    def __init__(self, count: int) -> None:
-        context = get_context("spawn")
-        self.size = count
-        self._stop = context.RawValue("b", 0)  # without a lock, which a killed process might keep
-        self._lanes = [_Lane(context, self._stop) for _ in range(count)]
+    Parameters
+    ----------
+    count : processes at a time.
+    copied : where the system can, a process begins as a copy of this one, which saves seconds; only for a program that
+        has no threads at work.
+    died : told of each process that ended over an item: the item, its number, and whether :func:`limited` ended it.
+    """
+
+    def __init__(
+        self, count: int, *, copied: bool = False, died: Callable[[Any, int, bool], None] = lambda *_: None
+    ) -> None:
+        context = get_context("fork" if copied and sys.platform.startswith("linux") else "spawn")
+        self.size, self._died = count, died
+        try:
+            self._stop = context.RawValue("b", 0)  # without a lock, which a killed process might keep
+            self._lanes = [_Lane(context, self._stop, context.RawArray("d", 2)) for _ in range(count)]
+        except OSError as error:  # memory that processes share is a file to the system
+            raise CompgenError(f"processes cannot be started here: {error.strerror or error}") from error
         self._idle: queue.LifoQueue[_Lane] = queue.LifoQueue()
         for lane in self._lanes:
             self._idle.put(lane)
@@ -208,20 +254,26 @@ class Processes:
                 if stop() or self._stop.value:
                     raise StoppedError("not begun: stopped")
                 try:
-                    return self._waited(lane.perform(function, item), stop).value()
+                    return self._waited(lane, lane.perform(function, item), stop).value()
                 except BrokenExecutor:
+                    late = lane.overdue()
                     lane.close()
+                    self._died(item.value(), lane.pid, late)
+                if late:
+                    raise LostError("the process that worked on it took too long and was ended")
         finally:
             self._idle.put(lane)
         raise LostError("the process that worked on it was killed, twice (out of memory?)")
 
-    def _waited(self, future: Future[Answer], stop: Stop) -> Answer:
+    def _waited(self, lane: _Lane, future: Future[Answer], stop: Stop) -> Answer:
         while True:
             try:
                 return future.result(POLL_S)
             except NotYet:
                 if stop():
                     self._stop.value = 1
+                if lane.overdue():
+                    lane.kill()
 
     def close(self) -> None:
         """Begin nothing more, wait for what runs, end the processes."""
@@ -287,13 +339,10 @@ def _in_order(
             future.cancel()
 
 
-def opened_workers(workers: int, cluster: str | None, *, same_host: str = "") -> Workers | None:
-    """Return what does the work: None for this process, which is the case for one worker and no cluster.
-
-    ``same_host`` says why every worker of the cluster has to run on this machine; empty: they need not.
-    """
+def opened_workers(workers: int, cluster: str | None) -> Workers | None:
+    """Return what does the work: None for this process, which is the case for one worker and no cluster."""
     if cluster is not None:
         from compgen.core.cluster import Cluster  # the library is an optional one
 
-        return Cluster(cluster, same_host=same_host)
+        return Cluster(cluster)
     return Processes(workers) if workers > 1 else None

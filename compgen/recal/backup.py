@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from compgen.errors import InputError
 from compgen.recal import schema
 from compgen.recal.database import StoreError, first_line, retried, shown
-from compgen.recal.store import Store, open_store
+from compgen.recal.store import Store, inflated, open_store
 
 #: Rows that are held in memory at once.
 ROWS = 200
@@ -29,6 +29,8 @@ def backup(url: str, path: Path) -> dict[str, int]:
     ------
     InputError
         if the file exists or cannot be written.
+    StoreError
+        if contents are damaged: a copy of them would be found out when it is needed.
     """
     if path.exists():
         raise InputError("exists already; a backup is never written over another one", file=path)
@@ -76,6 +78,8 @@ def restore(path: Path, url: str) -> dict[str, int]:
     ------
     InputError
         if there is no such backup, or the store holds something already.
+    StoreError
+        if contents of the backup are damaged.
     """
     if not path.is_file():
         raise InputError("no such backup", file=path)
@@ -125,6 +129,9 @@ def _copy_table(reading: sa.Connection, writing: sa.Connection, table: sa.Table)
     keys = [table.c.id] if "id" in table.c else list(table.primary_key)
     rows = reading.execution_options(yield_per=ROWS).execute(sa.select(table).order_by(*keys))
     for part in rows.partitions(ROWS):
+        if table is schema.blobs:
+            for row in part:
+                inflated(row.sha256, row.deflated)
         writing.execute(sa.insert(table), [dict(row._mapping) for row in part])
         count += len(part)
     if writing.dialect.name == "postgresql" and "id" in table.c and count:

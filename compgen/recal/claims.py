@@ -14,12 +14,13 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import sqlalchemy as sa
 
 from compgen.errors import CompgenError
 from compgen.recal import logs, schema
-from compgen.recal.records import MeasurementRecord
+from compgen.recal.records import MachineRecord, MeasurementRecord
 from compgen.recal.store import Store
 
 #: How long a claim counts without being renewed, s.
@@ -155,6 +156,32 @@ def give_back(store: Store, claim: Claim) -> None:
 def forget(store: Store, claim: Claim) -> None:
     """Say that this process no longer works on a measurement, whatever the store says."""
     _working.discard((claim.owner, store.url, claim.measurement_id))
+
+
+def left_by(store: Store, machine: MachineRecord, pid: int) -> list[MeasurementRecord]:
+    """Return the machine's measurements that a process of this computer had claimed when it ended."""
+    mark = f"{socket.gethostname()}/{_process_space()}/{pid}/"
+    measured = {item.id: item for item in store.measurements(machine)}
+    found = [
+        last.measurement_id
+        for last in _last_claims(store)
+        if last.kind != "release" and str(last.owner).startswith(mark) and _alive(str(last.owner)) is False
+    ]
+    return [measured[key] for key in found if key in measured]
+
+
+def unfinished(store: Store) -> set[int]:
+    """Return the ids of the machines that have a measurement whose claim a process left that no longer runs."""
+    left = [last for last in _last_claims(store) if last.kind != "release" and _alive(str(last.owner)) is False]
+    machines = {item.id: item.machine_id for item in store.measurements()} if left else {}
+    return {machines[last.measurement_id] for last in left}
+
+
+def _last_claims(store: Store) -> list[Any]:
+    """Return the last row of the chain of each measurement."""
+    table = schema.claims
+    last = sa.select(sa.func.max(table.c.id)).group_by(table.c.measurement_id)
+    return store.read(lambda connection: list(connection.execute(sa.select(table).where(table.c.id.in_(last)))))
 
 
 def _last(connection: sa.Connection, measurement_id: int) -> sa.Row[tuple[object, ...]] | None:

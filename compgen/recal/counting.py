@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from compgen.recal.records import IdentificationRecord, MachineRecord
+from compgen.recal.records import IdentificationRecord, MachineRecord, TableRecord
 from compgen.recal.store import Store
 
 
@@ -12,9 +12,14 @@ def counting(store: Store, machine: MachineRecord) -> list[IdentificationRecord]
     It is the one behind the active tables; else the newest whose tables nobody rejected and the round trip accepted; else
     the newest.
     """
-    states = {table.identification_id: table.state for table in store.tables(machine, figures=False)}
+
+    def read() -> tuple[list[TableRecord], list[IdentificationRecord]]:
+        return store.tables(machine, figures=False), store.identifications(machine)
+
+    tables, identifications = store.together(read)
+    states = {table.identification_id: table.state for table in tables}
     every: dict[int, list[IdentificationRecord]] = {}
-    for item in store.identifications(machine):
+    for item in identifications:
         every.setdefault(item.measurement_id, []).append(item)
 
     def rank(item: IdentificationRecord) -> tuple[int, int]:

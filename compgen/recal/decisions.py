@@ -11,7 +11,7 @@ from compgen.errors import InputError
 from compgen.recal import schema
 from compgen.recal.records import DecisionKind, DecisionRecord, MachineRecord, TableRecord
 from compgen.recal.states import OPEN, WAS_ACTIVE, active_id, before_active, state_of
-from compgen.recal.store import Store
+from compgen.recal.store import Store, files_of
 
 
 class DecisionError(InputError):
@@ -52,6 +52,8 @@ def approve(
     ------
     DecisionError
         for an unknown version, one that is not open, one that is held back without ``override``.
+    StoreError
+        if the contents of its files are missing or damaged in the store.
     """
 
     def action(connection: sa.Connection) -> DecisionRecord:
@@ -70,6 +72,7 @@ def approve(
             raise DecisionError(
                 _place(machine, version) + " is held back by the policy; say the reason why it is right"
             )
+        files_of(connection, table_id)  # nobody decides for files that nobody can write any more
         return add_decision(store, connection, machine, "approve", table_id, actor, reason)
 
     return store.write(action)
@@ -107,6 +110,8 @@ def rollback(
     ------
     DecisionError
         where nothing is active, the version was never active, or no reason is given.
+    StoreError
+        if the contents of its files are missing or damaged in the store.
     """
 
     def action(connection: sa.Connection) -> DecisionRecord:
@@ -117,6 +122,8 @@ def rollback(
         if active_id(decisions) is None and not to:
             raise DecisionError(f"{machine.name}: no tables are active, so there is nothing to undo")
         table_id = before_active(decisions) if to is None else _earlier(connection, machine, decisions, to)
+        if table_id is not None:
+            files_of(connection, table_id)
         return add_decision(store, connection, machine, "rollback", table_id, actor, reason)
 
     return store.write(action)

@@ -19,7 +19,7 @@ from compgen.recal.drift_trend import Series, Step, Trend, fit_trend, usable_tem
 from compgen.recal.drift_volume import volume_forecast
 from compgen.recal.drift_words import interval_of, sentences
 from compgen.recal.exclude import excluded
-from compgen.recal.records import MachineRecord
+from compgen.recal.records import MachineRecord, TableRecord
 from compgen.recal.store import Store
 
 
@@ -154,13 +154,18 @@ def _figure_summary(item: FigureDrift, times: Sequence[str], confidence: float) 
 
 def drift_of_store(store: Store, machine: MachineRecord, settings: DriftSettings) -> Drift:
     """Return the drift of a machine of the store; the calibration behind its active tables is the reference."""
-    history, ids, model = calibrations_of(store, machine)
+
+    def read() -> tuple[tuple[list[Calibration], list[int], Machine], list[TableRecord], list[str]]:
+        found = calibrations_of(store, machine)
+        return found, store.tables(machine, figures=False), [*excluded(store, machine).values()]
+
+    (history, ids, model), tables, left_out = store.together(read)
     history, ids, fewer = with_all_errors(history, ids)
-    active = next((table for table in store.tables(machine, figures=False) if table.state == "active"), None)
+    active = next((table for table in tables if table.state == "active"), None)
     known = active is not None and active.identification_id in ids
     reference = ids.index(active.identification_id) if known and active is not None else 0
     found = drift_report(model, history, replace(settings, reference=reference), name=machine.name)
-    return replace(found, notes=(*found.notes, *fewer, *excluded(store, machine).values()))
+    return replace(found, notes=(*found.notes, *fewer, *left_out))
 
 
 def drift_report(

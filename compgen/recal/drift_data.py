@@ -109,6 +109,10 @@ def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibrat
 
     Those that a person excluded are left out. InputError if there is none.
     """
+    return store.together(lambda: _calibrations(store, machine))
+
+
+def _calibrations(store: Store, machine: MachineRecord) -> tuple[list[Calibration], list[int], Machine]:
     left_out, records = excluded(store, machine), counting(store, machine)
     measured = {item.id: item for item in store.measurements(machine)}
     found, ids = [], []

@@ -57,6 +57,10 @@ def said_of(event: EventRecord) -> tuple[str, str, str]:
 
 def excluded(store: Store, machine: MachineRecord) -> dict[int, str]:
     """Return who excluded what and why, in words, by the id of the measurement, whichever version was named."""
+    return store.together(lambda: _excluded(store, machine))
+
+
+def _excluded(store: Store, machine: MachineRecord) -> dict[int, str]:
     measured = {item.id: item.measurement_id for item in store.identifications(machine)}
     tables = store.tables(machine, figures=False)
     behind = {f"version {table.version}": measured[table.identification_id] for table in tables}

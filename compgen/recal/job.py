@@ -74,6 +74,7 @@ class MachineJob:
     notify: tuple[str, ...] = ()
     settle_s: float = 0.0
     max_size_mb: float = 100.0
+    max_minutes: float = 60.0
     policy: Policy = Policy()
     identify: Mapping[str, Any] = field(default_factory=dict)
     tolerances: Mapping[str, float] = field(default_factory=dict)
@@ -84,6 +85,8 @@ class MachineJob:
         digests = [sha256_of(read_bytes(path)) for path in files if path is not None]
         own = {"controllers": self.controllers, "measured_with": self.measured_with, "identify": dict(self.identify)}
         rules = {"policy": asdict(self.policy), "unverified": self.allow_unverified, "templates": str(self.templates)}
+        if self.max_minutes != MachineJob.max_minutes:  # who allows more time wants what took too long tried again
+            rules["max_minutes"] = self.max_minutes
         return sha256_of(json.dumps([digests, own, rules], sort_keys=True).encode())
 
 
@@ -212,6 +215,7 @@ def _options(keys: _Keys, folder: Path, name: str) -> dict[str, Any]:
         "notify": keys.take("notify", command_words, ()),
         "settle_s": keys.take("settle_s", tomlio.not_negative, 0.0),
         "max_size_mb": keys.take("max_size_mb", tomlio.positive, MachineJob.max_size_mb),
+        "max_minutes": keys.take("max_minutes", tomlio.positive, MachineJob.max_minutes),
         "policy": _policy(keys.section("policy")),
         "identify": _identify(keys.section("identify")),
         "tolerances": _tolerances(keys.section("tolerances")),

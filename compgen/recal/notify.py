@@ -1,6 +1,7 @@
-"""The notification command: it gets one JSON object on stdin for every decision and every failure, each once.
+"""The notification command: it gets one JSON object on stdin for every decision and every failure, at least once.
 
-What was told already stands in the store as events; a command that fails is tried again by the next run.
+What was told already stands in the store as events, noted after the command ended well: a command that fails is tried
+again by the next run. So one whose process is killed in between, or two at the same time, tell it twice: the same object.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list
     since = store.read(store.now) - OLDEST
     problems = []
     for subject, message in _news(store, machine):
-        if subject in told or message["at"] < since.isoformat():
+        if subject in told or message["at"] < since.isoformat() or _told(store, machine, subject):
             continue
         problem = _send(command, message)
         if problem:
@@ -48,11 +49,19 @@ def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list
     return problems
 
 
+def _told(store: Store, machine: MachineRecord, subject: str) -> bool:
+    """Whether another runner told it meanwhile."""
+    return any(event.kind == KIND and event.subject == subject for event in store.events(machine))
+
+
 def _news(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any]]]:
     """Return everything that may be told, in the order of time, by a name that stays."""
-    tables = {table.id: table for table in store.tables(machine)}
+    known, decisions, attempts = store.together(
+        lambda: (store.tables(machine, figures=False), store.decisions(machine), store.attempts(machine))
+    )
+    tables = {table.id: table for table in known}
     found: list[tuple[str, dict[str, Any]]] = []
-    for decision in store.decisions(machine):
+    for decision in decisions:
         table = None if decision.table_id is None else tables[decision.table_id]
         message = {
             "machine": machine.name,
@@ -64,7 +73,7 @@ def _news(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any
             "at": decision.at.isoformat(),
         }
         found.append((f"decision {decision.sequence}", message))
-    for attempt in store.attempts(machine):
+    for attempt in attempts:
         if attempt.outcome == "failed":
             message = {"machine": machine.name, "event": "failed", "reason": attempt.message}
             found.append((f"attempt {attempt.id}", {**message, "at": attempt.at.isoformat()}))

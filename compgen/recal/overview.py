@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Any, TypeVar
 
 from compgen.recal import exclude
-from compgen.recal.job import Job
+from compgen.recal.job import Job, MachineJob
 from compgen.recal.records import AttemptRecord, MachineRecord, TableRecord
 from compgen.recal.schedule import Cron, Schedule
 from compgen.recal.store import Store
@@ -59,6 +59,10 @@ class Entry:
 def status(store: Store, job: Job, names: Sequence[str] = ()) -> list[MachineStatus]:
     """Return the status of the machines ``names`` (default all of the job), in the order of the job file."""
     chosen = [job.machine(name) for name in names] if names else list(job.machines.values())
+    return store.together(lambda: _status(store, chosen))
+
+
+def _status(store: Store, chosen: Sequence[MachineJob]) -> list[MachineStatus]:
     known = {machine.name: machine for machine in store.machines()}
     one = known.get(chosen[0].name) if len(chosen) == 1 else None
     tables = _grouped(store.tables(one, figures=False))
@@ -118,6 +122,10 @@ def _grouped(records: Iterable[Record]) -> dict[int, list[Record]]:
 
 def history(store: Store, machine: MachineRecord | None = None) -> list[Entry]:
     """Return everything that happened to a machine (or to all), oldest first."""
+    return store.together(lambda: _history(store, machine))
+
+
+def _history(store: Store, machine: MachineRecord | None) -> list[Entry]:
     names = {item.id: item.name for item in store.machines()}
     versions: Mapping[int, int] = {table.id: table.version for table in store.tables(machine, figures=False)}
     entries: list[tuple[datetime, int, Entry]] = []

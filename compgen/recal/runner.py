@@ -13,6 +13,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from compgen.core.parallel import limited
 from compgen.core.steady import steady
 from compgen.errors import CompgenError
 from compgen.recal import claims, inbox, logs
@@ -238,7 +239,7 @@ class _Pass:
     def _keep(self, measurement: MeasurementRecord, claim: Claim, settings: str) -> None:
         started = time.monotonic()
         try:
-            with claims.Renewal(self.store, claim):
+            with claims.Renewal(self.store, claim), limited(60.0 * self.job.max_minutes):
                 done = process(self.store, self.job, self.machine, measurement)
         except ClaimLostError:
             raise

@@ -6,10 +6,12 @@ Open it with :func:`open_store`. Approval and rollback are in :mod:`compgen.reca
 
 from __future__ import annotations
 
+import os
 import tempfile
 import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from contextvars import ContextVar
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -40,13 +42,20 @@ from compgen.recal.states import state_of
 
 Result = TypeVar("Result")
 Clock = Callable[[], datetime]
+#: The store whose reads go through one connection at the moment, and that connection.
+_together: ContextVar[tuple[Store, sa.Connection] | None] = ContextVar("compgen_store_together", default=None)
 
 
 class Store:
-    """A store that is open; every method is one transaction. ``clock`` is for tests."""
+    """A store that is open; every method is one transaction. ``clock`` is for tests.
+
+    A method raises StoreError once the file of an SQLite store was moved, removed or replaced: what is written to an open
+    file that nobody finds any more is lost.
+    """
 
     def __init__(self, engine: sa.Engine, url: str, clock: Clock | None = None) -> None:
         self.engine, self.url, self._clock = engine, url, clock
+        self._file = _file_of(engine)
 
     def close(self) -> None:
         """Give the connections back."""
@@ -65,24 +74,71 @@ class Store:
         """Do ``action`` in a transaction that only reads; again while the store cannot be reached."""
 
         def once() -> Result:
+            self._check_file()
             with self.engine.connect().execution_options(reading=True) as connection:
                 return action(connection)
 
+        current = _together.get()
         try:
+            if current is not None and current[0] is self:
+                return action(current[1])
             return retried(once, self.url)
-        except CompgenError:
+        except (CompgenError, UnicodeDecodeError):
             raise
         except ValueError as error:  # no time, no JSON
             raise StoreError(f"the store {shown(self.url)} is damaged: {error}; restore a backup") from error
+
+    def together(self, action: Callable[[], Result]) -> Result:
+        """Do ``action``, which reads several times, on the store as it is at one moment: its reads fit together."""
+        current = _together.get()
+        if current is not None and current[0] is self:
+            return action()
+
+        def once() -> Result:
+            self._check_file()
+            options: dict[str, Any] = {"reading": True}
+            if self.engine.dialect.name == "postgresql":
+                options["isolation_level"] = "REPEATABLE READ"
+            with self.engine.connect().execution_options(**options) as connection:
+                token = _together.set((self, connection))
+                try:
+                    return action()
+                finally:
+                    _together.reset(token)
+
+        return retried(once, self.url)
 
     def write(self, action: Callable[[sa.Connection], Result]) -> Result:
         """Do ``action`` in a transaction, all of it or nothing; again while the store cannot be reached."""
 
         def once() -> Result:
+            self._check_file()
             with self.engine.begin() as connection:
-                return action(connection)
+                found = action(connection)
+                self._check_file()  # again, right before it counts
+                return found
 
         return retried(once, self.url)
+
+    def _check_file(self) -> None:
+        """Raise StoreError unless the path still leads to the file that was opened."""
+        if self._file is not None and _file_of(self.engine) != self._file:
+            raise StoreError(
+                f"the store {shown(self.url)} was moved, removed or replaced while it was open; nothing was written: "
+                "put the file back, or start again with the right one"
+            )
+
+    def version(self) -> tuple[object, ...]:
+        """Return something that is another one after every change: what was read before may be shown while it is equal.
+
+        Rows are only added. SQLite numbers them in the order in which they count; on PostgreSQL a lower number may
+        come later, so they are counted as well.
+        """
+        counted = self.engine.dialect.name == "postgresql"
+        tables = [table for table in schema.ALL if "id" in table.c and table is not schema.claims]
+        columns = [sa.select(sa.func.max(table.c.id)).scalar_subquery() for table in tables]
+        columns += [sa.select(sa.func.count()).select_from(table).scalar_subquery() for table in tables if counted]
+        return tuple(self.read(lambda connection: connection.execute(sa.select(*columns)).one()))
 
     # --- machines ---------------------------------------------------------------------------------------------------
 
@@ -138,6 +194,9 @@ class Store:
         self, machine: MachineRecord | None = None, *, sha256: str | None = None
     ) -> list[MeasurementRecord]:
         """Return the measurements of a machine (or of all) in the order in which they were made."""
+        return self.together(lambda: self._measurements(machine, sha256))
+
+    def _measurements(self, machine: MachineRecord | None, sha256: str | None) -> list[MeasurementRecord]:
         table = schema.measurements
         query = sa.select(table).order_by(table.c.measured_at, table.c.id)
         query = _where(query, table, machine)
@@ -224,6 +283,9 @@ class Store:
 
         Without ``figures`` their summaries stay empty, which saves much where the whole fleet is looked at.
         """
+        return self.together(lambda: self._tables(machine, figures))
+
+    def _tables(self, machine: MachineRecord | None, figures: bool) -> list[TableRecord]:
         decided: dict[int, list[DecisionRecord]] = {}
         for decision in self.decisions(machine):
             decided.setdefault(decision.machine_id, []).append(decision)
@@ -237,12 +299,8 @@ class Store:
         return found
 
     def table_files(self, table: TableRecord) -> list[TableFile]:
-        """Return the files of a set of tables, byte for byte."""
-        files, blobs = schema.table_files, schema.blobs
-        query = sa.select(files.c.controller, files.c.name, files.c.sha256, blobs.c.deflated)
-        query = query.join(blobs, blobs.c.sha256 == files.c.sha256, isouter=True).where(files.c.table_id == table.id)
-        rows = self._rows(query.order_by(files.c.id))
-        return [TableFile(controller, name, _inflated(digest, packed)) for controller, name, digest, packed in rows]
+        """Return the files of a set of tables, byte for byte; StoreError if any is missing or damaged."""
+        return self.read(lambda connection: files_of(connection, table.id))
 
     def decisions(self, machine: MachineRecord | None = None) -> list[DecisionRecord]:
         """Return all decisions in their order: who, what, when, why."""
@@ -277,13 +335,34 @@ class Store:
     def blob(self, sha256: str) -> bytes:
         """Return contents by their SHA-256; StoreError if they are damaged."""
         query = sa.select(schema.blobs.c.deflated).where(schema.blobs.c.sha256 == sha256)
-        return _inflated(sha256, self.read(lambda connection: connection.execute(query).scalar()))
+        return inflated(sha256, self.read(lambda connection: connection.execute(query).scalar()))
 
     def _rows(self, query: sa.Select[Any]) -> list[Any]:
         return self.read(lambda connection: list(connection.execute(query).all()))
 
 
-def _inflated(sha256: str, packed: bytes | None) -> bytes:
+def _file_of(engine: sa.Engine) -> tuple[int, int] | None:
+    """Return which file the path of an SQLite store leads to, None if there is none or it is another database."""
+    if engine.dialect.name != "sqlite":
+        return None
+    try:
+        found = os.stat(str(engine.url.database))
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def files_of(connection: sa.Connection, table_id: int) -> list[TableFile]:
+    """Return the files of a set of tables, byte for byte; StoreError if any is missing or damaged."""
+    files, blobs = schema.table_files, schema.blobs
+    query = sa.select(files.c.controller, files.c.name, files.c.sha256, blobs.c.deflated)
+    query = query.join(blobs, blobs.c.sha256 == files.c.sha256, isouter=True).where(files.c.table_id == table_id)
+    rows = connection.execute(query.order_by(files.c.id)).all()
+    return [TableFile(controller, name, inflated(digest, packed)) for controller, name, digest, packed in rows]
+
+
+def inflated(sha256: str, packed: bytes | None) -> bytes:
+    """Return contents as they were kept; StoreError unless they are those of this SHA-256."""
     try:
         content = zlib.decompress(packed or b"")
     except zlib.error:

@@ -115,6 +115,9 @@ def _check_session(own: Service) -> None:
 
 def _context() -> dict[str, Any]:
     own, session = service(), g.get("session")
+    if g.get("for_all") and session is not None:
+        may_decide = own.may_decide(session.user)
+        return {"settings": own.settings, "messages": [], "may_decide": may_decide, **reading.PLACES}
     messages = list(session.messages) if session is not None else []
     if session is not None:
         session.messages.clear()

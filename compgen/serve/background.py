@@ -1,15 +1,18 @@
-"""Figures that take more than a moment: worked out one at a time beside the requests, and kept.
+"""What is kept between requests: figures that take more than a moment, and pages as long as nothing changes.
 
-One thread: nobody can keep all processors busy by asking. Whoever asks waits a little and is told to come again.
+Figures are worked out one at a time in a thread beside the requests: nobody can keep all processors busy by asking.
+Whoever asks waits a little and is told to come again.
 """
 
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYetError
+from dataclasses import dataclass, field
 from typing import Any
 
 from compgen.errors import InputError
@@ -18,6 +21,8 @@ from compgen.errors import InputError
 MOST, WAITING = 300, 20
 #: How long a request waits for a result, s.
 PATIENCE_S = 0.7
+#: Pages that are kept; how long one is shown that says how long ago something was, and one that waits for figures, s.
+PAGES, SHOWN_S, WAITING_SHOWN_S = 200, 60.0, 1.0
 
 
 class NotReadyError(Exception):
@@ -63,3 +68,38 @@ class Background:
         """Drop what was not asked for longest; what is being worked out stays."""
         for key in [key for key, item in self._known.items() if item.done()][: max(0, len(self._known) - MOST)]:
             del self._known[key]
+
+
+@dataclass
+class _Page:
+    """One page, what it was made from, and until when it is shown; made by one request while the others wait."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    made_from: Hashable = None
+    until: float = 0.0
+    text: str = ""
+
+
+class Pages:
+    """Pages by address, each made once for every state of what it shows.
+
+    ``state`` tells it; every request asks, so that a page is never older than what could be read then.
+    """
+
+    def __init__(self, state: Callable[[], Hashable]) -> None:
+        self._state, self._lock = state, threading.Lock()
+        self._pages: OrderedDict[Hashable, _Page] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], tuple[str, bool]]) -> str:
+        """Return the page; ``make`` gives its text, and whether it is complete: if not, it is made again soon."""
+        state = self._state()
+        with self._lock:
+            page = self._pages.setdefault(key, _Page())
+            self._pages.move_to_end(key)
+            while len(self._pages) > PAGES:
+                self._pages.popitem(last=False)
+        with page.lock:
+            if page.made_from != state or time.monotonic() >= page.until:
+                page.text, complete = make()
+                page.made_from, page.until = state, time.monotonic() + (SHOWN_S if complete else WAITING_SHOWN_S)
+            return page.text

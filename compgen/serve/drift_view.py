@@ -58,12 +58,18 @@ class JobFile:
         self._state: tuple[int, int] | None = None
         self._job: Job | None = None
 
+    def state(self) -> tuple[int, int] | None:
+        """Return what changes when the file is written, None where there is none."""
+        if self._path is None or not self._path.is_file():
+            return None
+        stat = self._path.stat()
+        return stat.st_mtime_ns, stat.st_size
+
     def tolerances(self, machine: str) -> Mapping[str, float]:
         """Return the tolerances of a machine, mm and rad, by error; none without a job file or such a machine."""
-        if self._path is None or not self._path.is_file():
+        state = self.state()
+        if self._path is None or state is None:
             return {}
-        stat = self._path.stat()
-        state = (stat.st_mtime_ns, stat.st_size)
         with self._lock:
             if self._job is None or state != self._state:
                 self._job, self._state = read_job(self._path), state
@@ -80,9 +86,12 @@ class DriftCache:
     def __call__(self, machine: MachineRecord, patience_s: float | None = None) -> Drift:
         """Return the drift; InputError where there are no errors with uncertainties, NotReadyError while it is made."""
         tolerances = self._job.tolerances(machine.name)
-        decided = self._store.decisions(machine)
-        excluded = tuple(item.id for item in self._store.events(machine) if item.kind == EXCLUSION)
-        made = tuple(item.id for item in self._store.identifications(machine))
+        store = self._store
+        decided, events, identified = store.together(
+            lambda: (store.decisions(machine), store.events(machine), store.identifications(machine))
+        )
+        excluded = tuple(item.id for item in events if item.kind == EXCLUSION)
+        made = tuple(item.id for item in identified)
         last = decided[-1].sequence if decided else 0
         key = ("drift", machine.id, last, made, excluded, tuple(sorted(tolerances.items())))
 

@@ -200,6 +200,10 @@ class AuditPage:
 
 def audit_page(store: Store, page: int, *, people: bool) -> AuditPage:
     """Return one page of the audit trail, with ``people`` only what persons decided."""
+    return store.together(lambda: _audit_page(store, page, people=people))
+
+
+def _audit_page(store: Store, page: int, *, people: bool) -> AuditPage:
     decisions, tables, machines = schema.decisions, schema.tables, schema.machines
     who = decisions.c.actor != AUTOMATIC if people else sa.true()
     count = store.read(lambda c: c.execute(sa.select(sa.func.count()).select_from(decisions).where(who)).scalar_one())

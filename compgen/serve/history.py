@@ -83,7 +83,11 @@ class History:
 
 
 def history(store: Store, errors_of: ErrorCache, machine: MachineRecord) -> History:
-    """Collect the history of a machine."""
+    """Collect the history of a machine, as it is at one moment."""
+    return store.together(lambda: _history(store, errors_of, machine))
+
+
+def _history(store: Store, errors_of: ErrorCache, machine: MachineRecord) -> History:
     tables = store.tables(machine)
     measurements = store.measurements(machine)
     failures = [attempt for attempt in store.attempts(machine) if attempt.outcome == "failed"]

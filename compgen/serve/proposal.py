@@ -112,7 +112,11 @@ def find_table(store: Store, machine: MachineRecord, version: int) -> TableRecor
 
 
 def proposal(store: Store, errors_of: ErrorCache, machine: MachineRecord, table: TableRecord) -> Proposal:
-    """Collect what a person needs to decide on a set of tables."""
+    """Collect what a person needs to decide on a set of tables, as it is at one moment."""
+    return store.together(lambda: _proposal(store, errors_of, machine, table))
+
+
+def _proposal(store: Store, errors_of: ErrorCache, machine: MachineRecord, table: TableRecord) -> Proposal:
     identification = store.identification(table.identification_id)
     active = next((item for item in store.tables(machine) if item.state == "active"), None)
     behind = None if active is None or active.id == table.id else store.identification(active.identification_id)

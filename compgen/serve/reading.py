@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import re
+import secrets
+from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlencode
 
-from flask import Blueprint, Response, abort, current_app, render_template, request
+from flask import Blueprint, Response, abort, current_app, g, render_template, request
+from markupsafe import escape
 from werkzeug.routing import IntegerConverter
 
 from compgen.errors import CompgenError, InputError
+from compgen.recal import logs
 from compgen.recal.recheck import format_recheck_points
 from compgen.recal.records import MachineRecord
 from compgen.resources import data_folder
@@ -27,6 +32,8 @@ pages = Blueprint("reading", __name__)
 #: How long the page of a machine waits for the drift, s.
 A_MOMENT_S = 0.2
 NUMBER = "number(max=2147483647)"
+#: What stands in a page that is kept where the reader's own name and token belong; nobody can guess it.
+PLACES = {name: f"{name}-{secrets.token_hex(16)}" for name in ("user", "csrf")}
 
 
 class Number(IntegerConverter):
@@ -47,6 +54,31 @@ def the_machine(machine_id: int) -> MachineRecord:
     return found if found is not None else abort(404, "The store has no such machine.")
 
 
+def kept(view: Callable[..., str]) -> Callable[..., str]:
+    """Make a page once for all readers with the same rights, as long as nothing changes that it shows."""
+
+    @functools.wraps(view)
+    def wrapper(**arguments: int) -> str:
+        service, session = own(), g.session
+        if session is not None and session.messages:
+            return view(**arguments)
+
+        def make() -> tuple[str, bool]:
+            g.for_all, g.complete = True, True
+            try:
+                return view(**arguments), g.complete
+            finally:
+                g.for_all = False
+
+        rights = None if session is None else service.may_decide(session.user)
+        page = service.pages.get((request.full_path, rights), make)
+        if session is None:
+            return page
+        return page.replace(PLACES["user"], str(escape(session.user))).replace(PLACES["csrf"], session.csrf)
+
+    return wrapper
+
+
 def page_url(**arguments: Any) -> str:
     """Return the address of the fleet page with these choices."""
     return "/?" + urlencode({key: value for key, value in arguments.items() if value})
@@ -58,6 +90,7 @@ def _page_number() -> int:
 
 
 @pages.get("/")
+@kept
 def overview() -> str:
     """Show the fleet."""
     words, status = request.args.get("q", "")[:100], request.args.get("status", "")
@@ -67,6 +100,7 @@ def overview() -> str:
 
 
 @pages.get(f"/machines/<{NUMBER}:machine_id>")
+@kept
 def machine(machine_id: int) -> str:
     """Show one machine's history; what its drift says, if that is known by now."""
     service, found = own(), the_machine(machine_id)
@@ -74,7 +108,7 @@ def machine(machine_id: int) -> str:
     try:
         sentences = service.drift_of(found, A_MOMENT_S).sentences()
     except NotReadyError:
-        problem = "The drift is being worked out."
+        g.complete, problem = False, "The drift is being worked out."
     except InputError as error:
         problem = str(error)
     told = history(service.store, service.errors_of, found)
@@ -82,12 +116,14 @@ def machine(machine_id: int) -> str:
 
 
 @pages.get(f"/machines/<{NUMBER}:machine_id>/drift")
+@kept
 def drift(machine_id: int) -> str:
     """Show which errors changed, which drift, and when they leave their tolerance."""
     found = the_machine(machine_id)
     try:
         known = own().drift_of(found)
     except NotReadyError:
+        g.complete = False
         return render_template("drift.html", machine=found, waiting=True, problem="")
     except InputError as error:
         return render_template("drift.html", machine=found, waiting=False, problem=str(error))
@@ -125,6 +161,7 @@ def recheck_points(machine_id: int) -> Response:
 
 
 @pages.get(f"/machines/<{NUMBER}:machine_id>/tables/<{NUMBER}:version>")
+@kept
 def table(machine_id: int, version: int) -> str:
     """Show before and after of one set of tables."""
     service, found = own(), the_machine(machine_id)
@@ -153,6 +190,7 @@ def _download(content: bytes, name: str) -> Response:
 
 
 @pages.get("/audit")
+@kept
 def audit() -> str:
     """Show who decided what, when and why, the newest first."""
     people = request.args.get("who") == "people"
@@ -173,11 +211,13 @@ def metrics() -> Response:
 
 @pages.get("/healthz")
 def health() -> tuple[Response, int]:
-    """Say whether the store can be read."""
+    """Say whether the store can be read, and is still the file that was opened."""
+    store = own().store
     try:
-        own().store.read(own().store.now)
-    except CompgenError:
-        return Response("store not available\n", mimetype="text/plain"), 503
+        store.version()
+    except CompgenError as error:
+        logs.error("store", problem=str(error))
+        return Response("store not available; the log says why\n", mimetype="text/plain"), 503
     return Response("ok\n", mimetype="text/plain"), 200
 
 

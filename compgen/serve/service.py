@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from compgen.errors import InputError
 from compgen.recal import actions, decisions
-from compgen.recal.job import read_job
+from compgen.recal.job import Job, read_job
 from compgen.recal.records import DecisionRecord, MachineRecord
 from compgen.recal.store import Store
-from compgen.serve.background import Background
+from compgen.serve.background import Background, Pages
 from compgen.serve.drift_view import DriftCache, JobFile
 from compgen.serve.history import ErrorCache
 from compgen.serve.limits import LoginLimit
@@ -40,6 +41,7 @@ class Service:
     drift_of: DriftCache
     recheck_of: RecheckCache
     job: JobFile
+    pages: Pages
 
     def may_decide(self, user: str) -> bool:
         """Whether this user may approve, reject and roll back here."""
@@ -64,6 +66,7 @@ def make_service(settings: Settings, store: Store, clock: Callable[[], float] = 
         DriftCache(store, background, job),
         RecheckCache(store, background),
         job,
+        Pages(lambda: (store.version(), job.state())),
     )
 
 
@@ -76,10 +79,16 @@ class Wish:
     seen: int
 
 
+def _job(service: Service, path: Path) -> Job:
+    """Read the job file; StoreError if its store is no longer what the pages show, before a new one is opened by name."""
+    service.store.version()
+    return read_job(path)
+
+
 def approve(service: Service, machine: MachineRecord, version: int, wish: Wish, *, override: bool) -> DecisionRecord:
     """Approve as ``compgen recal approve`` does; the files follow where there is a job file."""
     if service.settings.job is not None:
-        job, seen = read_job(service.settings.job), wish.seen
+        job, seen = _job(service, service.settings.job), wish.seen
         return actions.approve(job, machine.name, version, wish.actor, wish.reason, override=override, seen=seen)
     store = service.store
     return decisions.approve(store, machine, version, wish.actor, wish.reason, override=override, seen=wish.seen)
@@ -88,7 +97,7 @@ def approve(service: Service, machine: MachineRecord, version: int, wish: Wish, 
 def reject(service: Service, machine: MachineRecord, version: int, wish: Wish) -> DecisionRecord:
     """Reject as ``compgen recal reject`` does."""
     if service.settings.job is not None:
-        job = read_job(service.settings.job)
+        job = _job(service, service.settings.job)
         return actions.reject(job, machine.name, version, wish.actor, wish.reason, seen=wish.seen)
     return decisions.reject(service.store, machine, version, wish.actor, wish.reason, seen=wish.seen)
 
@@ -96,7 +105,7 @@ def reject(service: Service, machine: MachineRecord, version: int, wish: Wish) -
 def rollback(service: Service, machine: MachineRecord, to: int, wish: Wish) -> DecisionRecord:
     """Roll back as ``compgen recal rollback`` does."""
     if service.settings.job is not None:
-        job = read_job(service.settings.job)
+        job = _job(service, service.settings.job)
         return actions.rollback(job, machine.name, wish.actor, wish.reason, to=to, seen=wish.seen)
     return decisions.rollback(service.store, machine, wish.actor, wish.reason, to=to, seen=wish.seen)
 
