@@ -16,6 +16,7 @@ from compgen.controllers.base import Controller, SourceFile, Term, Usage, covera
 from compgen.controllers.grids import take_loss_mm, uneven_nodes_mm
 from compgen.controllers.linuxcnc.comp_notes import dead_zone_warnings, parameters, sign_statement
 from compgen.controllers.linuxcnc.comp_table import MOST_ROWS, CompTable, parse_comp
+from compgen.controllers.linuxcnc.text import MM_PER_UNIT, take_machine_units
 from compgen.controllers.terms import one_dimensional_name, one_dimensional_terms
 from compgen.core import tomlio
 from compgen.core.csvio import FloatArray, fixed
@@ -44,12 +45,19 @@ class CompSettings:
     loss_mm : loss by interpolation between rows that is worth no further row.
     servo_period_us : [EMCMOT] SERVO_PERIOD, for the warning about small reversal steps.
     max_acceleration_mm_s2 : [JOINT_n] MAX_ACCELERATION of X, Y, Z, for the same, or None if not stated.
+    machine_units : [TRAJ] LINEAR_UNITS, ``"mm"`` or ``"inch"``: what the numbers of the files mean to the control.
     """
 
     comp_file_type: int
     loss_mm: float
     servo_period_us: float
     max_acceleration_mm_s2: tuple[float, float, float] | None
+    machine_units: str
+
+    @property
+    def mm_per_unit(self) -> float:
+        """Length of one machine unit, mm."""
+        return MM_PER_UNIT[self.machine_units]
 
 
 @dataclass(frozen=True)
@@ -73,6 +81,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
             loss_mm=take_loss_mm(section),
             servo_period_us=section.take("servo_period_us", tomlio.positive, 1000.0),
             max_acceleration_mm_s2=section.take("max_acceleration_mm_s2", _positive3, None),
+            machine_units=take_machine_units(section),
         )
         section.finish()
         return settings
@@ -80,7 +89,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
     def basis(self, machine: Machine, settings: CompSettings, errors: ErrorTable) -> list[Term]:
         """Return X(x), Y(y), Z(z) with rows where the curves need them."""
         nodes = [
-            _written(uneven_nodes_mm(machine, errors, axis, loss_mm=settings.loss_mm, most=MOST_ROWS))
+            _written_mm(uneven_nodes_mm(machine, errors, axis, loss_mm=settings.loss_mm, most=MOST_ROWS), settings)
             for axis in range(3)
         ]
         return one_dimensional_terms(machine, errors, nodes, [(axis, axis) for axis in range(3)])
@@ -93,7 +102,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         for axis in range(3):
             term = next(item for item in basis if item.name == one_dimensional_name(axis, axis))
             trims = values[term.name]
-            found[axis] = _as_written(settings, CompTable(term.nodes_mm, trims, trims))
+            found[axis] = _as_written(settings, term.nodes_mm, trims, trims)
         return CompTables(found)
 
     def reversal_in_tables(self, settings: CompSettings, reversal: ReversalCurves) -> ReversalCurves:
@@ -111,12 +120,12 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
             table = found[axis]
             low, high = machine.axes[axis].range_mm
             inside = curve.position_mm[(curve.position_mm >= low) & (curve.position_mm <= high)]
-            nodes = np.union1d(table.nominal_mm, _written(inside))
+            nodes = np.union1d(table.nominal_mm, _written_mm(inside, settings))
             nodes = table.nominal_mm if len(nodes) > MOST_ROWS else nodes
             half = 0.5 * curve.at(nodes)
             forward = np.interp(nodes, table.nominal_mm, table.forward_mm) - half
             reverse = np.interp(nodes, table.nominal_mm, table.reverse_mm) + half
-            found[axis] = _as_written(settings, CompTable(nodes, forward, reverse))
+            found[axis] = _as_written(settings, nodes, forward, reverse)
         return CompTables(found)
 
     def backlash_parameters(
@@ -128,10 +137,13 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
     def context(self, machine: Machine, settings: CompSettings, tables: CompTables) -> dict[str, Any]:
         """Return rows by axis letter, INI lines, and what to know of small reversal steps."""
         return {
-            "sign_statement": sign_statement(settings.comp_file_type, tables.tables),
-            "parameters": parameters(settings.comp_file_type, settings.servo_period_us, tables.tables, FILES),
+            "sign_statement": sign_statement(settings.comp_file_type, settings.machine_units, tables.tables),
+            "parameters": parameters(
+                settings.comp_file_type, settings.machine_units, settings.servo_period_us, tables.tables, FILES
+            ),
             "warnings": dead_zone_warnings(settings.servo_period_us, settings.max_acceleration_mm_s2, tables.tables),
             "comp_file_type": settings.comp_file_type,
+            "unit": settings.machine_units,
             "tables": [
                 {"letter": AXES[axis], "joint": axis, "file": FILES[axis], "rows": _rows(settings, table)}
                 for axis, table in sorted(tables.tables.items())
@@ -145,7 +157,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
             axis = _axis_of(source)
             if axis in found:
                 raise source.fail(f"is a second file for {AXES[axis]}; give one per joint")
-            found[axis] = parse_comp(source, settings.comp_file_type)
+            found[axis] = parse_comp(source, settings.comp_file_type, settings.mm_per_unit)
         if not found:
             raise InputError(f"no COMP_FILE was given; {', '.join(FILES)} are due")
         return CompTables(found)
@@ -165,11 +177,16 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         return added
 
     def violations(self, machine: Machine, settings: CompSettings, tables: CompTables) -> list[str]:
-        """Return joints without a table, and travel that a table leaves out."""
+        """Return joints without a table, and travel that a table leaves out: that of a file in another unit among them."""
         found = [f"there is no COMP_FILE for {AXES[axis]}" for axis in range(3) if axis not in tables.tables]
         for axis, table in sorted(tables.tables.items()):
             first, last = table.nominal_mm[0], table.nominal_mm[-1]
-            found += coverage_violations(machine, axis, first, last, f"the COMP_FILE of {AXES[axis]}")
+            left_out = coverage_violations(machine, axis, first, last, f"the COMP_FILE of {AXES[axis]}")
+            other = "inch" if settings.machine_units == "mm" else "mm"
+            share = MM_PER_UNIT[other] / settings.mm_per_unit
+            if left_out and not coverage_violations(machine, axis, first * share, last * share, ""):
+                left_out = [f"{text}; in {other} it would cover it: is machine_units right?" for text in left_out]
+            found += left_out
         return found
 
     def resolution_mm(self, settings: CompSettings) -> float:
@@ -199,21 +216,29 @@ def _written(values: FloatArray, digits: int = POSITION_DIGITS) -> FloatArray:
     return np.array([float(fixed(value, digits)) for value in values.tolist()])
 
 
-def _as_written(settings: CompSettings, table: CompTable) -> CompTable:
-    """Return the table as it is read back from its text."""
-    rows = np.array(_rows(settings, table))
-    nominal, forward, reverse = (_written(column) for column in rows.T)
+def _written_mm(position_mm: FloatArray, settings: CompSettings) -> FloatArray:
+    """Positions as the file has them, in mm: two that are equal in the file are equal here, to the last bit."""
+    return _written(position_mm / settings.mm_per_unit) * settings.mm_per_unit
+
+
+def _as_written(
+    settings: CompSettings, nominal_mm: FloatArray, forward_mm: FloatArray, reverse_mm: FloatArray
+) -> CompTable:
+    """Return the table of these positions and trims as it is read back from its text."""
+    unit = settings.mm_per_unit
+    table = CompTable(nominal_mm / unit, forward_mm / unit, reverse_mm / unit, unit)
+    nominal, forward, reverse = (_written(column) for column in np.array(_rows(settings, table)).T)
     if settings.comp_file_type == 0:
         forward, reverse = nominal - forward, nominal - reverse
-    return CompTable(nominal, forward, reverse)
+    return CompTable(nominal, forward, reverse, unit)
 
 
 def _rows(settings: CompSettings, table: CompTable) -> list[list[float]]:
-    """Rows of the file: nominal, then trims (type 1) or actual positions (type 0)."""
-    forward, reverse = table.forward_mm, table.reverse_mm
+    """Rows of the file, in machine units: nominal, then trims (type 1) or actual positions (type 0)."""
+    forward, reverse = table.forward, table.reverse
     if settings.comp_file_type == 0:
-        forward, reverse = table.nominal_mm - forward, table.nominal_mm - reverse
-    return [list(row) for row in zip(table.nominal_mm.tolist(), forward.tolist(), reverse.tolist(), strict=True)]
+        forward, reverse = table.nominal - forward, table.nominal - reverse
+    return [list(row) for row in zip(table.nominal.tolist(), forward.tolist(), reverse.tolist(), strict=True)]
 
 
 def _axis_of(source: SourceFile) -> int:

@@ -14,23 +14,30 @@ _SECONDS_PER_US = 1e-6
 _NO_STEP_MM = 1e-9
 
 
-def sign_statement(file_type: int, tables: Mapping[int, CompTable]) -> str:
+def sign_statement(file_type: int, unit: str, tables: Mapping[int, CompTable]) -> str:
     """Return the sign in words with a number from the file."""
-    axis, table = max(tables.items(), key=lambda item: float(np.max(np.abs(item[1].forward_mm))))
-    row = int(np.argmax(np.abs(table.forward_mm)))
-    position, trim = float(table.nominal_mm[row]), float(table.forward_mm[row])
-    written = f"the trim {trim:+.6f}" if file_type == 1 else f"the actual position {position - trim:.6f}"
+    axis, table = max(tables.items(), key=lambda item: float(np.max(np.abs(item[1].forward))))
+    row = int(np.argmax(np.abs(table.forward)))
+    position, trim = float(table.nominal[row]), float(table.forward[row])
+    places = 6 if unit == "mm" else 8
+    written = f"the trim {trim:+.{places}f}" if file_type == 1 else f"the actual position {position - trim:.{places}f}"
     return (
         f"COMP_FILE_TYPE {file_type}: the trim is ADDED to the motor command. The file of {AXES[axis]} has {written} at "
-        f"{position:g} mm (forward), so the motor is sent to {position + trim:.6f} mm there."
+        f"{position:.9g} {unit} (forward), so the motor is sent to {position + trim:.{places}f} {unit} there."
     )
 
 
 def parameters(
-    file_type: int, servo_period_us: float, tables: Mapping[int, CompTable], files: Sequence[str]
+    file_type: int, unit: str, servo_period_us: float, tables: Mapping[int, CompTable], files: Sequence[str]
 ) -> list[dict[str, str]]:
-    """Return the INI lines of each joint, and the accelerations at which a reversal step may be lost."""
-    rows = []
+    """Return the INI lines of each joint, and the accelerations at which a reversal step may be lost, in machine units."""
+    rows = [
+        {
+            "name": "[TRAJ] LINEAR_UNITS",
+            "value": unit,
+            "meaning": "unit of all numbers in the files; LinuxCNC takes them in its own unit, whatever they were meant in",
+        }
+    ]
     for axis, table in sorted(tables.items()):
         section = f"[JOINT_{axis}]"
         rows.append({"name": f"{section} COMP_FILE", "value": files[axis], "meaning": f"the file of {AXES[axis]}"})
@@ -44,11 +51,14 @@ def parameters(
         )
         steps = table.step_mm[table.step_mm > _NO_STEP_MM]
         if len(steps):
-            low, high = _lost_between(float(steps.min()), float(steps.max()), servo_period_us)
+            low, high = (
+                value / table.mm_per_unit
+                for value in _lost_between(float(steps.min()), float(steps.max()), servo_period_us)
+            )
             rows.append(
                 {
                     "name": f"{section} MAX_ACCELERATION",
-                    "value": f"not {low:.0f} ... {high:.0f} mm/s2",
+                    "value": f"not {low:.0f} ... {high:.0f} {unit}/s2",
                     "meaning": f"with SERVO_PERIOD {servo_period_us:g} us; within, the reversal step of {AXES[axis]} may "
                     "not be applied from standstill",
                 }

@@ -28,23 +28,40 @@ _COLUMNS = ("the nominal position", "the forward value", "the reverse value")
 
 @dataclass(frozen=True)
 class CompTable:
-    """One COMP_FILE: ``nominal_mm`` (n,) strictly increasing, ``forward_mm`` and ``reverse_mm`` (n,) are trims, added."""
+    """One COMP_FILE with the numbers of its text, in machine units of ``mm_per_unit``, in which the control rounds too.
 
-    nominal_mm: FloatArray
-    forward_mm: FloatArray
-    reverse_mm: FloatArray
+    ``nominal`` (n,) is strictly increasing; ``forward`` and ``reverse`` (n,) are trims, which are added.
+    """
+
+    nominal: FloatArray
+    forward: FloatArray
+    reverse: FloatArray
+    mm_per_unit: float = 1.0
+
+    @property
+    def nominal_mm(self) -> FloatArray:
+        """Positions of the rows, mm."""
+        return self.nominal * self.mm_per_unit
+
+    @property
+    def forward_mm(self) -> FloatArray:
+        """Trims while the joint moves up, mm."""
+        return self.forward * self.mm_per_unit
+
+    @property
+    def reverse_mm(self) -> FloatArray:
+        """Trims while the joint moves down, mm."""
+        return self.reverse * self.mm_per_unit
 
     def at(self, position_mm: FloatArray, direction: int) -> FloatArray:
         """Return the correction at joint positions (m,) in the direction +1 or -1, bit for bit as the control."""
-        trims = (self.forward_mm if direction > 0 else self.reverse_mm).astype(np.float32)
-        slopes = _slopes(self.nominal_mm, trims)
-        position = np.asarray(position_mm, dtype=np.float64)
-        row = np.searchsorted(self.nominal_mm, position, side="right") - 1
+        trims = (self.forward if direction > 0 else self.reverse).astype(np.float32)
+        slopes = _slopes(self.nominal, trims)
+        position = np.asarray(position_mm, dtype=np.float64) / self.mm_per_unit
+        row = np.searchsorted(self.nominal, position, side="right") - 1
         inside = np.clip(row, 0, len(trims) - 1)
-        found = trims[inside].astype(np.float64) + slopes[inside].astype(np.float64) * (
-            position - self.nominal_mm[inside]
-        )
-        return np.where(row < 0, np.float64(trims[0]), found)
+        found = trims[inside].astype(np.float64) + slopes[inside].astype(np.float64) * (position - self.nominal[inside])
+        return np.where(row < 0, np.float64(trims[0]), found) * self.mm_per_unit
 
     @property
     def step_mm(self) -> FloatArray:
@@ -52,10 +69,10 @@ class CompTable:
         return np.abs(self.forward_mm - self.reverse_mm)
 
 
-def _slopes(nominal_mm: FloatArray, trims: NDArray[np.float32]) -> NDArray[np.float32]:
+def _slopes(nominal: FloatArray, trims: NDArray[np.float32]) -> NDArray[np.float32]:
     """Slopes behind each row, float32 of the float32 differences; zero behind the last."""
     differences = (trims[1:] - trims[:-1]).astype(np.float64)
-    return np.append((differences / np.diff(nominal_mm)).astype(np.float32), np.float32(0.0))
+    return np.append((differences / np.diff(nominal)).astype(np.float32), np.float32(0.0))
 
 
 def standstill_outcome(step_mm: float, acceleration_mm_s2: float, period_s: float) -> str:
@@ -73,13 +90,14 @@ def standstill_outcome(step_mm: float, acceleration_mm_s2: float, period_s: floa
     return "never" if abs(step_mm) <= RAMPED * unit_mm else "ramped"
 
 
-def parse_comp(source: SourceFile, file_type: int) -> CompTable:
+def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> CompTable:
     """Read a COMP_FILE strictly.
 
     Parameters
     ----------
     source : the text; CRLF, exponents and further columns are what the control takes too.
     file_type : 0: nominal, actual forward, actual reverse (the trim is nominal minus actual); 1: the trims themselves.
+    mm_per_unit : unit of the machine, in which the file is written; the file itself does not say it.
 
     Raises
     ------
@@ -103,8 +121,8 @@ def parse_comp(source: SourceFile, file_type: int) -> CompTable:
         raise source.fail("holds no row; is it the right file, or was it cut?", 1)
     nominal, forward, reverse = np.array(rows).T
     if file_type == 0:
-        return CompTable(nominal, nominal - forward, nominal - reverse)
-    return CompTable(nominal, forward, reverse)
+        return CompTable(nominal, nominal - forward, nominal - reverse, mm_per_unit)
+    return CompTable(nominal, forward, reverse, mm_per_unit)
 
 
 def _row(source: SourceFile, line: int, text: str, above: list[tuple[float, ...]]) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Text that LinuxCNC reads: lines one by one, so that garbage of any size fails at its first wrong line; numbers."""
+"""Text that LinuxCNC reads: lines one by one, so that garbage of any size fails at its first wrong line; numbers; units."""
 
 from __future__ import annotations
 
@@ -7,12 +7,21 @@ import re
 from collections.abc import Iterator
 
 from compgen.controllers.base import SourceFile
+from compgen.core.tomlio import Section, choice
 
 #: A number as C reads it with %lf, less hexadecimal digits, ``inf`` and ``nan``.
 _NUMBER = re.compile(r"[+-]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][+-]?\d{1,4})?")
 _BLANK = re.compile(r"[ \t\r\n]*+")
 #: What is quoted of a wrong word.
 SHOWN = 40
+#: Lengths of one unit of the machine, [TRAJ] LINEAR_UNITS: everything that LinuxCNC reads is in machine units.
+MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
+
+
+def take_machine_units(section: Section) -> str:
+    """Return the setting ``machine_units``: [TRAJ] LINEAR_UNITS of the machine, ``"mm"`` (the default) or ``"inch"``."""
+    units: str = section.take("machine_units", choice(*MM_PER_UNIT), "mm")
+    return units
 
 
 def check_size(source: SourceFile, most: int) -> None:
