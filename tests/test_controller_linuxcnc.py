@@ -160,6 +160,45 @@ def test_the_exported_files_add_minus_the_error(file_type):
     assert np.array_equal(parsed(COMP, machine, texts).tables[0].forward_mm, tables.tables[0].forward_mm)
 
 
+@pytest.mark.parametrize("file_type", [0, 1])
+def test_files_for_an_inch_machine_hold_inches(file_type):
+    """EXX = +0.0127 mm (0.0005 inch) at 500 mm (19.685039370 inch): that trim, with the opposite sign, at that place."""
+    machine = machine_with(comp={"comp_file_type": file_type, "machine_units": "inch"})
+    curve = Curve(np.array([-300.0, 500.0]), np.array([0.0, 0.0127]), np.full(2, np.nan))
+    tables, texts = built(COMP, machine, ErrorTable({"EXX": curve}))
+    last = texts["joint0-x.comp"].splitlines()[-1].split()
+    assert last == ["19.685039370", *(["-0.000500000"] * 2 if file_type else ["19.685539370"] * 2)]
+    points = Points(np.array([[500.0, 0, 0], [100.0, 0, 0]]))
+    assert added(COMP, machine, texts, points)[:, 0] == pytest.approx([-0.0127, -0.00635], abs=COMP_QUANTUM_MM)
+    read = parsed(COMP, machine, texts)
+    assert np.array_equal(read.tables[0].forward, tables.tables[0].forward)
+    control = controller_named(COMP)
+    assert control.violations(machine, control.read_settings(machine), read) == []
+    metric = machine_with(comp={"comp_file_type": file_type})
+    found = control.violations(metric, control.read_settings(metric), parsed(COMP, metric, texts))
+    assert len(found) == 3
+    assert all("in inch it would cover it: is machine_units right?" in text for text in found)
+
+
+def test_an_inch_machine_is_corrected_as_one_in_mm_reversal_too_and_the_preflight_says_the_unit():
+    unknown = np.full(3, np.nan)
+    nodes = np.array([-300.0, 20.0, 500.0])
+    backlash = ReversalCurves({(0, 0): Curve(nodes, np.array([-0.006, 0.002, 0.004]), unknown)})
+    points = random_points(machine_with(), beyond=0.0)
+    found = {}
+    for unit in ("mm", "inch"):
+        machine = machine_with(comp={"machine_units": unit})
+        made = compgen.export(machine, random_errors(machine), COMP, reversal=backlash)
+        assert f"**The files are in {unit}**" in made.preflight
+        assert f"| `[TRAJ] LINEAR_UNITS` | {unit} |" in made.preflight
+        assert f"{unit}/s2" in made.preflight
+        found[unit] = [
+            added(COMP, machine, made.files, Points(points, approach=np.full((40, 3), way))) for way in (1.0, -1.0)
+        ]
+    assert np.max(np.abs(np.subtract(found["mm"], found["inch"]))) < 2 * COMP_QUANTUM_MM
+    assert np.max(np.abs(found["mm"])) > 0.01
+
+
 def test_exported_files_hold_rows_of_three_plain_numbers_and_nothing_else():
     machine = machine_with()
     x = np.linspace(*TRAVELS[0], 900)
@@ -385,6 +424,63 @@ def test_what_is_written_is_read_back_to_the_last_digit():
         assert np.array_equal(added(VOLUMETRIC, machine, again, points), added(VOLUMETRIC, machine, texts, points))
 
 
+@pytest.mark.parametrize("form", ["curves", "grid"])
+def test_a_table_in_inch_is_the_table_in_mm(form):
+    """1 inch is 25.4 mm: what is added at a point is the same; the text says its unit, and its numbers are in inch."""
+    machine = machine_with().with_setting(VOLUMETRIC, "form", form)
+    inch = machine.with_setting(VOLUMETRIC, "machine_units", "inch")
+    errors = random_errors(machine)
+    _, metric = built(VOLUMETRIC, machine, errors)
+    tables, texts = built(VOLUMETRIC, inch, errors)
+    assert metric["volcomp.tab"].startswith("volcomp 1\nunit mm\n")
+    assert texts["volcomp.tab"].startswith("volcomp 1\nunit inch\n")
+    tool = None if form == "grid" else np.random.default_rng(2).uniform(-200, 200, (40, 3))
+    points = Points(random_points(machine), tool)
+    assert np.max(np.abs(added(VOLUMETRIC, inch, texts, points) - added(VOLUMETRIC, machine, metric, points))) < 1e-8
+    read = parsed(VOLUMETRIC, inch, texts)
+    assert np.array_equal(read.error(points.position_mm, np.zeros(3)), tables.error(points.position_mm, np.zeros(3)))
+    control = controller_named(VOLUMETRIC)
+    assert control.violations(inch, control.read_settings(inch), read) == []
+    assert any("is in inch" in text for text in control.violations(machine, control.read_settings(machine), read))
+    start, step = texts["volcomp.tab"].split("\n")[2].split()[-2:] if form == "curves" else (None, None)
+    if form == "curves":
+        assert float(start) == pytest.approx(-300 / 25.4, abs=1e-11)
+        assert float(step) == pytest.approx(160 / 25.4, abs=1e-11)
+    assert "LINEAR_UNITS = inch" in texts["volkins.ini"]
+    assert "MIN_LIMIT = -11.811024\nMAX_LIMIT = 19.685040" in texts["volkins.ini"]  # -300 ... 500 mm, outward
+
+
+HAND_INCH = """volcomp 1
+unit inch
+curve EXX 0 2 -10 20 0.001 0.003
+curve ECX 0 2 -10 20 1e-5 3e-5
+term 0 EXX 1 1
+term 0 ECX -1 y term 1 ECX 1 tx
+{more}end
+"""
+
+
+@pytest.mark.parametrize(("more", "ez_inch"), [("", 0.0), ("term 2 EXX 2 z\n", 2 * 0.002 * 4.0)])
+def test_a_hand_written_table_in_inch_gives_the_hand_worked_error(more, ez_inch):
+    """At X 0 Y 5 Z 4 inch, tool 3 inch: EX = 0.002 - 5 * 2e-5 inch, EY = 3 * 2e-5 inch; also a curve used in both ways."""
+    table = parse_volcomp(SourceFile(Path("t"), signed(HAND_INCH.format(more=more))))
+    found = table.error(np.array([[0.0, 5 * 25.4, 4 * 25.4]]), np.array([3 * 25.4, 0.0, 0.0]))[0]
+    assert found == pytest.approx([25.4 * 0.0019, 25.4 * 6e-5, 25.4 * ez_inch], abs=1e-15)
+
+
+def test_the_setting_of_joints_names_axes():
+    machine = machine_with().with_setting(VOLUMETRIC, "coordinates", "xyyza")
+    _, texts = built(VOLUMETRIC, machine, random_errors(machine))
+    assert "coordinates=XYYZA\nJOINTS = 5" in texts["volkins.ini"]
+    for joint, low in ((1, "-151.000000"), (2, "-151.000000"), (3, "-421.000000")):
+        assert f"[JOINT_{joint}]\nMIN_LIMIT = {low}" in texts["volkins.ini"]
+    assert "[JOINT_4]" not in texts["volkins.ini"]
+    assert "loadrt volcomp" not in texts["volcomp.hal"]  # a gantry needs volkins
+    for wrong in ("XYA", "XYZQ", 3, "XYZ" * 6):
+        with pytest.raises(InputError, match="the axis of each joint"):
+            built(VOLUMETRIC, machine.with_setting(VOLUMETRIC, "coordinates", wrong), random_errors(machine))
+
+
 def test_a_grid_is_the_curves_at_its_vertices_for_the_tool_of_the_machine():
     machine = machine_with()
     errors = random_errors(machine)
@@ -437,6 +533,10 @@ MALFORMED = [
     ("", 1, "due"),
     ("hello 1\n", 1, "volcomp"),
     ("volcomp 2\nend\n", 1, "volcomp"),
+    ("volcomp 1\nunit cm\ncurve A 0 1 0 1 0.1\nterm 0 A 1 x\nend\n", 2, "not a unit"),
+    ("volcomp 1\nunit\nend\n", 3, "not a unit"),
+    ("volcomp 1\nunit mm\nunit mm\ncurve A 0 1 0 1 0.1\nterm 0 A 1 x\nend\n", 3, "due"),
+    ("volcomp 1\ncurve A 0 1 0 1 0.1\nunit inch\nterm 0 A 1 x\nend\n", 3, "due"),
     ("volcomp 1\nend\n", 2, "terms or a grid"),
     ("volcomp 1\ncurve A 0 2 0 1\n0.1\n0,2\nend\n", 4, "decimal point"),
     ("volcomp 1\ncurve A 3 2 0 1 0.1 0.2\nend\n", 2, "axis"),
@@ -484,7 +584,8 @@ def test_a_table_that_was_changed_or_cut_is_refused(text, words):
 def test_files_beside_the_table_must_be_whole_and_the_table_there_once():
     machine = machine_with()
     _, texts = built(VOLUMETRIC, machine, random_errors(machine))
-    assert set(texts) == {"volcomp.tab", "volkins.ini", "volkins.hal", "volkins.comp", "volcomp.comp", "volcomp.h"}
+    sources = {"volkins.comp", "volcomp.comp", "volcomp.h", "COPYING"}
+    assert set(texts) == {"volcomp.tab", "volkins.ini", "volkins.hal", "volcomp.hal"} | sources
     for name, text in texts.items():
         for cut in (0, len(text) // 2, len(text) - 2):
             with pytest.raises(InputError):
@@ -501,7 +602,8 @@ def test_the_sources_are_exported_as_they_are_with_their_licence():
     for name in ("volkins.comp", "volcomp.comp", "volcomp.h"):
         assert texts[name] == (folder / name).read_text()
         assert texts[name].startswith("// SPDX-License-Identifier: GPL-2.0-or-later")
-    assert "GNU GENERAL PUBLIC LICENSE" in (folder / "COPYING").read_text()
+    assert "GNU GENERAL PUBLIC LICENSE" in texts["COPYING"]
+    assert texts["COPYING"] == (folder / "COPYING").read_text()
 
 
 def test_errors_too_steep_for_an_inverse_are_a_violation_and_no_endless_loop():
@@ -568,18 +670,19 @@ def reader(tmp_path_factory):
 
 
 @needs_c
-@pytest.mark.parametrize("form", ["curves", "grid"])
-def test_c_and_the_emulator_agree_to_the_last_digits(form, reader, tmp_path):
-    machine = machine_with().with_setting(VOLUMETRIC, "form", form)
+@pytest.mark.parametrize(("form", "unit"), [("curves", "mm"), ("grid", "mm"), ("curves", "inch"), ("grid", "inch")])
+def test_c_and_the_emulator_agree_to_the_last_digits(form, unit, reader, tmp_path):
+    machine = machine_with().with_setting(VOLUMETRIC, "form", form).with_setting(VOLUMETRIC, "machine_units", unit)
+    scale = {"mm": 1.0, "inch": 25.4}[unit]
     _, texts = built(VOLUMETRIC, machine, random_errors(machine))
     (tmp_path / "t").write_text(texts["volcomp.tab"])
     corners = np.stack(np.meshgrid(*(axis.nodes_mm for axis in machine.axes), indexing="ij"), -1).reshape(-1, 3)
     points = np.vstack([random_points(machine, 3000, beyond=200.0), corners])
     tool = np.random.default_rng(6).uniform(-300, 300, points.shape)
-    np.hstack([points, tool]).tofile(tmp_path / "points")
+    (np.hstack([points, tool]) / scale).tofile(tmp_path / "points")
     words = [str(reader), "-e", str(tmp_path / "t"), str(tmp_path / "points"), str(tmp_path / "out")]
     assert subprocess.run(words, timeout=30, check=False).returncode == 0
-    found = np.fromfile(tmp_path / "out").reshape(-1, 6)
+    found = np.fromfile(tmp_path / "out").reshape(-1, 6) * scale
     table = parsed(VOLUMETRIC, machine, texts)
     assert np.max(np.abs(found[:, :3] - table.error(points, tool))) < 1e-15
     assert np.max(np.abs(found[:, 3:] - table.inverse(points, tool))) < AGREEMENT_MM
@@ -594,6 +697,7 @@ def test_c_refuses_exactly_the_tables_that_the_parser_refuses(reader, tmp_path):
     texts += [good[:k] + "7" + good[k:] for k in range(len(good))]
     texts += [signed(BODY[:k] + change + BODY[k:]) for k in range(len(BODY)) for change in ("-", " ", "e", ".", "#")]
     texts += list(golden(VOLUMETRIC, "hand.tab", "grid.tab").values())
+    texts += [signed(HAND_INCH.format(more="")), signed(BODY.replace("1\n", "1\nunit mm\n", 1))]
     for k, text in enumerate(texts):
         (tmp_path / f"{k:04}").write_text(text, newline="")
     paths = [str(tmp_path / f"{k:04}") for k in range(len(texts))]

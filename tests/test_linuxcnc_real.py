@@ -90,10 +90,10 @@ TOOL_TABLE = tool.tbl
 HALFILE = mill.hal
 [KINS]
 KINEMATICS = {kinematics}
-JOINTS = 3
+JOINTS = {joints}
 [TRAJ]
-COORDINATES = X Y Z
-LINEAR_UNITS = mm
+COORDINATES = {coordinates}
+LINEAR_UNITS = {units}
 ANGULAR_UNITS = degree
 DEFAULT_LINEAR_VELOCITY = 1000
 MAX_LINEAR_VELOCITY = 5000
@@ -106,10 +106,12 @@ MIN_LIMIT = -2000
 MAX_LIMIT = 2000
 MAX_VELOCITY = 5000
 MAX_ACCELERATION = {axis_acceleration}
+"""
+JOINT = """\
 [JOINT_{joint}]
-TYPE = LINEAR
-HOME = 0
-HOME_OFFSET = 0
+TYPE = {kind}
+HOME = {home}
+HOME_OFFSET = {home}
 HOME_SEARCH_VEL = 0
 HOME_LATCH_VEL = 0
 HOME_SEQUENCE = 0
@@ -228,28 +230,42 @@ def sampler(sampled, wiring):
 
 
 def session(workshop, steps, sampled, *, kinematics="trivkins coordinates=XYZ", more=("", "", ""), hal=None, files=None,
-            acceleration=PASSING, axis_acceleration=1e5, pins=()):  # fmt: skip
+            acceleration=PASSING, axis_acceleration=1e5, pins=(), coordinates="XYZ", units="mm",
+            home=(0.0, 0.0, 0.0)):  # fmt: skip
     """Run commands on the control; returns samples by pin name, pins at the end, messages, and whether it started.
 
     ``files`` beside the INI file; a ``volkins.hal`` among them is read as second HAL file and brings the e-stop chain.
+    ``coordinates`` is the axis of each joint; ``home`` the position of X, Y and Z that homing gives to a joint where it rests.
     """
     files = files or {}
-    ini = INI.format(kinematics=kinematics, acceleration=acceleration)
+    at_home = dict(zip("XYZ", home, strict=True))
+    ini = INI.format(kinematics=kinematics, acceleration=acceleration, joints=len(coordinates), units=units,
+                     coordinates=" ".join(coordinates))  # fmt: skip
     ini += "".join(
-        AXIS.format(
-            letter=letter, joint=joint, more=more[joint], acceleration=acceleration, axis_acceleration=axis_acceleration
-        )
-        for joint, letter in enumerate("XYZ")
+        AXIS.format(letter=letter, axis_acceleration=axis_acceleration) for letter in sorted(set(coordinates))
+    )
+    ini += "".join(
+        JOINT.format(
+            joint=joint,
+            kind="ANGULAR" if letter in "ABC" else "LINEAR",
+            home=at_home.get(letter, 0.0),
+            acceleration=acceleration,
+            more=more[joint] if joint < len(more) else "",
+        )  # fmt: skip
+        for joint, letter in enumerate(coordinates)
     )
     second = files.get("volkins.hal", "")
-    wiring = (hal or "".join(LOOP.format(k=k) for k in range(3))) + ("" if second else ENABLE)
+    wiring = (hal or "".join(LOOP.format(k=k) for k in range(len(coordinates)))) + (
+        "" if "iocontrol.0.emc-enable-in" in second + (hal or "") else ENABLE
+    )
     if second:
         ini = ini.replace("HALFILE = mill.hal", "HALFILE = mill.hal\nHALFILE = volkins.hal")
     wiring += sampler(sampled, wiring + second)
+    channels = "".join("b" if name.endswith("settling") else "f" for name in sampled)
     texts = {
         "mill.ini": ini,
-        "mill.hal": HAL.format(cfg="f" * len(sampled), more=wiring),
-        "plan.json": json.dumps({"steps": steps, "channels": len(sampled), "pins": list(pins)}),
+        "mill.hal": HAL.format(cfg=channels, more=wiring),
+        "plan.json": json.dumps({"steps": steps, "channels": channels, "pins": list(pins)}),
         "tool.tbl": "T1 P1 Z80\n",
     }
     here, output = launch(workshop, ["linuxcnc", "-r", "mill.ini"], {**texts, **files})
@@ -305,28 +321,33 @@ def tool_error(errors, reversal, joint, motor, command, velocity):
     return motor + errors.curves[f"E{axis}{axis}"].at(motor) + moved - command
 
 
-@pytest.mark.parametrize("file_type", [1, 0])
+@pytest.mark.parametrize(("file_type", "unit"), [(1, "mm"), (0, "mm"), (1, "inch"), (0, "inch")])
 def test_comp_files_act_bit_for_bit_as_emulated_and_the_error_shrinks_a_thousandfold(
-    file_type, workshop, small_machine, positioning, reversal
+    file_type, unit, workshop, small_machine, positioning, reversal
 ):
     machine = small_machine.with_setting("linuxcnc-comp", "comp_file_type", file_type)
+    machine = machine.with_setting("linuxcnc-comp", "machine_units", unit)
     made = compgen.export(machine, positioning, "linuxcnc-comp", reversal=reversal)
     control = controller_named("linuxcnc-comp")
     settings = control.read_settings(machine)
     tables = control.parse(machine, settings, [SourceFile(Path(name), text) for name, text in made.files.items()])
     steps = [{"mdi": line} for line in MOVES]
-    done = session(workshop, steps, JOINT_PINS, more=comp_lines(file_type), files=made.files)
+    done = session(workshop, steps, JOINT_PINS, more=comp_lines(file_type), files=made.files, units=unit)
     assert done.messages == []
+    scale = {"mm": 1.0, "inch": 25.4}[unit]
     for joint in range(3):
-        position, velocity, corrected, filtered, motor = joint_rows(done.rows, joint)
+        position, velocity, corrected, filtered, motor = (rows * scale for rows in joint_rows(done.rows, joint))
         moving = velocity != 0
         assert np.count_nonzero(moving) > 300
+        assert np.ptp(position) > 200  # mm, in either unit
         points = np.zeros((len(position), 3))
         points[:, joint] = position
         approach = np.zeros_like(points)
         approach[:, joint] = np.sign(velocity)
         added = control.emulate(machine, settings, tables, compgen.Points(points, approach=approach))[:, joint]
-        assert np.array_equal(corrected[moving], added[moving])
+        if unit == "mm":
+            assert np.array_equal(corrected[moving], added[moving])
+        assert np.max(np.abs((corrected - added)[moving])) < AGREEMENT_MM  # mm to inch and back is not bit for bit
         assert np.array_equal(filtered, corrected)
         assert np.max(np.abs(motor - (position + filtered))) < AGREEMENT_MM
         low, high = machine.axes[joint].range_mm
@@ -412,13 +433,15 @@ def table_of(machine, files):
     return control.parse(machine, control.read_settings(machine), sources)
 
 
-def moved_samples(done):
-    """Commanded positions, joint positions and tool offsets (error model) of the samples in world mode.
+#: Tool offset that the kinematics uses in a cycle (error model).
+USED_PINS = [f"volkins.used-{a}" for a in "xyz"]
 
-    The pins of the tool offset are written at the end of a cycle, the kinematics reads them in the next one.
-    """
-    command, joints = columns(done.rows, AXIS_PINS)[1:], columns(done.rows, VOLKINS_PINS[3:6])[1:]
-    tool = -columns(done.rows, VOLKINS_PINS[6:9])[:-1]
+
+def moved_samples(done):
+    """Commanded positions, joint positions and tool offsets (error model) of the samples in world mode, machine units."""
+    command, joints = columns(done.rows, AXIS_PINS), columns(done.rows, VOLKINS_PINS[3:6])
+    volkins = USED_PINS[0] in done.rows
+    tool = columns(done.rows, USED_PINS) if volkins else -columns(done.rows, VOLKINS_PINS[6:9])
     first = int(np.argmax(np.any(np.diff(command, axis=0, prepend=command[:1]) != 0, axis=1)))
     return command[first:], joints[first:], tool[first:]
 
@@ -432,28 +455,31 @@ def reached(workshop, small_machine, small_errors):
     return exact_error(small_machine, small_errors, joints, tool)
 
 
-@pytest.mark.parametrize("form", ["curves", "grid"])
+@pytest.mark.parametrize(("form", "unit"), [("curves", "mm"), ("grid", "mm"), ("curves", "inch"), ("grid", "inch")])
 def test_volkins_agrees_with_the_emulator_in_every_cycle_and_the_error_shrinks(
-    form, workshop, small_machine, small_errors, reached
+    form, unit, workshop, small_machine, small_errors, reached
 ):
     machine = small_machine.with_setting("linuxcnc-volumetric", "form", form)
+    machine = machine.with_setting("linuxcnc-volumetric", "machine_units", unit)
     made = compgen.export(machine, small_errors, "linuxcnc-volumetric")
     done = session(
         workshop,
         [{"program": "part.ngc"}],
-        VOLKINS_PINS,
+        [*VOLKINS_PINS, *USED_PINS],
         kinematics="volkins file=volcomp.tab",
         files={**made.files, "part.ngc": PROGRAM},
         pins=("volkins.loaded", "volkins.fault"),
+        units=unit,
     )
     assert done.messages == []
     assert done.pins == {"volkins.loaded": True, "volkins.fault": False}
-    command, joints, tool = moved_samples(done)
+    command, joints, tool = (rows * (1.0 if unit == "mm" else 25.4) for rows in moved_samples(done))
     assert len(command) > 1000
-    assert set(tool[:, 2].tolist()) == {0.0, -80.0}
+    assert np.ptp(command[:, 0]) > 400  # mm, in either unit
+    assert {0.0, -80.0} <= set(np.round(tool[:, 2], 9).tolist())
     table = table_of(machine, made.files)
     assert np.max(np.abs(joints - table.inverse(command, tool))) < AGREEMENT_MM
-    with_tool = tool[:, 2] == -80.0 if form == "grid" else np.full(len(tool), True)
+    with_tool = np.abs(tool[:, 2] + 80.0) < 1e-9 if form == "grid" else np.full(len(tool), True)
     after = (joints + exact_error(machine, small_errors, joints, tool) - command)[with_tool]
     assert np.max(np.abs(reached)) > 0.02
     assert np.max(np.abs(reached)) > SHRINKS_BY * np.max(np.abs(after))
@@ -503,7 +529,9 @@ def test_without_a_table_coordinated_motion_is_refused_even_past_the_e_stop_chai
 
 LOOKUP = """\
 loadrt threads name1=servo period1=1000000
-loadrt volcomp file=volcomp.tab
+loadrt volcomp file=volcomp.tab units=mm
+setp volcomp.enable TRUE
+setp volcomp.rate 1e9
 addf volcomp.feedback servo
 addf volcomp.command servo
 setp volcomp.gauge-z -5
@@ -528,39 +556,229 @@ def test_the_hal_component_looks_up_as_the_emulator_does(workshop, small_machine
     assert np.max(np.abs(found - expected)) < AGREEMENT_MM
 
 
-CHAIN = (
-    "loadrt volcomp file=volcomp.tab\n"
-    + "".join(
-        f"net pos-{a} joint.{k}.pos-cmd => volcomp.pos-{a}\n"
-        f"net motor-{a} joint.{k}.motor-pos-cmd => volcomp.motor-{a}\n"
-        f"net drive-{a} volcomp.drive-{a} => volcomp.drive-fb-{a}\n"
-        f"net fb-{a} volcomp.motor-fb-{a} => joint.{k}.motor-pos-fb\n"
-        f"net tool-{a} motion.tooloffset.{a} => volcomp.tool-{a}\n"
-        for k, a in enumerate("xyz")
-    )
-    + "addf volcomp.command servo-thread\naddf volcomp.feedback servo-thread\n"
+@pytest.mark.parametrize(
+    ("table_unit", "machine_unit", "stated", "said"),
+    [
+        ("mm", "inch", "", r'the table is in mm, the machine in inch: export it with machine_units = "inch"'),
+        ("mm", "imperial", "", "the table is in mm, the machine in inch"),
+        ("inch", "mm", "", "the table is in inch, the machine in mm"),
+        ("inch", "metric", "", "the table is in inch, the machine in mm"),
+        ("mm", "inch", " units=mm", r"units=mm, but \[TRAJ\] LINEAR_UNITS = inch"),
+        ("mm", "mm", " units=cm", "units=cm is not known"),
+    ],
 )
-
-
-def test_the_hal_component_between_motion_and_drives_corrects_under_the_kinematics_of_the_machine(
-    workshop, small_machine, small_errors
+def test_a_table_in_another_unit_than_the_machine_keeps_it_in_e_stop(
+    table_unit, machine_unit, stated, said, workshop, small_machine, small_errors
 ):
-    """Trivial kinematics: the drive gets the corrected command, the control sees its own one."""
-    files = compgen.export(small_machine, small_errors, "linuxcnc-volumetric").files
-    names = [
-        f"{pin}-{a}" for pin in ("volcomp.pos", "volcomp.drive", "volcomp.motor-fb", "volcomp.tool") for a in "xyz"
-    ]
+    machine = small_machine.with_setting("linuxcnc-volumetric", "machine_units", table_unit)
+    files = compgen.export(machine, small_errors, "linuxcnc-volumetric").files
+    done = session(
+        workshop, [], AXIS_PINS, kinematics=f"volkins file=volcomp.tab{stated}", files=files, pins=("volkins.loaded",),
+        units=machine_unit,
+    )  # fmt: skip
+    assert done.started is False
+    assert done.pins == {"volkins.loaded": False}
+    assert re.search(f"NO COMPENSATION.*volcomp.tab.*{said}", done.output)
+
+
+@pytest.mark.parametrize("stated", ["", " coordinates=XYYZAC"])
+def test_further_axes_and_both_joints_of_a_gantry_get_their_commands(stated, workshop, small_machine, small_errors):
+    """Rotary axes as they are told; the second joint of Y goes with the first; what volkins adds is that of XYZ."""
+    machine = small_machine.with_setting("linuxcnc-volumetric", "coordinates", "XYYZAC")
+    files = compgen.export(machine, small_errors, "linuxcnc-volumetric").files
+    assert "KINEMATICS = volkins file=volcomp.tab coordinates=XYYZAC\nJOINTS = 6" in files["volkins.ini"]
+    names = [*(f"axis.{a}.pos-cmd" for a in "xyzac"), *(f"joint.{k}.coarse-pos-cmd" for k in range(6))]
+    names += ["axis.x.teleop-pos-cmd"]
+    lines = ("G21 G90 G61", "G0 A90", "G1 X-200 Y200 Z-150 A-45 C30 F60000", "G0 C-10")
     done = session(
         workshop,
-        [{"program": "part.ngc"}],
+        [{"mdi": line} for line in lines],
         names,
-        hal=CHAIN,
-        files={"volcomp.tab": files["volcomp.tab"], "part.ngc": PROGRAM},
+        kinematics=f"volkins file=volcomp.tab{stated}",
+        files=files,
+        coordinates="XYYZAC",
+        pins=[*names, "volkins.loaded"],
     )
     assert done.messages == []
-    command, drive, feedback, tool = (columns(done.rows, names[k : k + 3]) for k in (0, 3, 6, 9))
-    assert len(command) > 1000
-    assert np.max(np.abs(drive - command)) > 0.02
-    expected = table_of(small_machine, files).inverse(command, -tool)
-    assert np.max(np.abs(drive - expected)) < AGREEMENT_MM
+    assert done.pins["volkins.loaded"] is True
+    command, joints = columns(done.rows, names[:5]), columns(done.rows, names[5:11])
+    started = int(np.argmax(command[:, 3] != 0))
+    assert np.max(joints[:, 4]) == 90.0
+    assert np.array_equal(joints[started:, 4:], command[started:, 3:])
+    assert np.array_equal(joints[:, 1], joints[:, 2])
+    expected = table_of(machine, files).inverse(command[started:, :3], np.zeros(3))
+    assert np.max(np.abs(joints[started:, [0, 1, 3]] - expected)) < AGREEMENT_MM
+    assert command[-1] == pytest.approx([-200, 200, -150, -45, -10], abs=1e-9)
+    assert np.max(np.abs(joints[-1, [0, 1, 3]] - command[-1, :3])) > 0.005
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "stated", "said"),
+    [
+        ("XYZA", " coordinates=XYZ", r"no joint for A of \[TRAJ\] COORDINATES = X Y Z A"),
+        ("XYZ", " coordinates=XYZA", r"\[KINS\] JOINTS = 3, and the coordinates are for 4 joints"),
+        ("XYZ", " coordinates=XYQ", "'Q' at joint 2 is not one of"),
+        ("XYZ", " coordinates=XYY", "no joint for Z"),
+    ],
+)
+def test_joints_that_do_not_fit_the_ini_file_keep_the_machine_in_e_stop(
+    coordinates, stated, said, workshop, small_machine, small_errors
+):
+    files = compgen.export(small_machine, small_errors, "linuxcnc-volumetric").files
+    done = session(
+        workshop, [], AXIS_PINS, kinematics=f"volkins file=volcomp.tab{stated}", files=files, pins=("volkins.loaded",),
+        coordinates=coordinates,
+    )  # fmt: skip
+    assert done.started is False
+    assert done.pins == {"volkins.loaded": False}
+    assert re.search(f"NO COMPENSATION.*{said}", done.output)
+
+
+def test_a_tool_pin_that_is_not_a_number_stops_volkins_with_an_error(workshop, small_machine, small_errors):
+    files = dict(compgen.export(small_machine, small_errors, "linuxcnc-volumetric").files)
+    files["volkins.hal"] = files["volkins.hal"].replace("net volkins-tool-z", "# net volkins-tool-z")
+    steps = [{"mdi": "G21 G90 G61 G1 X-100 Y50 Z-40 F60000"}, {"set": ["volkins.tool-z", "nan"]}, {"mdi": "G1 X100"}]
+    names = [*VOLKINS_PINS, *(f"joint.{k}.motor-pos-cmd" for k in range(3))]
+    done = session(workshop, steps, names, kinematics="volkins file=volcomp.tab", files=files, pins=("volkins.fault",))
+    assert done.pins == {"volkins.fault": True}
+    assert any("kinematics" in message.lower() for message in done.messages), done.messages
+    drives = columns(done.rows, names[-3:])
+    assert np.all(np.isfinite(drives))
+    assert drives[-1] == pytest.approx([-100, 50, -40], abs=0.1)
+
+
+#: A simulated drive stands where it is sent; the functions in an order for simulation: command before feedback.
+DRIVES = "".join(f"net drive-{a} volcomp.drive-{a} => volcomp.drive-fb-{a}\n" for a in "xyz")
+VOLCOMP_FUNCTIONS = "addf volcomp.command servo-thread\naddf volcomp.feedback servo-thread\n"
+VOLCOMP_NAMES = [
+    f"{pin}-{a}"
+    for pin in ("volcomp.pos", "volcomp.drive", "volcomp.motor-fb", "volcomp.tool", "volcomp.correction")
+    for a in "xyz"
+]
+#: The rate at which volcomp takes up what changes without motion, mm/s, and the servo period.
+RATE_MM_S, PERIOD_S = 0.1, 1e-3
+
+
+def volcomp_session(workshop, machine, errors, steps, *, unit="mm", wired=(), **options):
+    """Run the exported table and HAL file; returns (command, drive, feedback, tool, correction) in mm, table and session."""
+    machine = machine.with_setting("linuxcnc-volumetric", "machine_units", unit)
+    files = compgen.export(machine, errors, "linuxcnc-volumetric").files
+    hal = files["volcomp.hal"] + DRIVES + VOLCOMP_FUNCTIONS
+    for old, new in wired:
+        assert old in hal
+        hal = hal.replace(old, new)
+    done = session(
+        workshop, steps, [*VOLCOMP_NAMES, "volcomp.settling"], hal=hal, units=unit,
+        files={"volcomp.tab": files["volcomp.tab"], "part.ngc": PROGRAM},
+        pins=("volcomp.loaded", "volcomp.settling", "volcomp.fault"), **options,
+    )  # fmt: skip
+    scale = 1.0 if unit == "mm" else 25.4
+    parts = [columns(done.rows, VOLCOMP_NAMES[k : k + 3]) * scale for k in range(0, 15, 3)]
+    return parts, table_of(machine, files), done
+
+
+@pytest.mark.parametrize("unit", ["mm", "inch"])
+def test_the_hal_component_between_motion_and_drives_corrects_under_the_kinematics_of_the_machine(
+    unit, workshop, small_machine, small_errors
+):
+    """Trivial kinematics: the drive gets the corrected command, the control sees its own one."""
+    steps = [{"rest": "volcomp.settling"}, {"program": "part.ngc"}, {"rest": "volcomp.settling"}]
+    parts, table, done = volcomp_session(workshop, small_machine, small_errors, steps, unit=unit)
+    command, drive, feedback, tool, correction = parts
+    assert done.messages == []
+    assert done.pins == {"volcomp.loaded": True, "volcomp.settling": False, "volcomp.fault": False}
+    expected = table.inverse(command, -tool) - command
+    settled = done.rows["volcomp.settling"] == 0
+    settled[: int(np.argmax(np.any(command != 0, axis=1)))] = False
+    assert np.count_nonzero(settled & np.any(np.diff(command, axis=0, prepend=command[:1]) != 0, axis=1)) > 1000
+    assert np.max(np.abs(expected[settled])) > 0.02
+    assert np.max(np.abs((correction - expected)[settled])) < AGREEMENT_MM
+    assert set(np.round(tool[settled, 2], 9).tolist()) == {0.0, 80.0}
+    assert np.max(np.abs(drive - command - correction)) < AGREEMENT_MM
     assert np.max(np.abs(feedback - command)) < AGREEMENT_MM
+
+
+@pytest.mark.parametrize("unit", ["mm", "inch"])
+@pytest.mark.parametrize("home", [(905.0, 0.0, 0.0), (905.0, 250.0, -230.0)])
+def test_homing_and_tool_changes_never_step_the_drives(home, unit, workshop, small_machine, small_errors):
+    """At every cycle without motion the correction changes by the rate at most, through homing twice, G43 and G49."""
+    there = [value / (1.0 if unit == "mm" else 25.4) for value in home]
+    steps = [
+        {"rest": "volcomp.settling"},
+        {"home": -1},
+        {"rest": "volcomp.settling"},
+        {"mdi": "G21 G43.1 Z150"},
+        {"rest": "volcomp.settling"},
+        {"mdi": "G49"},
+        {"rest": "volcomp.settling"},
+    ]
+    parts, table, done = volcomp_session(workshop, small_machine, small_errors, steps, unit=unit, home=there)
+    command, _, _, tool, correction = parts
+    assert done.messages == []
+    assert command[-1] == pytest.approx(home)
+    least = RATE_MM_S * PERIOD_S
+    assert np.max(np.abs(np.diff(correction, axis=0))) < least * (1 + 1e-6)
+    assert np.max(tool[:, 2]) == pytest.approx(150.0)
+    at_home = [(table.inverse(command[-1:], np.array([0, 0, -z])) - command[-1])[0] for z in (0.0, 150.0)]
+    assert correction[-1] == pytest.approx(at_home[0], abs=AGREEMENT_MM)
+    assert np.max(np.abs(at_home[0])) > 100 * least
+    with_tool = np.argmax(tool[:, 2] > 0) + np.argmax(done.rows["volcomp.settling"][np.argmax(tool[:, 2] > 0) :] == 0)
+    assert correction[with_tool] == pytest.approx(at_home[1], abs=AGREEMENT_MM)
+
+
+def test_the_path_waits_until_the_correction_of_a_new_tool_is_there(workshop, small_machine, small_errors):
+    """No motion with a part of the correction: behind G43 the feed is held while the correction settles."""
+    text = "G21 G90 G61\nG1 X-100 Y50 Z-40 F60000\nG43.1 Z150\nG1 X150 Y250 Z-100 F60000\nM2\n"
+    steps = [{"rest": "volcomp.settling"}, {"mdi": "G0 Z-1"}, {"program": "wait.ngc"}, {"rest": "volcomp.settling"}]
+    files = compgen.export(small_machine, small_errors, "linuxcnc-volumetric").files
+    hal = files["volcomp.hal"] + DRIVES + VOLCOMP_FUNCTIONS + "setp volcomp.rate 0.01\n"
+    done = session(
+        workshop, steps, [*VOLCOMP_NAMES, "volcomp.settling"], hal=hal,
+        files={"volcomp.tab": files["volcomp.tab"], "wait.ngc": text},
+    )  # fmt: skip
+    assert done.messages == []
+    command, tool = columns(done.rows, VOLCOMP_NAMES[:3]), columns(done.rows, VOLCOMP_NAMES[9:12])
+    settling = done.rows["volcomp.settling"] != 0
+    waiting = np.flatnonzero(settling & (tool[:, 2] > 0))
+    assert len(waiting) > 100
+    moved = np.abs(np.diff(command[waiting], axis=0)).sum(axis=0)
+    assert np.all(moved < 1.0)  # it brakes from what one or two cycles gave it
+    assert command[-1] == pytest.approx([150, 250, -100 + 150])  # the machine coordinate holds the tool
+
+
+def test_a_tool_pin_that_is_not_a_number_holds_the_last_correction(workshop, small_machine, small_errors):
+    unwired = [("net volcomp-tool-z motion.tooloffset.z =>", "net volcomp-tool-z")]
+    steps = [
+        {"rest": "volcomp.settling"},
+        {"mdi": "G21 G90 G61 G1 X-100 Y50 Z-40 F60000"},
+        {"set": ["volcomp-tool-z", "nan"]},
+    ]
+    parts, table, done = volcomp_session(workshop, small_machine, small_errors, steps, wired=unwired)
+    command, drive, _, _, correction = parts
+    assert done.pins == {"volcomp.loaded": True, "volcomp.settling": True, "volcomp.fault": True}
+    assert np.all(np.isfinite(drive))
+    expected = table.inverse(command[-1:], np.zeros(3))[0] - command[-1]
+    assert correction[-1] == pytest.approx(expected, abs=AGREEMENT_MM)
+    again = [*steps, {"set": ["volcomp-tool-z", "0"]}, {"rest": "volcomp.settling"}]
+    parts, table, done = volcomp_session(workshop, small_machine, small_errors, again, wired=unwired)
+    assert done.pins == {"volcomp.loaded": True, "volcomp.settling": False, "volcomp.fault": False}
+    assert parts[4][-1] == pytest.approx(expected, abs=AGREEMENT_MM)
+
+
+def test_the_hal_component_adds_nothing_before_it_is_enabled(workshop, small_machine, small_errors):
+    unwired = [("net volcomp-enable", "# net volcomp-enable")]
+    parts, _, done = volcomp_session(workshop, small_machine, small_errors, [{"mdi": "G0 X50"}], wired=unwired)
+    assert not np.any(parts[4])
+    assert np.ptp(parts[0][:, 0]) == 50.0
+    assert done.pins["volcomp.loaded"] is True
+
+
+def test_the_hal_component_refuses_a_table_in_another_unit(workshop, small_machine, small_errors):
+    files = compgen.export(small_machine, small_errors, "linuxcnc-volumetric").files
+    done = session(
+        workshop, [], VOLCOMP_NAMES, hal=files["volcomp.hal"] + DRIVES + VOLCOMP_FUNCTIONS, units="inch",
+        files={"volcomp.tab": files["volcomp.tab"]}, pins=("volcomp.loaded",),
+    )  # fmt: skip
+    assert done.started is False
+    assert done.pins == {"volcomp.loaded": False}
+    assert re.search("NO COMPENSATION.*volcomp.tab.*the table is in mm, the machine in inch", done.output)

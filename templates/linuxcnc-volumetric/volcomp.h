@@ -8,12 +8,14 @@
 // version. It comes WITHOUT ANY WARRANTY; see the file COPYING beside the sources, or
 // <https://www.gnu.org/licenses/old-licenses/gpl-2.0.html>.
 //
-// E(q, t) is the error of the tool tip, actual minus commanded, in mm, with the axes at q and the tool offset t:
+// E(q, t) is the error of the tool tip, actual minus commanded, with the axes at q and the tool offset t. All lengths are in
+// the unit of the machine, mm or inch; the table says which it was written for, and volcomp_check_unit compares:
 //
 //     P = q + E(q, t)         where the tip stands, less the tool offset   (forward)
 //     q = P - E(q, t)         where the axes must stand                    (inverse, by iteration until nothing changes)
 //
-// A table that cannot be read to its last word is not used at all: volcomp_load returns 0 and says why.
+// A table that cannot be read to its last word is not used at all: volcomp_load returns 0 and says why. Nor is one whose unit
+// is not that of the machine.
 
 #ifndef VOLCOMP_H
 #define VOLCOMP_H
@@ -23,14 +25,17 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <strings.h>
 
+#define VOLCOMP_MM 1            // units of length; 0 is none
+#define VOLCOMP_INCH 2
 #define VOLCOMP_CURVES 64
 #define VOLCOMP_TERMS 512
 #define VOLCOMP_NODES 10000
 #define VOLCOMP_VERTICES 100000
 #define VOLCOMP_BYTES (64L << 20)
 #define VOLCOMP_NAME 32
-// The iteration ends when no axis moves by more than this, mm, and this part of its coordinate (far from machine zero
+// The iteration ends when no axis moves by more than this, mm or inch, and this part of its coordinate (far from machine zero
 // neighbouring numbers differ by more than the first); a table that needs more rounds is refused.
 #define VOLCOMP_STEP 0.0000000000001
 #define VOLCOMP_PART 0.000000000000001
@@ -49,14 +54,15 @@ typedef struct {
 } volcomp_term;
 
 typedef struct {
-    int good;                   // the table was read to its last word
+    int good;                   // the table was read to its last word, and its unit is that of the machine
+    int unit;                   // VOLCOMP_MM or VOLCOMP_INCH: lengths of the table
     int curves, terms, vertices;
     int count[3];               // vertices of the grid along X, Y, Z
     double first[3], step[3];
     double *vertex;             // ex ey ez, x fastest
     volcomp_curve curve[VOLCOMP_CURVES];
     volcomp_term term[VOLCOMP_TERMS];
-    char message[160];          // why it is not loaded
+    char message[256];          // why it is not loaded
 } volcomp_table;
 
 // ---- reading -------------------------------------------------------------------------------------------------------
@@ -245,19 +251,30 @@ static int volcomp_read_trailer(volcomp_table *table, volcomp_text *text)
     return found || volcomp_fail(table, text, "there is no checksum: the file was cut");
 }
 
+static int volcomp_read_unit(volcomp_table *table, volcomp_text *text)
+{
+    if (!volcomp_take(text) || (strcmp(text->word, "mm") && strcmp(text->word, "inch")))
+        return volcomp_fail(table, text, "a unit mm or inch is expected");
+    table->unit = strcmp(text->word, "mm") ? VOLCOMP_INCH : VOLCOMP_MM;
+    return 1;
+}
+
 static int volcomp_read(volcomp_table *table, volcomp_text *text)
 {
-    int good = 1;
+    int good = 1, first;
     if (!volcomp_take(text) || strcmp(text->word, "volcomp"))
         return volcomp_fail(table, text, "'volcomp 1' is due");
     if (!volcomp_take(text) || strcmp(text->word, "1"))
         return volcomp_fail(table, text, "'volcomp 1' is due");
-    while (good) {
+    table->unit = VOLCOMP_MM;   // of tables without the word "unit"
+    for (first = 1; good; first = 0) {
         if (!volcomp_take(text))
             return volcomp_fail(table, text, "there is no 'end': the file was cut");
         if (!strcmp(text->word, "end"))
             break;
-        if (!strcmp(text->word, "curve"))
+        if (first && !strcmp(text->word, "unit"))
+            good = volcomp_read_unit(table, text);
+        else if (!strcmp(text->word, "curve"))
             good = volcomp_read_curve(table, text);
         else if (!strcmp(text->word, "term"))
             good = volcomp_read_term(table, text);
@@ -313,6 +330,80 @@ static int volcomp_load(volcomp_table *table, const char *path)
     return table->good;
 }
 
+// ---- the machine ---------------------------------------------------------------------------------------------------
+
+// Copy what the INI file of the running LinuxCNC says at [section] key, without blanks around it; 0 if that is not known.
+// The script linuxcnc names the file, with all includes expanded, in INI_FILE_NAME.
+static inline int volcomp_ini(const char *section, const char *key, char *value, size_t size)
+{
+    const char *path = getenv("INI_FILE_NAME");
+    FILE *file = path ? fopen(path, "r") : NULL;
+    char line[1024], *start, *end, *equals;
+    int inside = 0, found = 0;
+    while (file && !found && fgets(line, sizeof line, file)) {
+        start = line + strspn(line, " \t");
+        for (end = start + strlen(start); end > start && volcomp_blank(end[-1]);)
+            *--end = 0;
+        if (*start == '[') {
+            inside = !strncmp(start + 1, section, strlen(section)) && start[1 + strlen(section)] == ']';
+            continue;
+        }
+        equals = strchr(start, '=');
+        if (!inside || *start == '#' || *start == ';' || !equals || strncmp(start, key, strlen(key)))
+            continue;
+        if (start + strlen(key) + strspn(start + strlen(key), " \t") != equals)
+            continue;
+        equals++;
+        snprintf(value, size, "%s", equals + strspn(equals, " \t"));
+        found = 1;
+    }
+    if (file)
+        fclose(file);
+    return found;
+}
+
+// The unit that a word names, in all spellings of [TRAJ] LINEAR_UNITS (a number is units per mm); 0 for any other word.
+static inline int volcomp_unit(const char *word)
+{
+    char *rest;
+    double per_mm = strtod(word, &rest);
+    if (!strcasecmp(word, "mm") || !strcasecmp(word, "metric"))
+        return VOLCOMP_MM;
+    if (!strcasecmp(word, "in") || !strcasecmp(word, "inch") || !strcasecmp(word, "imperial"))
+        return VOLCOMP_INCH;
+    if (rest == word || *rest)
+        return 0;
+    return fabs(per_mm - 1) < 0.001 ? VOLCOMP_MM : fabs(per_mm * 25.4 - 1) < 0.001 ? VOLCOMP_INCH : 0;
+}
+
+// Take the table out of use unless its unit is that of the machine: what "units=" states, what the INI file says. Both have
+// to agree, and one of them has to be there; a table in the wrong unit would act 25.4 times too much at the wrong place.
+static inline void volcomp_check_unit(volcomp_table *table, const char *stated)
+{
+    static const char *names[] = {"?", "mm", "inch"};
+    char ini[64] = "";
+    int said, known = volcomp_ini("TRAJ", "LINEAR_UNITS", ini, sizeof ini), machine;
+    size_t size = sizeof table->message;
+    if (!table->good)
+        return;
+    table->good = 0;
+    said = volcomp_unit(stated);
+    machine = known ? volcomp_unit(ini) : said;
+    if (*stated && !said)
+        snprintf(table->message, size, "units=%.32s is not known: mm or inch is expected", stated);
+    else if (known && !machine)
+        snprintf(table->message, size, "[TRAJ] LINEAR_UNITS = %.32s is not known: mm or inch is expected", ini);
+    else if (!machine)
+        snprintf(table->message, size, "the unit of the machine is not known: add units=mm or units=inch behind file=");
+    else if (said && said != machine)
+        snprintf(table->message, size, "units=%.32s, but [TRAJ] LINEAR_UNITS = %.32s", stated, ini);
+    else if (machine != table->unit)
+        snprintf(table->message, size, "the table is in %s, the machine in %s: export it with machine_units = \"%s\"",
+                 names[table->unit], names[machine], names[machine]);
+    else
+        table->good = 1;
+}
+
 // ---- evaluation ----------------------------------------------------------------------------------------------------
 
 // Linear between the nodes, the end values hold outside.
@@ -357,7 +448,7 @@ static void volcomp_grid_at(const volcomp_table *table, const double q[3], doubl
     }
 }
 
-// Error of the tip at axis positions q with the tool offset t, mm.
+// Error of the tip at axis positions q with the tool offset t.
 static void volcomp_error(const volcomp_table *table, const double q[3], const double t[3], double e[3])
 {
     double value[VOLCOMP_CURVES];
@@ -378,12 +469,20 @@ static void volcomp_error(const volcomp_table *table, const double q[3], const d
     }
 }
 
-// Axis positions q at which the tip stands at P; returns 0, or -1 if the iteration does not end.
+static int volcomp_finite(const double v[3])
+{
+    return isfinite(v[0]) && isfinite(v[1]) && isfinite(v[2]);
+}
+
+// Axis positions q at which the tip stands at P; returns 0, or -1 if the iteration does not end, or P or t is not a number
+// (one NaN on a tool pin would reach every drive).
 static int volcomp_inverse(const volcomp_table *table, const double p[3], const double t[3], double q[3])
 {
     int round, k;
     for (k = 0; k < 3; k++)
         q[k] = p[k];
+    if (!volcomp_finite(p) || !volcomp_finite(t))
+        return -1;
     for (round = 0; round < VOLCOMP_ROUNDS; round++) {
         double e[3];
         int moved = 0;
@@ -394,6 +493,8 @@ static int volcomp_inverse(const volcomp_table *table, const double p[3], const 
             moved |= step > VOLCOMP_STEP + VOLCOMP_PART * fabs(next);
             q[k] = next;
         }
+        if (!volcomp_finite(q))
+            return -1;
         if (!moved)
             return 0;
     }

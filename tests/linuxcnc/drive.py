@@ -8,6 +8,7 @@ which alone has the modules of LinuxCNC.
 import array
 import faulthandler
 import json
+import subprocess
 import sys
 import time
 
@@ -62,6 +63,29 @@ class Session:
         if self.command.wait_complete(WAIT_S) != linuxcnc.RCS_DONE:
             self.messages.append(f"not done: {line}")
 
+    def set(self, name_and_text):
+        """Set a pin, or a signal that nobody writes (its name has no dot)."""
+        name, text = name_and_text
+        subprocess.run(["halcmd", "setp" if "." in name else "sets", name, text], check=True)
+        time.sleep(0.05)
+
+    def rest(self, pin):
+        """Wait until a pin is FALSE and a moment longer."""
+        wait(lambda: not hal.get_value(pin), pin)
+        time.sleep(0.05)
+
+    def home(self, joint):
+        """Home again, all joints with -1."""
+        self.command.mode(linuxcnc.MODE_MANUAL)
+        self.command.wait_complete(5)
+        self.command.teleop_enable(0)
+        self.command.wait_complete(5)
+        self.command.home(joint)
+        time.sleep(0.1)
+        wait(lambda: all(self.polled().homed[: self.stat.joints]), "homing")
+        self.command.teleop_enable(1)
+        self.command.wait_complete(5)
+
     def program(self, path):
         self.command.mode(linuxcnc.MODE_AUTO)
         self.command.wait_complete(5)
@@ -86,11 +110,12 @@ def main():
         plan = json.load(file)
     component = hal.component("compgen-test")
     component.ready()
-    stream = hal.stream(component, hal.sampler_base, "f" * plan["channels"])
+    stream = hal.stream(component, hal.sampler_base, plan["channels"])
     session = Session()
     result = {"started": session.start()}
     for step in plan["steps"] if result["started"] else ():
-        session.mdi(step["mdi"]) if "mdi" in step else session.program(step["program"])
+        ((kind, given),) = step.items()
+        getattr(session, kind)(given)
     time.sleep(0.05)
     session.polled()
     samples = read_samples(stream)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -72,11 +72,44 @@ class VolGrid:
 
 @dataclass(frozen=True)
 class VolTable:
-    """A table as the kinematics module reads it: curves with terms, or a grid."""
+    """A table as the kinematics module reads it: curves with terms, or a grid.
+
+    Numbers are in mm here; ``unit`` is that of the lengths in the file: the unit of the machine, ``"mm"`` or ``"inch"``.
+    """
 
     curves: tuple[VolCurve, ...]
     terms: tuple[VolTerm, ...]
     grid: VolGrid | None = None
+    unit: str = "mm"
+
+    def scaled(self, factor: float) -> VolTable:
+        """Return the table with all lengths times ``factor``: from the unit of the file to mm, and back.
+
+        A curve is a length where a term takes it as it is (lever 1). Beside a lever it is an angle and has no unit; a curve
+        that is used in both ways is taken as a length, and the coefficient of the terms with a lever makes up for it.
+        """
+        if factor == 1.0:
+            return self
+        lengths = {term.curve for term in self.terms if term.lever == LEVERS[0]}
+        curves = tuple(
+            replace(
+                curve,
+                first_mm=curve.first_mm * factor,
+                step_mm=curve.step_mm * factor,
+                values=curve.values * factor if curve.name in lengths else curve.values,
+            )
+            for curve in self.curves
+        )
+        both = {term for term in self.terms if term.curve in lengths and term.lever != LEVERS[0]}
+        terms = tuple(
+            replace(term, coefficient=term.coefficient / factor) if term in both else term for term in self.terms
+        )
+        grid = self.grid
+        if grid is not None:
+            x, y, z = (value * factor for value in grid.first_mm)
+            hx, hy, hz = (value * factor for value in grid.step_mm)
+            grid = VolGrid((x, y, z), (hx, hy, hz), grid.vertices_mm * factor)
+        return VolTable(curves, terms, grid, self.unit)
 
     def error(self, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
         """E at axis positions (n, 3) with tool offsets (3,) or (n, 3): shape (n, 3), mm, actual minus commanded."""

@@ -1,6 +1,7 @@
 """Strict reading of the table of ``volkins``: as strict as the C sources, with the line of what is wrong.
 
-Words stand between white space: ``volcomp 1``, then ``curve NAME AXIS COUNT FIRST STEP`` with COUNT numbers, ``term OUTPUT
+Words are separated by white space: ``volcomp 1``, ``unit mm`` or ``unit inch`` (mm where it is missing: tables of versions that
+wrote mm only), then ``curve NAME AXIS COUNT FIRST STEP`` with COUNT numbers, ``term OUTPUT
 CURVE COEFFICIENT LEVER``, or ``grid NX NY NZ X0 Y0 Z0 HX HY HZ`` with 3 NX NY NZ numbers (x fastest), then ``end``.
 Comments (``#`` to the end of the line) and one ``crc32 XXXXXXXX`` of all words up to ``end`` follow.
 """
@@ -13,7 +14,7 @@ from itertools import chain
 import numpy as np
 
 from compgen.controllers.base import SourceFile
-from compgen.controllers.linuxcnc.text import SHOWN, check_size, lines_of, number_in, whole_in
+from compgen.controllers.linuxcnc.text import MM_PER_UNIT, SHOWN, check_size, lines_of, number_in, whole_in
 from compgen.controllers.linuxcnc.volcomp import (
     LEVERS,
     LONGEST_NAME,
@@ -98,7 +99,11 @@ def parse_volcomp(source: SourceFile) -> VolTable:
     curves: dict[str, VolCurve] = {}
     terms: list[VolTerm] = []
     grid: VolGrid | None = None
-    while (word := words.take("'end'")) != "end":
+    unit = "mm"
+    word = words.take("'end'")
+    if word == "unit":
+        unit, word = _unit(words), words.take("'end'")
+    while word != "end":
         if word == "curve":
             curve = _curve(words, curves)
             curves[curve.name] = curve
@@ -108,10 +113,18 @@ def parse_volcomp(source: SourceFile) -> VolTable:
             grid = _grid(words)
         else:
             raise source.fail(f"'curve', 'term', one 'grid' or 'end' is due, found {word[:SHOWN]!r}", words.line)
+        word = words.take("'end'")
     if bool(terms) == (grid is not None):
         raise source.fail("either terms or a grid are due, not both and not none", words.line)
     _check_trailer(source, words)
-    return VolTable(tuple(curves.values()), tuple(terms), grid)
+    return VolTable(tuple(curves.values()), tuple(terms), grid, unit).scaled(MM_PER_UNIT[unit])
+
+
+def _unit(words: _Words) -> str:
+    word = words.take("a unit")
+    if word not in MM_PER_UNIT:
+        raise words.source.fail(f"{word[:SHOWN]!r} is not a unit; mm or inch is expected", words.line)
+    return word
 
 
 def _curve(words: _Words, known: dict[str, VolCurve]) -> VolCurve:

@@ -16,6 +16,7 @@ import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
 from compgen.controllers.grids import equidistant_grid, take_loss_mm
+from compgen.controllers.linuxcnc.text import take_machine_units
 from compgen.controllers.linuxcnc.volcomp import (
     LEVERS,
     MOST_CURVES,
@@ -50,6 +51,8 @@ from compgen.model.volumetric import tool_of
 _ROUNDED_CURVES = 12
 #: Vertices of a grid along one axis: 46 x 46 x 46 is within what the module takes.
 MOST_ALONG_AXIS = 46
+#: Axes and joints that LinuxCNC knows.
+_AXIS_LETTERS, _MOST_JOINTS = "XYZABCUVW", 16
 #: A table whose errors change by more than this per mm of travel is refused; real machines stay below 0.01.
 STEEPEST = 0.5
 
@@ -64,12 +67,16 @@ class VolumetricSettings:
     loss_mm : loss by interpolation between nodes that is worth no further node.
     most_nodes : most nodes per axis.
     gauge_mm : tool offset of the error model where the control's tool offset is zero, for the pins ``volkins.gauge-*``.
+    machine_units : [TRAJ] LINEAR_UNITS, ``"mm"`` or ``"inch"``; all files are written in it, and the table says which.
+    coordinates : letter of the axis of each joint from joint 0 on, as in ``trivkins coordinates=XYYZA``.
     """
 
     form: str
     loss_mm: float
     most_nodes: int
     gauge_mm: tuple[float, float, float]
+    machine_units: str
+    coordinates: str
 
 
 class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
@@ -86,6 +93,8 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
             loss_mm=take_loss_mm(section),
             most_nodes=section.take("most_nodes", tomlio.whole(2, 1000), 400),
             gauge_mm=section.take("gauge_mm", tomlio.vector3, (0.0, 0.0, 0.0)),
+            machine_units=take_machine_units(section),
+            coordinates=section.take("coordinates", _coordinates, "XYZ"),
         )
         section.finish()
         return settings
@@ -116,12 +125,12 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
             for term in ordered
             for part in term.carrier
         )
-        table = as_written(VolTable(curves, terms))
+        table = as_written(VolTable(curves, terms, unit=settings.machine_units))
         return table if settings.form == "curves" else as_written(_as_grid(machine, table))
 
     def context(self, machine: Machine, settings: VolumetricSettings, tables: VolTable) -> dict[str, Any]:
         """Return curves, terms or grid as they are written, the checksum, and what INI and HAL need."""
-        return {**shown_table(tables), **notes(machine, settings.gauge_mm, tables)}
+        return {**shown_table(tables), **notes(machine, settings.gauge_mm, settings.coordinates, tables)}
 
     def parse(self, machine: Machine, settings: VolumetricSettings, files: Sequence[SourceFile]) -> VolTable:
         """Read the table; INI, HAL and C sources that are exported beside it are only checked for their last line."""
@@ -141,8 +150,13 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         return tables.inverse(points.position_mm, tool) - points.position_mm
 
     def violations(self, machine: Machine, settings: VolumetricSettings, tables: VolTable) -> list[str]:
-        """Return travel that curves leave out, and errors too steep for the inverse."""
+        """Return travel that curves leave out, errors too steep for the inverse, and a unit that is not the machine's."""
         found = []
+        if tables.unit != settings.machine_units:
+            found.append(
+                f"the table is in {tables.unit}, and machine_units is {settings.machine_units!r}: the control does not use "
+                "such a table, and the machine cannot be switched on"
+            )
         for axis, first, last, what in _spans(tables):
             found += coverage_violations(machine, axis, first, last, what)
         slope = tables.slope(machine.lower_mm, machine.upper_mm, tool_of(machine, None))
@@ -174,6 +188,14 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         ]
 
 
+def _coordinates(value: Any) -> str:
+    """One letter of an axis for each joint, X, Y and Z among them."""
+    letters = str(value).upper() if isinstance(value, str) else ""
+    if set(letters) - set(_AXIS_LETTERS) or not set(AXES) <= set(letters) or len(letters) > _MOST_JOINTS:
+        raise ValueError(f"the axis of each joint, e.g. 'XYZA', X, Y and Z among at most {_MOST_JOINTS}, is expected")
+    return letters
+
+
 def _curve(machine: Machine, term: Term, values: FloatArray) -> VolCurve:
     """Return a curve; a squareness is a constant, written as two equal nodes at the ends of the travel of its axis."""
     if term.axis is None:
@@ -194,7 +216,7 @@ def _as_grid(machine: Machine, table: VolTable) -> VolTable:
     vertices = np.array(list(product(*lines)))
     values = table.error(vertices, tool_of(machine, None)).reshape(*(len(line) for line in lines), 3)
     x, y, z = ((float(line[0]), float(line[1] - line[0])) for line in lines)
-    return VolTable((), (), VolGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), values))
+    return VolTable((), (), VolGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), values), table.unit)
 
 
 def _grid_lines(grid: VolGrid) -> list[FloatArray]:

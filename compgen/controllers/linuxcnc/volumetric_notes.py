@@ -6,57 +6,94 @@ from typing import Any
 
 import numpy as np
 
+from compgen.controllers.linuxcnc.text import MM_PER_UNIT
 from compgen.controllers.linuxcnc.volcomp import VolTable, checksum
-from compgen.controllers.linuxcnc.volumetric_text import digits_of, grid_rows, words_of
+from compgen.controllers.linuxcnc.volumetric_text import (
+    digits_of,
+    grid_rows,
+    in_file_units,
+    length_digits,
+    position_digits,
+    words_of,
+)
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine, Vector3
 from compgen.core.names import AXES
 from compgen.model.volumetric import tool_of
 
+#: Decimals of travel limits in the INI file.
+LIMIT_DIGITS = 6
+
 
 def shown_table(table: VolTable) -> dict[str, Any]:
     """Return the table in plain numbers for its template, with the checksum."""
-    grid = table.grid
+    inside = in_file_units(table)
+    grid = inside.grid
     return {
+        "unit": table.unit,
+        "position_digits": position_digits(table),
         "curves": [
             {
                 "name": curve.name,
                 "axis": curve.axis,
-                "first_mm": curve.first_mm,
-                "step_mm": curve.step_mm,
-                "digits": digits_of(curve),
+                "first": curve.first_mm,
+                "step": curve.step_mm,
+                "digits": digits_of(table, curve),
                 "values": curve.values.tolist(),
             }
-            for curve in table.curves
+            for curve in inside.curves
         ],
-        "terms": [vars(term) for term in table.terms],
+        "terms": [vars(term) for term in inside.terms],
         "grid": None
         if grid is None
         else {
             "count": list(grid.vertices_mm.shape[:3]),
-            "first_mm": list(grid.first_mm),
-            "step_mm": list(grid.step_mm),
+            "corner": [*grid.first_mm, *grid.step_mm],
+            "digits": length_digits(table),
             "rows": grid_rows(grid),
         },
         "crc32": checksum(words_of(table)),
     }
 
 
-def notes(machine: Machine, gauge_mm: Vector3, table: VolTable) -> dict[str, Any]:
-    """Return sign statement, parameters, warnings, and the travel and tool offset for INI and HAL."""
+def notes(machine: Machine, gauge_mm: Vector3, coordinates: str, table: VolTable) -> dict[str, Any]:
+    """Return sign statement, parameters, warnings, and travel, tool offset and joints for INI and HAL, in machine units."""
     tool = np.array(gauge_mm) - np.array(machine.tool_offset_mm)
-    low, high = machine.lower_mm, machine.upper_mm
+    scale = MM_PER_UNIT[table.unit]
+    margin_mm = float(np.ceil(2.0 * np.max(np.abs(_at_corners(machine, table)[1])))) or 1.0
+    axes = [
+        {
+            "letter": letter,
+            "joint": coordinates.index(letter),
+            "joints": [joint for joint, other in enumerate(coordinates) if other == letter],
+            "gauge": gauge / scale,
+            "limits": _outward(axis.range_mm, 0.0, scale),
+            "joint_limits": _outward(axis.range_mm, margin_mm, scale),
+        }
+        for letter, gauge, axis in zip(AXES, gauge_mm, machine.axes, strict=True)
+    ]
     return {
         "sign_statement": _sign_statement(machine, table),
-        "parameters": _parameters(gauge_mm),
+        "parameters": _parameters(gauge_mm, coordinates, table.unit),
         "warnings": _warnings(machine, table),
         "tables": [],
-        "gauge_mm": list(gauge_mm),
         "control_tool_mm": tool.tolist(),
-        "axes": [{"letter": AXES[k], "joint": k, "low_mm": float(low[k]), "high_mm": float(high[k])} for k in range(3)],
-        "margin_mm": float(np.ceil(2.0 * np.max(np.abs(_at_corners(machine, table)[1])))) or 1.0,
+        "coordinates": coordinates,
+        "axes": axes,
+        "gantry": len({coordinates.count(letter) for letter in AXES}) > 1,
+        "other_axes": sorted(set(coordinates) - set(AXES)),
+        "margin_mm": margin_mm,
         "form": "curves" if table.grid is None else "grid",
     }
+
+
+def _outward(range_mm: tuple[float, float], margin_mm: float, scale: float) -> list[float]:
+    """Limits of travel in machine units, rounded outward to the decimals of the INI file: the ends can be reached."""
+    low, high = range_mm
+    fine = 10.0**LIMIT_DIGITS
+    # a rounding error of the division must not move a limit that has few decimals
+    below, above = (round(value / scale * fine, 3) for value in (low - margin_mm, high + margin_mm))
+    return [float(np.floor(below)) / fine, float(np.ceil(above)) / fine]
 
 
 def _at_corners(machine: Machine, table: VolTable) -> tuple[FloatArray, FloatArray]:
@@ -78,14 +115,20 @@ def _sign_statement(machine: Machine, table: VolTable) -> str:
     )
 
 
-def _parameters(gauge_mm: Vector3) -> list[dict[str, str]]:
+def _parameters(gauge_mm: Vector3, coordinates: str, unit: str) -> list[dict[str, str]]:
+    joints = ", ".join(f"{joint} is {letter}" for joint, letter in enumerate(coordinates))
     rows = [
         {
             "name": "[KINS] KINEMATICS",
-            "value": "volkins file=volcomp.tab",
-            "meaning": "the table, relative to the folder of the INI file",
+            "value": f"volkins file=volcomp.tab coordinates={coordinates}",
+            "meaning": "the table, relative to the folder of the INI file, and the axis of each joint",
         },
-        {"name": "[KINS] JOINTS", "value": "3", "meaning": "joint 0, 1, 2 is X, Y, Z"},
+        {"name": "[KINS] JOINTS", "value": str(len(coordinates)), "meaning": f"joint {joints}"},
+        {
+            "name": "[TRAJ] LINEAR_UNITS",
+            "value": unit,
+            "meaning": "unit of all numbers in the exported files; on a machine in another unit volkins.loaded stays false",
+        },
         {
             "name": "volkins.loaded",
             "value": "true",
@@ -95,7 +138,7 @@ def _parameters(gauge_mm: Vector3) -> list[dict[str, str]]:
     rows += [
         {
             "name": f"volkins.gauge-{letter.lower()}",
-            "value": f"{value:g} mm",
+            "value": f"{value / MM_PER_UNIT[unit]:.9g} {unit}",
             "meaning": "tool offset of the error model where the control's tool offset is zero",
         }
         for letter, value in zip(AXES, gauge_mm, strict=True)
