@@ -1,5 +1,6 @@
 """The command line: help, exit codes, what goes to stdout and to stderr, and that bad input writes nothing."""
 
+import ast
 import io
 import json
 import os
@@ -659,6 +660,41 @@ def test_a_reader_that_stops_early_gets_no_verdict_and_no_traceback(words):
     with os.fdopen(write_end, "wb") as pipe:
         done = subprocess.run([script, *words], stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_ctrl_c_while_the_program_is_still_being_loaded_prints_no_traceback(tmp_path):
+    """The interrupt comes in the middle of the imports, where no command runs yet."""
+    hook = "import sys\nclass Interrupt:\n    def find_spec(self, name, *_):\n"
+    hook += (
+        "        if name == 'compgen.cli':\n            raise KeyboardInterrupt\nsys.meta_path.insert(0, Interrupt())\n"
+    )
+    (tmp_path / "sitecustomize.py").write_text(hook)
+    for words in ([sys.executable, "-m", "compgen"], [Path(sys.executable).with_name("compgen")]):
+        done = subprocess.run(
+            [*words, "machines"],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        )
+        assert (done.returncode, done.stdout, done.stderr) == (130, "", "stopped\n")
+
+
+def test_public_names_are_loaded_on_first_use_and_are_not_hidden_by_sub_packages():
+    code = "import sys, compgen; assert not {m for m in sys.modules if m.startswith(('compgen.', 'numpy', 'scipy'))}; "
+    code += "import compgen.fit, compgen.identify; assert callable(compgen.fit) and callable(compgen.identify); "
+    code += "assert {'fit', 'Machine'} <= set(dir(compgen))"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_the_stub_for_type_checkers_names_what_the_package_offers():
+    package = Path(compgen.__file__)
+    stub = ast.parse(package.with_suffix(".pyi").read_text())
+    homes = {a.name: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    listed = next(ast.literal_eval(node.value) for node in stub.body if isinstance(node, ast.Assign))
+    assert homes == {name: home for home, names in compgen._HOMES.items() for name in names.split()}
+    assert sorted(homes) == sorted(listed) == compgen.__all__
+    assert all(getattr(compgen, name) is not None for name in compgen.__all__)
 
 
 # --- the width of a terminal -----------------------------------------------------------------------------------------
