@@ -62,7 +62,7 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     if options.sign == "correction":
         runs = runs.negated()
         notes.append("the values were said to be corrections: their sign was turned round")
-    notes += remarks(runs, axis or "")
+    notes += remarks(runs, axis or "", angular=angular)
     understood = {
         "axis": axis,
         **_facts(runs, angular=angular),
@@ -186,7 +186,7 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
         runs = replace(runs, direction=motion(runs.position_mm, 2 * runs.run + (runs.direction < 0)))
     if options.sign == "correction":
         runs = runs.negated()
-    notes += remarks(runs, axis or "")
+    notes += remarks(runs, axis or "", angular=False)
     understood = {
         "axis": axis,
         **_facts(runs, angular=False),

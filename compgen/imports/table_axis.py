@@ -61,7 +61,7 @@ def axis_readings(findings: Findings, *, angular: bool = False) -> tuple[dict[st
         direction, run = _directions(findings, target[own], rows.run[own], rows.label[own])
         beside = {name: values[rows.row[own]] for name, values in further.covariates.items()}
         found[letter] = OneAxis(target[own], direction, run, value[own], line, beside)
-        findings.notes += remarks(found[letter], letter)
+        findings.notes += remarks(found[letter], letter, angular=angular)
     return found, further
 
 
