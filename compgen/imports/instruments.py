@@ -149,7 +149,7 @@ def _with_directions(found: Renishaw, runs: OneAxis, options: ImportOptions, dou
     if options.directions == "alternate":
         _, order = np.unique(found.one_way, return_inverse=True)
         direction = np.where(order % 2 == 0, 1, -1).astype(np.int64)
-        return replace(runs, direction=direction, run=cycles(direction, found.one_way))
+        return replace(runs, direction=direction, run=cycles(direction, found.one_way), in_time=False)
     if found.sorted_rows and options.directions is None:
         doubts.append(
             "its flags say runs in both directions, but every run lists the targets in the same order; give --directions "

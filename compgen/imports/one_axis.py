@@ -35,6 +35,7 @@ class OneAxis:
     value : measured minus target (n,), mm or rad.
     line : line of the file, (n,).
     covariates : further numbers by contract name (time_s, temp_..._c), each (n,).
+    in_time : whether the rows are in the order in which they were measured; tables by target or direction are not.
     """
 
     position_mm: FloatArray
@@ -43,6 +44,33 @@ class OneAxis:
     value: FloatArray
     line: IntArray
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    in_time: bool = False
+
+    def ordered(self) -> OneAxis:
+        """Return the rows in the order of time: run by run, up then down, unless the file says more.
+
+        Rows that are in the order of time already stay; where it is another one (a cycle that begins downwards), the column
+        ``order`` keeps it, since the order of rows by itself is never taken for time.
+        """
+        usual = np.lexsort((self.position_mm * self.direction, -self.direction, self.run))
+        if "time_s" in self.covariates and np.isfinite(self.covariates["time_s"]).all():
+            return self._rows(np.argsort(self.covariates["time_s"], kind="stable"))
+        if not self.in_time or not self.direction.all():
+            return self._rows(usual) if self.direction.all() else self
+        if np.array_equal(usual, np.arange(len(usual))):
+            return self
+        return replace(self, covariates={**self.covariates, "order": np.arange(1.0, len(usual) + 1)})
+
+    def _rows(self, rows: IntArray) -> OneAxis:
+        return replace(
+            self,
+            position_mm=self.position_mm[rows],
+            direction=self.direction[rows],
+            run=self.run[rows],
+            value=self.value[rows],
+            line=self.line[rows],
+            covariates={name: values[rows] for name, values in self.covariates.items()},
+        )
 
     def negated(self) -> OneAxis:
         """Return the readings with corrections turned into errors."""
