@@ -121,18 +121,16 @@ def test_controls_without_settings_are_left_out_by_name_and_refused_when_asked_f
     small_machine_file, errors_file, tmp_path, monkeypatch, capsys
 ):
     machine = tmp_path / "m.toml"
-    machine.write_text(
-        small_machine_file.read_text().replace("[controllers.siemens-cec]", "").replace('sign = "error"', "")
-    )
-    two = {name: CONTROLLERS[name] for name in ("siemens-cec", "siemens-eec")}
+    machine.write_text(small_machine_file.read_text().replace('mult_mode = "S1"', "products = true"))
+    two = {name: CONTROLLERS[name] for name in ("pmac", "siemens-eec")}
     monkeypatch.setattr("compgen.cli.safety_commands.CONTROLLERS", two)
     assert run_command(cli, ["crash-test", str(machine), str(errors_file), "--json"]) == 0
     printed = capsys.readouterr()
-    assert "siemens-cec is left out" in printed.err
+    assert "pmac is left out" in printed.err
     assert list(json.loads(printed.out)["controllers"]) == ["siemens-eec"]
     two.pop("siemens-eec")
     assert run_command(cli, ["crash-test", str(machine), str(errors_file)]) == 2
     assert "no control" in capsys.readouterr().err
     monkeypatch.undo()
-    assert run_command(cli, ["crash-test", str(machine), str(errors_file), "--controller", "siemens-cec"]) == 2
-    assert "sign" in capsys.readouterr().err
+    assert run_command(cli, ["crash-test", str(machine), str(errors_file), "--controller", "pmac"]) == 2
+    assert "counts_per_mm" in capsys.readouterr().err

@@ -143,7 +143,7 @@ def read_command(
       compgen read zha-gantry tables/volcomp0.csv --controller isg-csv --points p.points.csv --out correction.csv
     """
     where = read_points(points)
-    parsed = read_tables(machine, tables, controller)
+    parsed = read_tables(machine, tables, controller, foreign=True)
     for text in parsed.contradictions:
         warnings.warn(text, CompgenWarning, stacklevel=1)
     correction_mm = parsed.correction(machine, where)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from compgen.core.error_table import format_errors
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.core.points import Points, format_points, read_points
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError
 from compgen.export import Provenance
 from compgen.imports import open_errors
 from compgen.pipeline import export_and_verify, provenance_of, write_all
@@ -86,8 +87,10 @@ def diff_command(
       compgen diff zha-gantry new/NC_CEC.INI --against old/NC_CEC.INI --controller siemens-cec --out diff/
     """
     OutputFolder(out)
-    first = read_tables(machine, tables, controller)
-    second = read_tables(machine, against, controller_b or controller)
+    first = read_tables(machine, tables, controller, foreign=True)
+    second = read_tables(machine, against, controller_b or controller, foreign=True)
+    for remark in (*first.remarks, *second.remarks):
+        warnings.warn(remark, CompgenWarning, stacklevel=1)
     result = difference(machine, first, second, read_points(points) if points else None)
     data = result.summary()
     files = {"diff.json": json.dumps(data, indent=2) + "\n", "difference.csv": _difference_csv(machine, result)}
@@ -145,7 +148,7 @@ def merge_command(
     active = read_active(machine, old, controller_old or controller)
     measured = open_errors(errors)
     bare, lost_um = merged_errors(machine, measured, active)
-    provenance: Provenance = provenance_of(machine.source, errors, *old)
+    provenance: Provenance = provenance_of(machine.source, errors, *active.paths)
     done = export_and_verify(
         machine, bare, bare, controller, out, limits=limits, templates=templates, provenance=provenance
     )

@@ -167,6 +167,17 @@ class Controller(ABC, Generic[Settings, Tables]):
     def parse(self, machine: Machine, settings: Settings, files: Sequence[SourceFile]) -> Tables:
         """Read the control's numbers back from text; InputError with file and line for anything malformed."""
 
+    def parse_foreign(
+        self, machine: Machine, settings: Settings, files: Sequence[SourceFile]
+    ) -> tuple[Tables, list[str]] | None:
+        """Read files that this program did not write (an archive of a control): the tables that act, and remarks.
+
+        The text may hold any character. What has no bearing on a table is passed over and counted in the remarks, tables of
+        axes that the machine file lacks are named there; what could change a table and is not understood is an
+        InputError with its line. None (the default): this control has no reader but the strict :meth:`parse`.
+        """
+        return None
+
     @abstractmethod
     def emulate(self, machine: Machine, settings: Settings, tables: Tables, points: Points) -> FloatArray:
         """Return what the control adds to the command at each point, shape (n, 3), mm."""

@@ -34,7 +34,7 @@ from compgen.model.exact import exact_error
 from compgen.model.grid import volume_grid
 from compgen.model.observability import modelled_errors
 from compgen.model.volumetric import coefficients
-from compgen.verify.verify import ReadTables, read_tables
+from compgen.verify.verify import ReadTables, read_tables, table_files
 
 Measurement = Lengths | Deviations
 
@@ -88,10 +88,11 @@ def read_active(machine: Machine, paths: Sequence[str | Path], controller: str) 
 
     What reading assumed or kept apart is a CompgenWarning: the file of a control holds more than these tables.
     """
-    tables = read_tables(machine, paths, controller)
+    files = table_files(paths, controller)
+    tables = read_tables(machine, files, controller, foreign=True)
     for text in tables.remarks:
         warnings.warn(text, CompgenWarning, stacklevel=2)
-    return ActiveTables(tables, tuple(Path(path) for path in paths))
+    return ActiveTables(tables, tuple(files))
 
 
 def without_active(

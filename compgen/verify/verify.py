@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +20,8 @@ from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.points import Points
 from compgen.core.reversal import ReversalCurves
-from compgen.errors import InputError
+from compgen.core.text import one_line
+from compgen.errors import CompgenWarning, InputError
 from compgen.export.synthesis import Projector, wanted_correction
 from compgen.model.exact import exact_error
 from compgen.model.volumetric import tool_of, volumetric_error
@@ -71,14 +75,18 @@ class ReadTables:
         return mean
 
 
-def read_tables(machine: Machine, paths: Sequence[str | Path] | str | Path, controller: str) -> ReadTables:
+def read_tables(
+    machine: Machine, paths: Sequence[str | Path] | str | Path, controller: str, *, foreign: bool = False
+) -> ReadTables:
     """Parse controller files.
 
     Parameters
     ----------
     machine : its ``[controllers.<name>]`` settings say how the control reads them.
-    paths : the files.
+    paths : the files, or the folder of an export, whose manifest names them.
     controller : name of the control.
+    foreign : read archives and files of other programs as well, with remarks on what was passed over. Files that this
+        program wrote are read strictly all the same.
 
     Raises
     ------
@@ -87,25 +95,92 @@ def read_tables(machine: Machine, paths: Sequence[str | Path] | str | Path, cont
     """
     control = controller_named(controller)
     settings = control.read_settings(machine)
-    files = [Path(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
+    files = table_files([paths] if isinstance(paths, str | Path) else paths, controller)
     if not files:
         raise InputError("no table file was given")
-    contents = [(path, _read_limited(path)) for path in files]
-    sources = [SourceFile(path, _decode(path, content)) for path, content in contents]
-    tables = control.parse(machine, settings, sources)
-    others = tuple(control.contradictions(machine, settings, tables, sources))
+    contents = [(path, _read_limited(path, any_text=foreign)) for path in files]
     hashes = tuple((path.name, sha256_of(content)) for path, content in contents)
+    try:
+        sources = [SourceFile(path, _decode(path, content)) for path, content in contents]
+        tables = control.parse(machine, settings, sources)
+    except InputError:
+        other = _foreign_tables(control, machine, settings, contents) if foreign else None
+        if other is None:
+            raise
+        return ReadTables(control, settings, other[0], hashes, (), tuple(other[1]))
+    others = tuple(control.contradictions(machine, settings, tables, sources))
     remarks = tuple(control.remarks(machine, settings, tables, sources))
     return ReadTables(control, settings, tables, hashes, others, remarks)
 
 
-def _read_limited(path: Path) -> bytes:
+def table_files(paths: Sequence[str | Path], controller: str) -> list[Path]:
+    """Return the files, and in place of a folder those that its manifest names; InputError where it does not fit."""
+    found: list[Path] = []
+    for path in map(Path, paths):
+        found += _files_of_export(path, controller) if path.is_dir() else [path]
+    return found
+
+
+def _files_of_export(folder: Path, controller: str) -> list[Path]:
+    """The tables of an export; where it was made for several controls, those of its sub-folder of this control."""
+    own = folder / controller
+    place = next((place for place in (folder, own) if (place / "manifest.json").is_file()), None)
+    if place is None:
+        message = "is a folder without manifest.json; give the table files, or the folder of an export"
+        raise InputError(message, file=folder)
+    path = place / "manifest.json"
+    try:
+        manifest = json.loads(read_bytes(path, MOST_BYTES))
+        made_for, prefix = manifest["controller"], manifest.get("file_prefix", "")
+        names = [(item["name"], item.get("sha256")) for item in manifest["files"]]
+        if not names or not all(isinstance(name, str) and name == Path(name).name for name, _ in names):
+            raise ValueError("no file")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError("is no manifest of an export", file=path) from error
+    if made_for != controller:
+        message = f"names tables of {one_line(made_for)[:40]}, and {controller} was asked for"
+        raise InputError(message, file=path, field="controller")
+    for name, digest in names:
+        table = place / f"{prefix}{name}"
+        if digest != sha256_of(read_bytes(table, MOST_BYTES + 1)):
+            message = f"{table.name} was changed after the export that wrote {path}"
+            warnings.warn(message, CompgenWarning, stacklevel=5)
+    return [place / f"{prefix}{name}" for name, _ in names]
+
+
+#: Every file that this program writes says so in one of its first lines.
+_OWN_FILE = re.compile(rb"\b(?:compgen|volcomp) (?:\d+\.\d|unknown)")
+
+
+def _foreign_tables(
+    control: AnyController, machine: Machine, settings: Any, contents: Sequence[tuple[Path, bytes]]
+) -> tuple[Any, list[str]] | None:
+    """What the control's reader of other files makes of them; None for files of our own, which stay strict."""
+    if any(_OWN_FILE.search(content[:4000]) for _, content in contents):
+        return None
+    return control.parse_foreign(
+        machine, settings, [SourceFile(path, _any_text(content)) for path, content in contents]
+    )
+
+
+def _any_text(content: bytes) -> str:
+    """Text in whatever encoding: comments of real files hold umlauts and more."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16", "replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def _read_limited(path: Path, *, any_text: bool = False) -> bytes:
     """Contents of a file; one that is far larger than any table is refused before anybody looks for numbers in it."""
     content = read_bytes(path, MOST_BYTES + 1)
     lines = content.count(b"\n")
     if len(content) <= MOST_BYTES and lines <= MOST_LINES:
         return content
-    _decode(path, content)
+    if not any_text:
+        _decode(path, content)
     what = f"{MOST_LINES} lines" if lines > MOST_LINES else f"{MOST_BYTES // 1_000_000} MB"
     message = f"goes on beyond {what}; no controller table does"
     raise InputError(message, file=path, line=min(lines, MOST_LINES) + 1)
@@ -149,7 +224,6 @@ class Verification:
     position_mm: FloatArray = field(repr=False)
     error_before_mm: FloatArray = field(repr=False)
     error_after_mm: FloatArray = field(repr=False)
-    machine: str = ""
 
     @property
     def accepted(self) -> bool:
@@ -186,7 +260,6 @@ class Verification:
             "notes": list(self.notes),
             "reasons": list(self.reasons),
             "controller": self.controller,
-            "machine": self.machine,
             "points": self.points,
             "before": self.before.as_dict(),
             "after": self.after.as_dict(),
@@ -262,7 +335,6 @@ def verify(
         position_mm=where.position_mm,
         error_before_mm=before,
         error_after_mm=after,
-        machine=machine.name,
     )
 
 

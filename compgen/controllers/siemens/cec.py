@@ -16,6 +16,7 @@ import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.siemens.archive import Findings, Foreign, foreign_assignments
 from compgen.controllers.siemens.limits import cec_usage, largest_sums, set_violations, stated_limit_violations
 from compgen.controllers.siemens.preflight import cec_parameters, cec_reservations, cec_sign_statement, cec_warnings
 from compgen.controllers.siemens.products import (
@@ -65,6 +66,10 @@ VARIABLES = {
     "SN_CEC_TABLE_ENABLE": 1,
     "SN_CEC_TABLE_WEIGHT": 1,
 }
+MODE_OF_A_FILE = (
+    "the file multiplies tables, and the machine file does not say what the control makes of that: state "
+    'mult_mode = "S1", "S2", "S3" or "S4" in the section of the control'
+)
 #: (output, axis) of every table without products.
 ALL_PAIRS = [(output, axis) for output in range(3) for axis in range(3)]
 _AXIS_VALUE = re.compile(r'\(\s*([A-Z0-9_]{1,32})\s*\)|"([A-Z0-9_]{1,32})"')
@@ -186,6 +191,14 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         """Read the tables; every variable of a table must be there, because the control keeps old values."""
         return cec_tables_from(read_assignments(files, VARIABLES), files, settings)
 
+    def parse_foreign(
+        self, machine: Machine, settings: CecSettings, files: Sequence[SourceFile]
+    ) -> tuple[CecTables, list[str]]:
+        """Read an archive or a program of a real control: the tables that act, and what was passed over."""
+        findings = Findings()
+        given = foreign_assignments(files, VARIABLES, findings)
+        return foreign_cec_tables(given, machine, settings, findings), findings.statements()
+
     def emulate(self, machine: Machine, settings: CecSettings, tables: CecTables, points: Points) -> FloatArray:
         """Return what the control adds: the clipped sum of the tables, subtracted or added as ``sign`` says.
 
@@ -294,14 +307,7 @@ def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], se
     }
     if not settings.mode_stated:
         for index in (index for index, entry in found.items() if entry.multiplier):
-            raise (
-                parts[index]
-                .scalar("$AN_CEC_MULT_BY_TABLE")
-                .fail(
-                    "the file multiplies tables, and the machine file does not say what the control makes of that: state "
-                    'mult_mode = "S1", "S2", "S3" or "S4" in the section of the control'
-                )
-            )
+            raise (parts[index].scalar("$AN_CEC_MULT_BY_TABLE").fail(MODE_OF_A_FILE))
     for (variable, index), item in switches.items():
         if variable == "SN_CEC_TABLE_ENABLE" and index in found:
             found[index] = replace(found[index], enabled=item.whole(0, 1) == 1)
@@ -310,6 +316,98 @@ def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], se
         elif item.number() != 0:
             raise item.fail(f"the files hold no table {index}")
     return CecTables(found)
+
+
+def foreign_cec_tables(given: Foreign, machine: Machine, settings: CecSettings, findings: Findings) -> CecTables:
+    """Return the tables that act, from the files of a real control.
+
+    Tables without a step are not in use; those of axes that the machine file lacks are kept apart, and those that machine
+    data or setting data switch off are off. InputError with the line for what could change a table and is not known.
+    """
+    parts: dict[int, TableParts] = {}
+    for item in given.items:
+        if item.variable in SWITCHES:
+            continue
+        index = item.index_number(0, 999)
+        part = parts.setdefault(index, TableParts(f"table {index}", item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
+    found, apart = {}, set()
+    for index, part in sorted(parts.items()):
+        if part.is_zero and part.scalar("$AN_CEC_STEP").number() == 0:
+            findings.count("tables that are not in use (step 0)")
+            continue
+        axes = [_axis_name_of(part.scalar(f"$AN_CEC_{side}_AXIS")) for side in ("INPUT", "OUTPUT")]
+        if set(axes) <= set(settings.axis_names):
+            found[index] = _foreign_table(part, machine, settings, axes, findings)
+        else:
+            apart.add(index)
+            findings.apart.append(f"table {index} ({axes[0]} into {axes[1]}, up to {part.largest})")
+    _check_products(parts, set(found), apart, settings)
+    if not found:
+        listed = f"; of other axes: {'; '.join(findings.apart)}" if apart else ""
+        raise next(iter(parts.values())).source.fail(
+            f"holds no table over and into the axes {', '.join(settings.axis_names)} of the machine file{listed}"
+        )
+    return CecTables(_switched(found, given, settings, findings))
+
+
+def _foreign_table(
+    part: TableParts, machine: Machine, settings: CecSettings, axes: Sequence[str], findings: Findings
+) -> CecTable:
+    base, output = (settings.axis_names.index(name) for name in axes)
+    table = findings.table(part, "$AN_CEC", machine.axes[base].range_mm)
+    factor = part.scalars.get("$AN_CEC_MULT_BY_TABLE")
+    if factor is None:
+        findings.count("tables without MULT_BY_TABLE (0 taken)")
+    return CecTable(
+        base,
+        output,
+        table,
+        part.scalar("$AN_CEC_DIRECTION").whole(-1, 1),
+        0 if factor is None else factor.whole(0, 1_000_000),
+        decimals=written_decimals(table),
+    )
+
+
+def _check_products(parts: Mapping[int, TableParts], found: set[int], apart: set[int], settings: CecSettings) -> None:
+    """Refuse products that cannot be worked out: with an axis that is not there, or without a stated mode."""
+    for index, part in parts.items():
+        factor = part.scalars.get("$AN_CEC_MULT_BY_TABLE")
+        number = 0 if factor is None else factor.whole(0, 1_000_000)
+        if not number or factor is None:
+            continue
+        if {index, number - 1} & found and {index, number - 1} & apart:
+            raise factor.fail(
+                f"table {index} is multiplied by table {number - 1}, and one of the two belongs to an axis that the "
+                "machine file does not have"
+            )
+        if index in found and not settings.mode_stated:
+            raise factor.fail(MODE_OF_A_FILE)
+
+
+def _switched(
+    found: Mapping[int, CecTable], given: Foreign, settings: CecSettings, findings: Findings
+) -> dict[int, CecTable]:
+    """Return the tables with SD41300 and SD41310; those into an axis whose MD32710 is 0 in an archive are off."""
+    result = dict(found)
+    own = {(item.variable, item.index): item for item in given.items if item.variable in SWITCHES}
+    for (variable, index), item in {**given.machine_data, **own}.items():
+        number = int(index[0]) if len(index) == 1 and index[0].isdigit() else -1
+        if number not in result:
+            continue
+        if variable == "SN_CEC_TABLE_ENABLE":
+            result[number] = replace(result[number], enabled=item.whole(0, 1) == 1)
+        elif variable == "SN_CEC_TABLE_WEIGHT":
+            result[number] = replace(result[number], weight=item.number())
+    for number, entry in result.items():
+        name = settings.axis_names[entry.output_axis]
+        if entry.enabled and given.switched_off("MA_CEC_ENABLE", (name,)):
+            result[number] = replace(entry, enabled=False)
+            findings.notes.append(f"$MA_CEC_ENABLE[{name}] is 0 in the archive: its tables do not act")
+    off = [str(number) for number, entry in result.items() if not entry.enabled]
+    if off:
+        findings.notes.append(f"table{'s' * (len(off) > 1)} {', '.join(off)} switched off, without effect")
+    return result
 
 
 def _read_table(part: TableParts, axis_names: Sequence[str], label: str) -> CecTable:
@@ -329,10 +427,14 @@ def _read_table(part: TableParts, axis_names: Sequence[str], label: str) -> CecT
 
 
 def _axis_value(item: Assignment, axis_names: Sequence[str]) -> int:
+    return axis_of(item, _axis_name_of(item), axis_names)
+
+
+def _axis_name_of(item: Assignment) -> str:
     match = _AXIS_VALUE.fullmatch(item.value)
     if match is None:
-        raise item.fail(f'{item.value[:40]!r} is not an axis; write ({axis_names[0]}) or "{axis_names[0]}"')
-    return axis_of(item, match.group(1) or match.group(2), axis_names)
+        raise item.fail(f'{item.value[:40]!r} is not an axis; write e.g. (AX1) or "AX1"')
+    return match.group(1) or match.group(2)
 
 
 def _output(entry: CecTable, points: Points) -> FloatArray:

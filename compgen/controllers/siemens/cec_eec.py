@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage
+from compgen.controllers.siemens.archive import Findings, Foreign, foreign_assignments
 from compgen.controllers.siemens.cec import VARIABLES as CEC_VARIABLES
 from compgen.controllers.siemens.cec import (
     CecTables,
@@ -22,10 +23,11 @@ from compgen.controllers.siemens.cec import (
     cec_tables_from,
     cec_tables_of,
     cec_terms,
+    foreign_cec_tables,
     unwritten_products,
 )
 from compgen.controllers.siemens.eec import VARIABLES as EEC_VARIABLES
-from compgen.controllers.siemens.eec import EecTables, SiemensEec, eec_tables_from, eec_terms
+from compgen.controllers.siemens.eec import EecTables, SiemensEec, eec_tables_from, eec_terms, foreign_eec_tables
 from compgen.controllers.siemens.products import MULT_MODES, term_names
 from compgen.controllers.siemens.ranking import Choice, chosen_terms, terms_of_tables
 from compgen.controllers.siemens.settings import CecSettings, EecSettings, take_cec_settings, take_eec_settings
@@ -148,6 +150,23 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
             if not any(item.variable == array for item in found):
                 raise files[-1].fail(f"the files hold no {what} tables (${array}); give both AX_EEC and NC_CEC")
         return CecEecTables(cec_tables_from(cec_items, files, settings.cec), eec_tables_from(eec_items, settings.eec))
+
+    def parse_foreign(
+        self, machine: Machine, settings: CecEecSettings, files: Sequence[SourceFile]
+    ) -> tuple[CecEecTables, list[str]]:
+        """Read an archive or programs of a real control: the tables of both kinds that act, and what was passed over."""
+        findings = Findings()
+        given = foreign_assignments(files, {**EEC_VARIABLES, **CEC_VARIABLES}, findings)
+        cec_part, eec_part = (
+            Foreign([item for item in given.items if item.variable in kind], given.machine_data)
+            for kind in (CEC_VARIABLES, EEC_VARIABLES)
+        )
+        for part, array, what in ((cec_part, "AN_CEC", "cross"), (eec_part, "AA_ENC_COMP", "encoder")):
+            if not any(item.variable == array for item in part.items):
+                raise files[-1].fail(f"the files hold no {what} tables (${array}); give all that the control holds")
+        cec = foreign_cec_tables(cec_part, machine, settings.cec, findings)
+        eec = foreign_eec_tables(eec_part, machine, settings.eec, findings)
+        return CecEecTables(cec, eec), findings.statements()
 
     def emulate(self, machine: Machine, settings: CecEecSettings, tables: CecEecTables, points: Points) -> FloatArray:
         """Return the sum of both corrections."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controllers.grids import equidistant_grid
+from compgen.controllers.siemens.archive import Findings, Foreign, foreign_assignments
 from compgen.controllers.siemens.profiles import PROFILES
 from compgen.controllers.siemens.reversal import plain_backlash_rows
 from compgen.controllers.siemens.settings import EecSettings, take_eec_settings
@@ -176,6 +177,14 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         """Read the tables of the machine's axes; an axis without any assignment has no table."""
         return eec_tables_from(read_assignments(files, VARIABLES), settings)
 
+    def parse_foreign(
+        self, machine: Machine, settings: EecSettings, files: Sequence[SourceFile]
+    ) -> tuple[EecTables, list[str]]:
+        """Read an archive or a program of a real control: the tables that act, and what was passed over."""
+        findings = Findings()
+        given = foreign_assignments(files, VARIABLES, findings)
+        return foreign_eec_tables(given, machine, settings, findings), findings.statements()
+
     def emulate(self, machine: Machine, settings: EecSettings, tables: EecTables, points: Points) -> FloatArray:
         """Return minus the interpolated values of the active measuring system: the actual position is corrected by it."""
         correction = np.zeros((len(points), 3))
@@ -243,6 +252,46 @@ def eec_terms(
     ]
     pairs = [(axis, axis) for axis in range(3)]
     return one_dimensional_terms(machine, errors, nodes, pairs, anchored=True, lever_origin_mm=lever_origin_mm)
+
+
+def foreign_eec_tables(given: Foreign, machine: Machine, settings: EecSettings, findings: Findings) -> EecTables:
+    """Return the tables that act, from the files of a real control.
+
+    Kept apart are tables of axes that the machine file lacks, tables that the archive's machine data switch off, and
+    tables of zeros; a table that acts in another measuring system than the machine file's is refused with its line.
+    """
+    parts: dict[tuple[str, int], TableParts] = {}
+    for item in given.items:
+        if item.variable in SWITCHES:
+            continue
+        encoder, name = item.index_number(0, 1), item.index[-1]
+        part = parts.setdefault((name, encoder), TableParts(f"table of {name}, encoder {encoder}", item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AA_ENC_COMP" else None)
+    tables = {}
+    for (name, encoder), part in sorted(parts.items()):
+        axis = settings.axis_names.index(name) if name in settings.axis_names else None
+        own = axis is not None and encoder in settings.encoders[axis]
+        if part.is_zero and (not own or part.scalar("$AA_ENC_COMP_STEP").number() == 0):
+            findings.count("encoder tables of zeros, of other axes or measuring systems")
+        elif axis is None:
+            findings.apart.append(f"encoder table of {name} (encoder {encoder}, up to {part.largest})")
+        elif given.switched_off("MA_ENC_COMP_ENABLE", (str(encoder), name)):
+            findings.notes.append(f"$MA_ENC_COMP_ENABLE[{encoder},{name}] is 0 in the archive: its table does not act")
+        elif not own:
+            raise part.scalar("$AA_ENC_COMP_STEP").fail(
+                f"the control holds a table of up to {part.largest} for encoder {encoder} of {name}; the machine "
+                f"file has encoder = {list(settings.encoders[axis])}: state the one that is in use, e.g. encoder = "
+                f"{{ {AXES[axis]} = {encoder} }}"
+            )
+        else:
+            tables[axis, encoder] = findings.table(part, "$AA_ENC_COMP", machine.axes[axis].range_mm)
+    if not tables:
+        said = [*findings.apart, *findings.notes]
+        raise next(iter(parts.values())).source.fail(
+            f"holds no table that acts for the axes {', '.join(settings.axis_names)} and measuring systems of the machine "
+            f"file{': ' if said else ''}{'; '.join(said)}"
+        )
+    return EecTables(dict(sorted(tables.items())))
 
 
 def eec_tables_from(items: Sequence[Assignment], settings: EecSettings) -> EecTables:

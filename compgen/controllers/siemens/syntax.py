@@ -42,6 +42,8 @@ SWITCHES = {
 PROTECTING = ("MA_ENC_COMP_ENABLE", "MA_CEC_ENABLE")
 MAKE_EFFECTIVE = "NEWCONF"
 
+#: A step that was rounded misses MAX by less than this share of itself: 39 steps of 19.7436 mm are 770.0004 mm.
+_ROUNDED = Decimal("0.01")
 _LONGEST_LINE = 1000
 _MOST_LINES = 200_000
 _MOST_CHARACTERS = 20_000_000
@@ -233,9 +235,12 @@ class LinearTable:
         return np.array([float(value) for value in self.values])
 
     def at(self, position_mm: FloatArray) -> FloatArray:
-        """Interpolated value at positions of any shape."""
+        """Interpolated value at positions of any shape; what lies beyond ``last_mm`` has the value there.
+
+        The last node stands at ``last_mm``, or beyond it where that is no whole number of steps.
+        """
         start, last = float(self.start_mm), float(self.last_mm)
-        position = start + np.mod(position_mm - start, last - start) if self.modulo else position_mm
+        position = start + np.mod(position_mm - start, last - start) if self.modulo else np.minimum(position_mm, last)
         return np.interp(position, self.nodes_mm, self.numbers)
 
 
@@ -272,6 +277,44 @@ class TableParts:
                 f"{self.what}: {name} is missing (the control would keep an older value): is the file truncated?"
             )
         return self.scalars[name]
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether every node is zero: whatever is not known of such a table does not matter."""
+        return all(item.number() == 0 for item in self.nodes.values())
+
+    @property
+    def largest(self) -> str:
+        """Largest value of a node in size, as people read it; of a rotary axis it is in degrees."""
+        return f"{max((abs(float(item.number())) for item in self.nodes.values()), default=0.0):g} mm or degrees"
+
+    def foreign_table(self, prefix: str) -> tuple[LinearTable, int, float]:
+        """Return a table as a real control may hold it, how many reserved nodes lie beyond MAX, and a doubt in um.
+
+        Where MAX is no whole number of steps from MIN, the node behind it ends the last, shorter interval; whether the
+        control interpolates to it or holds the node before is not documented, and the doubt is what that can matter.
+        """
+        first, last, step = (self.scalar(f"{prefix}_{key}") for key in ("MIN", "MAX", "STEP"))
+        start_mm, last_mm, step_mm = first.number(), last.number(), step.number()
+        if step_mm <= 0:
+            raise step.fail(f"{step.value} is not above zero, and the table holds values")
+        if last_mm <= start_mm:
+            raise last.fail(f"{last.value} is not above the position {first.value} of the first node")
+        whole, part = divmod(last_mm - start_mm, step_mm)
+        count = int(whole) + (2 if part else 1)
+        if part and int(whole) + 1 not in self.nodes:
+            count -= 1
+        missing = next((n for n in range(count) if n not in self.nodes), None)
+        if missing is not None:
+            raise self.source.fail(
+                f"{self.what}: node {missing} of 0 ... {count - 1} is missing: is the file truncated?", first.line
+            )
+        values = tuple(self.nodes[n].number() for n in range(count))
+        modulo = f"{prefix}_IS_MODULO" in self.scalars and self.scalars[f"{prefix}_IS_MODULO"].whole(-1, 1) == 1
+        odd = _ROUNDED < part / step_mm < 1 - _ROUNDED and count > 1
+        doubt = abs(float((values[-1] - values[-2]) * part / step_mm)) if odd else 0.0
+        surplus = sum(1 for n in self.nodes if n >= count)
+        return LinearTable(start_mm, step_mm, last_mm, values, modulo), surplus, 1000.0 * doubt
 
     def table(self, prefix: str) -> LinearTable:
         """Return the complete table; ``prefix`` is ``$AN_CEC`` or ``$AA_ENC_COMP``."""

@@ -1,0 +1,353 @@
+"""Files that real controls hold: archives, programs and parameter files that this program did not write.
+
+All texts are made up here in the form of the real ones; their numbers are worked by hand.
+"""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from compgen.cli import cli, run_command
+from compgen.controllers import controller_named
+from compgen.core.error_table import format_errors
+from compgen.core.machine import read_machine
+from compgen.core.points import Points
+from compgen.errors import CompgenWarning, InputError
+from compgen.export.render import load_format, render_files
+from compgen.verify import read_tables
+from compgen.verify.active import read_active
+
+MACHINE = """\
+name = "mill"
+chain = "WXYFZT"
+[axes.X]
+range_mm = [0.0, 950.0]
+nodes = 6
+[axes.Y]
+range_mm = [-850.0, 0.0]
+nodes = 6
+[axes.Z]
+range_mm = [-650.0, 0.0]
+nodes = 6
+"""
+
+
+def machine_with(folder, settings=""):
+    path = folder / "machine.toml"
+    path.write_text(MACHINE + settings)
+    return read_machine(path)
+
+
+def table(index, values, axes, step, start, end, more=("DIRECTION", "MULT_BY_TABLE", "IS_MODULO"), **others):
+    """One cross table as a control saves it; ``values`` of all reserved nodes."""
+    lines = [f"$AN_CEC[{index},{n}]={value}" for n, value in enumerate(values)]
+    numbers = {"STEP": step, "MIN": start, "MAX": end, **dict.fromkeys(more, 0), **others}
+    lines += [f"$AN_CEC_INPUT_NCU[{index}]=1", f"$AN_CEC_INPUT_AXIS[{index}]=({axes[0]})"]
+    lines += [f"$AN_CEC_OUTPUT_NCU[{index}]=1", f"$AN_CEC_OUTPUT_AXIS[{index}]=({axes[1]})"]
+    lines += [f"$AN_CEC_{key}[{index}]={value}" for key, value in numbers.items()]
+    return "\n".join([*lines, f"$AN_CEC_TYPE[{index}]=0"]) + "\n"
+
+
+STRAIGHT = [0, 0, 0.002, 0.005, 0.006, 0.003, 0, -0.001, -0.004, -0.002, 0, 0, 0.007]  # 13 reserved, 10 in 0 ... 950
+NOTHING = table(8, [0, 0], ("X", "X"), 0, 0, 0)
+CEC_INI = (
+    "METRIC\n\nCHANDATA(1)\n"
+    + table(0, [0] * 12, ("AX2", "AX1"), 100, -850, 0)
+    + table(2, STRAIGHT, ("AX1", "AX2"), 100, 0, 950)
+    + table(7, [0, 0.001, 0], ("AX5", "AX1"), 120, -120, 120)
+    + NOTHING
+    + "M17\n"
+)
+INITIAL = """\
+METRIC
+
+CHANDATA(1)
+N10000 $MN_AXCONF_MACHAX_NAME_TAB[0]="X1"
+N10240 $MN_SCALING_SYSTEM_IS_METRIC=1
+N18342 $MN_MM_CEC_MAX_POINTS[2]=13
+N32450 $MA_BACKLASH[0,AX1]=-0.0009
+N32700 $MA_ENC_COMP_ENABLE[1,AX1]=1
+N32710 $MA_CEC_ENABLE[AX1]=1
+N32710 $MA_CEC_ENABLE[AX2]=1
+N32720 $MA_CEC_MAX_SUM[AX2]=1
+N41300 $SN_CEC_TABLE_ENABLE[2]=1
+N41310 $SN_CEC_TABLE_WEIGHT[2]=1
+M17
+"""
+PROGRAM = "; Durchhang \u00fcberpr\u00fcfen\nR816=$AN_CEC [6,16]\n$AN_CEC [2,3] = R816+_SAG\nIF R1==0 GOTOF ENDE\nM30\n"
+
+
+def archive(parts):
+    """A start-up archive: before each file NUL bytes with its name, and other bytes around them."""
+    content = b"@@MMCIBN.002" + b"\0" * 80 + b";1476518513\n;---components---\n"
+    for name, kind, text in parts:
+        head = (
+            f"_N_{name}_{kind}".encode() + b"\0" * 30 + f"{name}.{kind}".encode() + b"\0" * 9 + b"77777\0/_N_CMA_DIR/\0"
+        )
+        content += b"\0" * 50 + head + text.encode("latin-1")
+    return content + b"\0" * 20 + b"\x02\x88\xff\0" + b"other data\n"
+
+
+def cec_archive(cec=CEC_INI, initial=INITIAL):
+    return archive([("CMA", "DEF", "DEF CHAN INT _X\n"), ("SAG", "SPF", PROGRAM), ("NC_CEC", "INI", cec),
+                    ("INITIAL", "INI", initial), ("LAST", "MPF", "G0 X0\nM30\n")])  # fmt: skip
+
+
+def read(folder, content, controller="siemens-cec", settings="", name="control.arc"):
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return read_tables(machine_with(folder, settings), path, controller, foreign=True)
+
+
+def added(machine, tables, positions):
+    return tables.correction(machine, Points(np.array(positions, dtype=float))) * 1e3
+
+
+def test_the_archive_of_a_control_gives_the_tables_that_act(tmp_path):
+    tables = read(tmp_path, cec_archive())
+    machine = machine_with(tmp_path)
+    # Y as a function of X, subtracted; 12.5 % of the way from node 8 to node 9, and what MAX cuts off the last interval
+    moved = added(machine, tables, [[300, -400, -300], [812.5, -400, -300], [950, -400, -300]])
+    np.testing.assert_allclose(moved, [[0, -5, 0], [0, 3.75, 0], [0, 1, 0]], atol=1e-9)
+    said = "\n".join(tables.remarks)
+    assert "table 7 (AX5 into AX1, up to 0.001 mm or degrees)" in said
+    for words in ("other files of the archive", "SAG.SPF", "$MA_BACKLASH", "reserved nodes beyond MAX", "not in use"):
+        assert words in said
+    assert "table 2: MIN + k STEP does not meet MAX" in said  # 950 of 0, 100, ... 1000: half of 2 um
+    assert "up to 1.0 um" in said
+    assert len(tables.remarks) <= 4
+
+
+@pytest.mark.parametrize(
+    ("line", "instead", "moved_um"),
+    [
+        ("N32710 $MA_CEC_ENABLE[AX2]=1", "N32710 $MA_CEC_ENABLE[AX2]=0", 0.0),
+        ("N41300 $SN_CEC_TABLE_ENABLE[2]=1", "N41300 $SN_CEC_TABLE_ENABLE[2]=0", 0.0),
+        ("N41310 $SN_CEC_TABLE_WEIGHT[2]=1", "N41310 $SN_CEC_TABLE_WEIGHT[2]=0.5", -2.5),
+    ],
+)
+def test_what_the_archive_switches_off_does_not_act(tmp_path, line, instead, moved_um):
+    assert line in INITIAL
+    tables = read(tmp_path, cec_archive(initial=INITIAL.replace(line, instead)))
+    assert added(machine_with(tmp_path), tables, [[300, -400, -300]])[0, 1] == pytest.approx(moved_um, abs=1e-9)
+    assert (moved_um == 0.0) == any("switched off" in remark for remark in tables.remarks)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("$AN_CEC[2,3]=0.005", "$AN_CEC[2,3]=R816+1", r"AN_CEC\[2,3\].*not a number"),
+        ("$AN_CEC[2,3]=0.005", "$AN_CEC[2,3] 0.005", "not understood, and it could change a table"),
+        ("$AN_CEC[2,3]=0.005\n", "", "node 3 of 0 ... 10 is missing"),
+        ("$AN_CEC[2,3]=0.005", "$AN_CEC[2,3]=0.005\n$AN_CEC[2,3]=0.004", "second value"),
+        ("$AN_CEC_TYPE[2]=0", "$AN_CEC_TYPE[2]=1", "is not understood; 0 is"),
+        ("$AN_CEC_TYPE[2]=0", "$AN_CEC_MAGIC[2]=1", "could change a table"),
+        ("$AN_CEC_MULT_BY_TABLE[2]=0", "$AN_CEC_MULT_BY_TABLE[2]=8", "multiplied by table 7.*does not have"),
+        ("$AN_CEC_IS_MODULO[2]=0", "$AN_CEC_IS_MODULO[2]=7", "IS_MODULO"),
+        ("METRIC\n\nCHANDATA", "INCH\n\nCHANDATA", "the file is in inch"),
+        ("M17\n", "", "truncated"),
+        ("(AX1)\n$AN_CEC_OUTPUT_NCU[2]=1\n$AN_CEC_OUTPUT_AXIS[2]=(AX2)",
+         "(AX4)\n$AN_CEC_OUTPUT_NCU[2]=1\n$AN_CEC_OUTPUT_AXIS[2]=(AX5)", None),
+    ],
+)  # fmt: skip
+def test_what_could_change_a_table_and_is_not_understood_is_refused_with_its_line(tmp_path, old, new, words):
+    assert old in CEC_INI
+    content = cec_archive(cec=CEC_INI.replace(old, new))
+    if words is None:  # all tables but those of zeros are of other axes: read, and said
+        assert "table 2 (AX4 into AX5" in "\n".join(read(tmp_path, content).remarks)
+        return
+    with pytest.raises(InputError, match=words) as caught:
+        read(tmp_path, content)
+    assert caught.value.line and caught.value.file.name == "control.arc"
+
+
+def test_an_inch_control_is_refused(tmp_path):
+    with pytest.raises(InputError, match="SCALING_SYSTEM_IS_METRIC"):
+        read(tmp_path, cec_archive(initial=INITIAL.replace("IS_METRIC=1", "IS_METRIC=0")))
+
+
+SPF = """\
+%_N_KOMP_SPF
+; Kompensation gepr\u00fcft am 3.4.  ; zweiter
+$MA_CEC_ENABLE[AX1] = FALSE
+$SN_CEC_TABLE_ENABLE[7] = FALSE
+NEWCONF
+STOPRE
+METRIC
+$AN_CEC_INPUT_AXIS[2] = (AX1) ; Basisachse
+$AN_CEC_OUTPUT_AXIS[2] = (AX1)
+$AN_CEC_STEP [2] = 475
+$AN_CEC_MIN[2] = 0
+$AN_CEC_MAX[2] = 950
+$AN_CEC_DIRECTION[2] = 1
+$AN_CEC_IS_MODULO[2] = -1
+$AN_CEC [2,0] = 0.000   ; -120 [Bei MKS Anzeige]
+$AN_CEC [2,1] = 0,004
+$AN_CEC [2,2] = 2EX-3
+M0
+M30
+"""
+
+
+def test_a_program_of_a_machine_builder_is_read(tmp_path):
+    for content in (SPF.encode("latin-1"), SPF.encode(), SPF.replace("\n", "\r\n").encode("latin-1")):
+        tables = read(tmp_path, content, name="KOMP.SPF")
+        up = Points(np.array([[237.5, -400.0, 0.0], [950.0, -400.0, 0.0]]), approach=np.ones((2, 3)))
+        np.testing.assert_allclose(tables.correction(machine_with(tmp_path), up)[:, 0] * 1e3, [-2.0, -2.0], atol=1e-9)
+        said = " ".join(tables.remarks)
+        for words in ("decimal commas (1)", "numbers with an exponent (1)", "without MULT_BY_TABLE", "IS_MODULO = -1"):
+            assert words in said
+    with pytest.raises(InputError, match="not understood"):
+        read(tmp_path, SPF.replace("STOPRE", "IF R1 == 1 GOTOF ENDE"), name="KOMP.SPF")
+    with pytest.raises(InputError, match="neither 0 nor 1"):
+        read(tmp_path, SPF.replace("MAX[2] = 950", "MAX[2] = 949.9"), name="KOMP.SPF")
+    with pytest.raises(InputError):  # verify reads what this program writes, and nothing else
+        read_tables(machine_with(tmp_path), tmp_path / "KOMP.SPF", "siemens-cec")
+
+
+def eec_text(values, step, start, end, encoder=0, axis="AX1"):
+    lines = [f"$AA_ENC_COMP[{encoder},{n},{axis}]={value}" for n, value in enumerate(values)]
+    numbers = {"STEP": step, "MIN": start, "MAX": end, "IS_MODULO": 0}
+    lines += [f"$AA_ENC_COMP_{key}[{encoder},{axis}]={value}" for key, value in numbers.items()]
+    return "\n".join(lines) + "\n"
+
+
+def test_a_step_that_was_rounded_gives_all_nodes(tmp_path):
+    """39 steps of 24.3590 mm are 950.0010 mm: the 40 values belong to 0 ... 950."""
+    values = [f"{0.0001 * n:.4f}".replace(".", ",") for n in range(40)]
+    text = "CHANDATA(1)\n" + eec_text(values, 24.3590, 0, 950) + "$MA_BACKLASH[0,AX1]=n/a\nNEWCONF\nM30\n"
+    tables = read(tmp_path, text, "siemens-eec", name="eec.spf")
+    moved = added(machine_with(tmp_path), tables, [[0, 0, 0], [24.359, 0, 0], [950, 0, 0]])[:, 0]
+    np.testing.assert_allclose(moved, [0.0, -0.1, -3.9], atol=1e-5)
+    assert not any("does not meet" in remark for remark in tables.remarks)
+
+
+def test_tables_of_another_measuring_system_are_asked_about_if_they_act(tmp_path):
+    text = (
+        "METRIC\nCHANDATA(1)\n"
+        + eec_text([0, 0.003, 0], 475, 0, 950, 1)
+        + eec_text([0, 0.1], 360, 0, 360, 1, "AX4")
+        + "M17\n"
+    )
+    content = archive([("AX_EEC", "INI", text), ("INITIAL", "INI", INITIAL)])
+    with pytest.raises(InputError, match="for encoder 1 of AX1; the machine file has encoder = .0.") as caught:
+        read(tmp_path, content, "siemens-eec")
+    assert caught.value.line
+    own = "[controllers.siemens-eec]\nencoder = { X = 1 }\n"
+    tables = read(tmp_path, content, "siemens-eec", own)
+    assert added(machine_with(tmp_path, own), tables, [[475, 0, 0]])[0, 0] == pytest.approx(-3.0)
+    assert any("encoder table of AX4" in remark for remark in tables.remarks)
+    off = archive([("AX_EEC", "INI", text), ("INITIAL", "INI", INITIAL.replace("ENABLE[1,AX1]=1", "ENABLE[1,AX1]=0"))])
+    with pytest.raises(InputError, match="does not act"):
+        read(tmp_path, off, "siemens-eec", own)
+
+
+def test_an_archive_written_back_in_our_form_holds_the_same_numbers(tmp_path):
+    tables = read(tmp_path, cec_archive())
+    machine = machine_with(tmp_path)
+    common = {"version": "1", "machine_name": "mill", "chain": "WXYFZT", "input_sha256": "0" * 64}
+    control = controller_named("siemens-cec")
+    context = {**common, **control.context(machine, tables.settings, tables.tables)}
+    text = render_files(load_format("siemens-cec"), context)["NC_CEC.INI"]
+    for n, value in enumerate(STRAIGHT[:11]):
+        assert f"$AN_CEC[2,{n}]={value:.6f}\n" in text
+    assert "$AN_CEC_INPUT_AXIS[2]=(AX1)" in text and "$AN_CEC_OUTPUT_AXIS[2]=(AX2)" in text
+
+
+# --- the commands, and the folder of an export -----------------------------------------------------------------------
+
+
+@pytest.fixture
+def exported(tmp_path, small_machine_file, small_errors):
+    errors = tmp_path / "small.errors.csv"
+    errors.write_text(format_errors(small_errors))
+    out = tmp_path / "tables"
+    words = ["export", str(small_machine_file), str(errors), "--controller", "siemens-cec", "--out", str(out)]
+    assert run_command(cli, words) == 0
+    return small_machine_file, errors, out
+
+
+def test_commands_take_the_folder_of_an_export(exported, tmp_path, capsys):
+    machine, errors, folder = exported
+    points = tmp_path / "p.points.csv"
+    points.write_text("x_mm,y_mm,z_mm\n0,0,-100\n")
+    cec = ["--controller", "siemens-cec"]
+    for source, name in ((folder, "a.csv"), (folder / "NC_CEC.INI", "b.csv")):
+        words = ["read", str(machine), str(source), *cec, "--points", str(points), "--out", str(tmp_path / name)]
+        assert run_command(cli, words) == 0
+    assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
+    judged = ["verify", str(machine), str(folder), *cec, "--errors", str(errors), "--out", str(tmp_path / "v")]
+    assert run_command(cli, judged) == 0
+    against = [
+        "diff",
+        str(machine),
+        str(folder),
+        "--against",
+        str(folder / "NC_CEC.INI"),
+        *cec,
+        "--out",
+        str(tmp_path / "d"),
+    ]
+    assert run_command(cli, against) == 0
+    assert json.loads((tmp_path / "d" / "diff.json").read_text())["same"]
+    merged = ["merge", str(machine), str(folder), *cec, "--errors", str(errors), "--out", str(tmp_path / "m")]
+    assert run_command(cli, merged) == 0
+    assert read_active(read_machine(machine), [folder], "siemens-cec").paths == (folder / "NC_CEC.INI",)
+    capsys.readouterr()
+
+
+def test_a_folder_that_does_not_fit_is_refused_and_a_changed_table_is_said(exported, tmp_path, capsys):
+    machine, errors, folder = exported
+
+    def judged(source, controller="siemens-cec"):
+        words = ["verify", str(machine), str(source), "--controller", controller, "--errors", str(errors)]
+        code = run_command(cli, [*words, "--out", str(tmp_path / "v")])
+        return code, capsys.readouterr().err
+
+    assert judged(folder, "isg-csv")[0] == 2
+    (tmp_path / "empty").mkdir()
+    code, said = judged(tmp_path / "empty")
+    assert code == 2 and "without manifest.json" in said
+    several = tmp_path / "several"
+    several.mkdir()
+    shutil.copytree(folder, several / "siemens-cec")
+    assert judged(several)[0] == 0
+    text = (folder / "NC_CEC.INI").read_text()
+    (folder / "NC_CEC.INI").write_text(text.replace("0.0", "0.1", 1))
+    assert "changed after the export" in judged(folder)[1]
+    for bad in (
+        "{",
+        '{"controller": "siemens-cec", "files": []}',
+        '{"controller": "siemens-cec", "files": [{"name": "../x"}]}',
+    ):
+        (folder / "manifest.json").write_text(bad)
+        assert judged(folder)[0] == 2
+
+
+def test_our_own_tables_stay_strict(exported, tmp_path, capsys):
+    machine, _, folder = exported
+    path = folder / "NC_CEC.INI"
+    text = path.read_text()
+    points = tmp_path / "p.points.csv"
+    points.write_text("x_mm,y_mm,z_mm\n0,0,-100\n")
+    words = ["read", str(machine), str(path), "--controller", "siemens-cec", "--points", str(points)]
+    for old, new in (
+        ("M17", "STOPRE\nM17"),
+        ("$AN_CEC_MULT_BY_TABLE[0]=0\n", ""),
+        ("$AN_CEC[0,1]=", "$AN_CEC [0,1]=0,"),
+    ):
+        assert old in text
+        path.write_text(text.replace(old, new))
+        assert run_command(cli, [*words, "--out", str(tmp_path / "o.csv")]) == 2
+        assert not (tmp_path / "o.csv").exists()
+    capsys.readouterr()
+
+
+def test_the_active_tables_of_an_archive_are_said_once(tmp_path):
+    (tmp_path / "control.arc").write_bytes(cec_archive())
+    with pytest.warns(CompgenWarning) as said:
+        active = read_active(machine_with(tmp_path), [tmp_path / "control.arc"], "siemens-cec")
+    assert sum("kept apart: table 7" in str(warning.message) for warning in said) == 1
+    assert active.paths == (tmp_path / "control.arc",)
