@@ -1,11 +1,15 @@
 # make demo   sets up and runs the main job on the example
 # make test   sets up, checks style and types, runs the tests
+# make pins   writes the pinned dependencies again (CONTRIBUTING.md)
 # make bench  prints the ratios against named peers
 PYTHON ?= python3
 BIN := .venv/bin
 CONTROLLERS := isg-csv etalon-exchange siemens-eec siemens-cec fanuc-pitch
 
-.PHONY: demo test lint system bench clean
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+COMPILE = uv pip compile --quiet --all-extras --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
+
+.PHONY: demo test lint system bench pins clean
 .DELETE_ON_ERROR:
 
 demo: .venv/ready
@@ -31,18 +35,23 @@ lint: .venv/ready-dev
 	  { rm -rf .venv; echo "no virtual environment: install your system's python3-venv package"; exit 1; }
 
 .venv/ready: .venv/bin/python requirements.txt pyproject.toml
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps -e .
+	$(PIP) --require-hashes -r requirements.txt
+	$(PIP) --no-build-isolation --no-deps -e .
 	@touch $@
 
 .venv/ready-dev: .venv/ready requirements-dev.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	$(PIP) --require-hashes -r requirements-dev.txt
 	@touch $@
 
 # every benchmark, one after the other, that of the diagnosis in short; some minutes on a quiet computer
 bench: .venv/ready-dev
 	for name in identify evaluate fit interval_coverage; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 	$(BIN)/python benchmarks/diagnosis.py --sets 2
+
+# pins stay as they are unless UPGRADE names a package: make pins UPGRADE="--upgrade-package numpy"
+pins:
+	$(COMPILE) $(UPGRADE) pyproject.toml requirements.in -o requirements.txt
+	$(COMPILE) $(UPGRADE) -c requirements.txt pyproject.toml requirements-dev.in -o requirements-dev.txt
 
 clean:
 	rm -rf .venv demo-out

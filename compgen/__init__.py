@@ -2,102 +2,61 @@
 
 Each stage is a function on plain data, without side effects: :func:`load_machine`, :func:`read_lengths`,
 :func:`identify`, :func:`fit`, :func:`export`, :func:`read_tables`, :func:`verify`, :func:`predict`.
+
+The names are loaded on first use, so that a program that needs one of them does not wait for all.
 """
 
-from compgen.controllers import CONTROLLERS
-from compgen.core.deviations import Deviations, format_deviations, read_deviations
-from compgen.core.error_table import Curve, ErrorTable, format_errors, read_errors
-from compgen.core.lengths import Lengths, format_lengths, read_lengths
-from compgen.core.machine import Axis, Chain, Machine, load_machine
-from compgen.core.points import Points, format_points, read_points
-from compgen.core.reversal import ReversalCurves, format_reversal, read_reversal
-from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
-from compgen.export import Export, export, wanted_correction
-from compgen.fit import FitOptions, FitResult, fit
-from compgen.identify import (
-    Covariance,
-    Identification,
-    IdentifyOptions,
-    SystematicInputs,
-    identify,
-    identify_deviations,
-    joint_covariance,
-    predict_uncertainty,
-    read_covariance,
-)
-from compgen.model import c_matrix, exact_error, modelled_errors, observable_errors, predict, volumetric_error
-from compgen.pipeline import RunResult, run
-from compgen.plan import Plan, PlannedStations, plan, planned_stations, suggest
-from compgen.plugins import load_plugins
-from compgen.simulate import Scenario, Simulation, read_scenario, simulate, write_simulation
-from compgen.verify import ReadTables, Residuals, Verification, read_tables, residuals, verify, without_rigid_motion
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import Any
 
-__all__ = [
-    "CONTROLLERS",
-    "Axis",
-    "Chain",
-    "CompgenError",
-    "CompgenWarning",
-    "ConvergenceError",
-    "Covariance",
-    "Curve",
-    "Deviations",
-    "ErrorTable",
-    "Export",
-    "FitOptions",
-    "FitResult",
-    "Identification",
-    "IdentifyOptions",
-    "InputError",
-    "Lengths",
-    "Machine",
-    "Plan",
-    "PlannedStations",
-    "Points",
-    "ReadTables",
-    "Residuals",
-    "ReversalCurves",
-    "RunResult",
-    "Scenario",
-    "Simulation",
-    "SystematicInputs",
-    "UndeterminedError",
-    "Verification",
-    "c_matrix",
-    "exact_error",
-    "export",
-    "fit",
-    "format_deviations",
-    "format_errors",
-    "format_lengths",
-    "format_points",
-    "format_reversal",
-    "identify",
-    "identify_deviations",
-    "joint_covariance",
-    "load_machine",
-    "load_plugins",
-    "modelled_errors",
-    "observable_errors",
-    "plan",
-    "planned_stations",
-    "predict",
-    "predict_uncertainty",
-    "read_covariance",
-    "read_deviations",
-    "read_errors",
-    "read_lengths",
-    "read_points",
-    "read_reversal",
-    "read_scenario",
-    "read_tables",
-    "residuals",
-    "run",
-    "simulate",
-    "suggest",
-    "verify",
-    "volumetric_error",
-    "wanted_correction",
-    "without_rigid_motion",
-    "write_simulation",
-]
+#: The public names by the module that defines them.
+_HOMES = {
+    "compgen.controllers": "CONTROLLERS",
+    "compgen.core.deviations": "Deviations format_deviations read_deviations",
+    "compgen.core.error_table": "Curve ErrorTable format_errors read_errors",
+    "compgen.core.lengths": "Lengths format_lengths read_lengths",
+    "compgen.core.machine": "Axis Chain Machine load_machine",
+    "compgen.core.points": "Points format_points read_points",
+    "compgen.core.reversal": "ReversalCurves format_reversal read_reversal",
+    "compgen.errors": "CompgenError CompgenWarning ConvergenceError InputError UndeterminedError",
+    "compgen.export": "Export export wanted_correction",
+    "compgen.fit": "FitOptions FitResult fit",
+    "compgen.identify": (
+        "Covariance Identification IdentifyOptions SystematicInputs "
+        "identify identify_deviations joint_covariance predict_uncertainty read_covariance"
+    ),
+    "compgen.model": "c_matrix exact_error modelled_errors observable_errors predict volumetric_error",
+    "compgen.pipeline": "RunResult run",
+    "compgen.plan": "Plan PlannedStations plan planned_stations suggest",
+    "compgen.plugins": "load_plugins",
+    "compgen.simulate": "Scenario Simulation read_scenario simulate write_simulation",
+    "compgen.verify": "ReadTables Residuals Verification read_tables residuals verify without_rigid_motion",
+}
+__all__ = sorted(name for names in _HOMES.values() for name in names.split())
+
+
+def _on_first_use(name: str, home: str) -> property:
+    """A public name as a property: importing the sub-package ``compgen.fit`` must not hide the function ``fit``."""
+
+    def load(package: ModuleType) -> Any:
+        return getattr(import_module(home), name)
+
+    def keep(package: ModuleType, value: Any) -> None:
+        # the import system sets every sub-package as an attribute of the package; the public name stays what it is
+        if not isinstance(value, ModuleType):
+            raise AttributeError(f"compgen.{name} cannot be replaced; it belongs to {home}")
+
+    return property(load, keep)
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+sys.modules[__name__].__class__ = type(
+    "_Package",
+    (ModuleType,),
+    {name: _on_first_use(name, home) for home, names in _HOMES.items() for name in names.split()},
+)

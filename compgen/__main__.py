@@ -1,5 +1,17 @@
-"""``python -m compgen``: the command line, also where the shell has a built-in of the same name (bash)."""
+"""The console script, also as ``python -m compgen`` where the shell has a built-in of the same name (bash)."""
 
-from compgen.cli import main
+import sys
 
-main()
+
+def main() -> None:
+    """Run the command line; Ctrl-C while the program is still being loaded ends it as it does later."""
+    try:
+        from compgen.cli import main as command_line
+    except KeyboardInterrupt:
+        sys.stderr.write("stopped\n")
+        sys.exit(130)
+    command_line()
+
+
+if __name__ == "__main__":
+    main()

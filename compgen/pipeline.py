@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,8 +23,8 @@ from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.core.reversal import WORTH_MM, ReversalCurves, format_reversal
 from compgen.effects import with_effects_reversal
-from compgen.errors import ConvergenceError, InputError, UndeterminedError
-from compgen.export import REJECTED_PREFIX, Export, Provenance, export, usable_format
+from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.export import REJECTED_PREFIX, Export, Provenance, export, set_aside_superseded, usable_format
 from compgen.fit import FitOptions, FitResult, fit
 from compgen.identify import (
     Identification,
@@ -65,11 +66,15 @@ class ControllerResult:
 
 @dataclass(frozen=True)
 class RunResult:
-    """Outcome of :func:`run`; ``accepted`` is True if every control's tables are."""
+    """Outcome of :func:`run`; ``accepted`` is True if every control's tables are.
+
+    ``earlier_report`` says where the report of the tables that were in the folder before is kept.
+    """
 
     identification: Identification
     fitted: FitResult
     results: tuple[ControllerResult, ...]
+    earlier_report: tuple[Path, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -121,6 +126,22 @@ def identification_files(
         **files,
         "identify.json": json.dumps(summary, indent=2) + "\n",
     }
+
+
+#: What only some identifications write.
+SOME_WRITE = ("stations.csv", "measured.deviations.csv", "identified.reversal.csv", covariance.FILE_NAME)
+
+
+def add_identification(output: OutputFolder, files: Mapping[str, str | bytes]) -> None:
+    """Add the files of an identification; those of an earlier one that have no successor are set aside.
+
+    Else the reversal or the covariance of one measurement would be taken for that of the next.
+    """
+    for name, content in files.items():
+        output.add(name, content)
+    for name in SOME_WRITE:
+        if name not in files and (output.folder / name).is_file():
+            output.set_aside(name)
 
 
 def identified_reversal(result: Identification) -> ReversalCurves | None:
@@ -197,7 +218,7 @@ def export_and_verify(
     reasons = tuple(dict.fromkeys([*verification.reasons, *exported.violations]))
     verification = replace(verification, reasons=reasons)
     beside = check_files(machine, exported, identified, export_options.get("templates"), reversal)
-    return _write_result(exported, verification, beside, folder)
+    return _write_results(OutputFolder(folder), {"": (exported, verification, beside)})[0][0]
 
 
 def _read_back(
@@ -245,25 +266,45 @@ def identify_bare(
     return replace(result, corrections={**result.corrections, "active_tables": report})
 
 
-def _write_result(
-    exported: Export, verification: Verification, beside: Mapping[str, str], folder: str | Path
-) -> ControllerResult:
-    prefix = "" if verification.accepted else REJECTED_PREFIX
-    verification = replace(verification, files=tuple((prefix + name, digest) for name, digest in verification.files))
-    result = {**beside, **verification_files(verification)}
-    paths = exported.write(folder, accepted=verification.accepted, beside=result)
-    return ControllerResult(exported, verification, tuple(paths))
+def _write_results(
+    output: OutputFolder, checked: Mapping[str, tuple[Export, Verification, Mapping[str, str]]]
+) -> tuple[list[ControllerResult], tuple[Path, ...]]:
+    """Write what is in ``output`` and the tables of all controls, by sub-folder, together: all files or none.
+
+    Returns
+    -------
+    tuple
+        the result of each control, and where the report of the tables that were there before is kept.
+    """
+    results = []
+    for sub_folder, (exported, verification, beside) in checked.items():
+        prefix = "" if verification.accepted else REJECTED_PREFIX
+        verification = replace(
+            verification, files=tuple((prefix + name, digest) for name, digest in verification.files)
+        )
+        files = {**beside, **verification_files(verification)}
+        names = exported.add_to(output, sub_folder, accepted=verification.accepted, beside=files)
+        paths = tuple(output.folder / name for name in names)
+        results.append(ControllerResult(exported, verification, paths))
+    earlier_report = set_aside_superseded(output, list(checked))
+    output.commit()
+    return results, tuple(earlier_report)
 
 
 @contextmanager
 def failure_reported(folder: str | Path) -> Iterator[None]:
     """Write ``identify.json`` where the data do not determine the errors, or no optimum is found, and pass the error on.
 
-    No error curve is written then; ``identified`` is false and the reason stands there.
+    No error curve is written then; ``identified`` is false and the file gives the reason. A folder with the results of
+    an earlier run is left as it is: a mixture of both would be taken for one result.
     """
     try:
         yield
     except (UndeterminedError, ConvergenceError) as error:
+        if any((Path(folder) / name).exists() for name in ("identify.json", "identified.errors.csv", "manifest.json")):
+            text = f"{folder}: nothing was written; the folder still has the results of an earlier run"
+            warnings.warn(text, CompgenWarning, stacklevel=3)
+            raise
         combinations = list(getattr(error, "combinations", []))
         report = {"identified": False, "error": str(error), "unobservable": combinations}
         write_all(folder, {"identify.json": json.dumps(report, indent=2) + "\n"})
@@ -298,11 +339,11 @@ def run(
         ``limits`` for the steps of the tables, and ``instrument``, the instrument file of six-DOF readings. Where these
         contradict the machine's chain, nothing is accepted.
     """
-    targets = {name: Path(folder) / name if len(set(controllers)) > 1 else Path(folder) for name in controllers}
-    if not targets:
+    sub_folders = {name: name if len(set(controllers)) > 1 else "" for name in controllers}
+    if not sub_folders:
         raise InputError("no controller was given; name at least one")
-    for name, target in targets.items():  # wrong settings are found before the work begins
-        OutputFolder(target)
+    for name, sub_folder in sub_folders.items():  # wrong settings are found before the work begins
+        OutputFolder(Path(folder) / sub_folder)
         controller_named(name).read_settings(machine)
         usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
@@ -316,7 +357,7 @@ def run(
     fitted = fit(machine, identification.errors, fit_options or FitOptions(), covariance=known)
     reversal = identified_reversal(identification)
     checked: dict[str, tuple[Export, Verification, Mapping[str, str]]] = {}
-    for name in targets:
+    for name, sub_folder in sub_folders.items():
         progress(f"exporting, reading back and verifying: {name}")
         exported = export(
             machine,
@@ -331,8 +372,9 @@ def run(
         reasons = tuple(dict.fromkeys([*verification.reasons, *identification.objections]))
         verification = replace(verification, reasons=reasons)
         beside = check_files(machine, exported, identification.errors, templates, reversal)
-        checked[name] = exported, verification, beside
+        checked[sub_folder] = exported, verification, beside
     evidence = evidence_files(machine, measurement, identification)
-    write_all(folder, {**identification_files(identification, provenance), **fit_files(fitted), **evidence})
-    results = [_write_result(*checked[name], target) for name, target in targets.items()]
-    return RunResult(identification, fitted, tuple(results))
+    output = OutputFolder(folder)
+    add_identification(output, {**identification_files(identification, provenance), **fit_files(fitted), **evidence})
+    results, earlier_report = _write_results(output, checked)
+    return RunResult(identification, fitted, tuple(results), earlier_report)

@@ -1,5 +1,6 @@
 """The command line: help, exit codes, what goes to stdout and to stderr, and that bad input writes nothing."""
 
+import ast
 import io
 import json
 import os
@@ -395,7 +396,11 @@ def bad_machine(folder, small_machine_file, old, new):
     ("old", "new", "message"),
     [
         ("[-50.0, 100.0, -40.0]", "[-50.0, 100.0, 40.0]", "Z = 40 mm lies outside the travel -240 ... 0 mm"),
-        ("range_mm = [-300.0, 200.0]", "range_m = [-300.0, 200.0]", "did you mean 'range_m'"),
+        (
+            "range_mm = [-300.0, 200.0]",
+            "range_m = [-300.0, 200.0]",
+            "'range_m' is not a key here, did you mean 'range_mm'?",
+        ),
         ("nodes = 6", "nodes = 6\nstep = 4", "is not a known key"),
         ('chain = "WFYXZT"', 'chain = "WYXZT"', "chain 'WYXZT' is not valid"),
         ("[-300.0, 200.0]", "[200.0, -300.0]", "range_mm"),
@@ -427,13 +432,15 @@ def test_siemens_cec_without_the_mode_of_its_products_asks_for_it(
     assert listing(tmp_path) == before
 
 
-def test_two_machines_with_one_name_are_refused(call, small_machine_file, tmp_path):
+def test_two_machines_with_one_name_are_refused_where_that_name_is_used(call, small_machine_file, tmp_path):
     for name in ("a", "b"):
         (tmp_path / "two" / name).mkdir(parents=True)
         shutil.copy(small_machine_file, tmp_path / "two" / name / "machine.toml")
-    for words in (("machines",), ("run", "small-gantry", "x.csv", "--controller", "isg-csv", "--out", "o")):
-        code, stdout, stderr = call(*words, "--machines", tmp_path / "two")
-        check_refused(code, stdout, stderr, "two machines are named 'small-gantry'")
+    words = ("run", "small-gantry", "x.csv", "--controller", "isg-csv", "--out", "o")
+    check_refused(*call(*words, "--machines", tmp_path / "two"), "two machines are named 'small-gantry'")
+    code, stdout, stderr = call("machines", "--machines", tmp_path / "two")
+    assert (code, "zha-gantry" in stdout) == (0, True)
+    assert "left out: two machines are named 'small-gantry'" in stderr
 
 
 @pytest.mark.parametrize(
@@ -659,6 +666,57 @@ def test_a_reader_that_stops_early_gets_no_verdict_and_no_traceback(words):
     with os.fdopen(write_end, "wb") as pipe:
         done = subprocess.run([script, *words], stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.parametrize(
+    "said, meant",
+    [
+        ("sinumerik", ["siemens-cec", "siemens-cec-eec", "siemens-eec"]),
+        ("fanuc", ["fanuc-3d", "fanuc-pitch", "fanuc-straightness"]),
+        ("Beckhoff", ["etalon-exchange", "isg-csv", "twincat-lists"]),
+        ("iTNC", ["heidenhain-kinematics"]),
+        ("isg_csv", ["isg-csv"]),
+    ],
+)
+def test_the_name_of_a_maker_leads_to_all_of_its_formats(call, said, meant):
+    code, _, stderr = call("controllers", said)
+    assert code == 2
+    assert f"did you mean {' or '.join(map(repr, meant))}?" in stderr
+
+
+def test_ctrl_c_while_the_program_is_still_being_loaded_prints_no_traceback(tmp_path):
+    """The interrupt comes in the middle of the imports, where no command runs yet."""
+    hook = "import sys\nclass Interrupt:\n    def find_spec(self, name, *_):\n"
+    hook += (
+        "        if name == 'compgen.cli':\n            raise KeyboardInterrupt\nsys.meta_path.insert(0, Interrupt())\n"
+    )
+    (tmp_path / "sitecustomize.py").write_text(hook)
+    for words in ([sys.executable, "-m", "compgen"], [Path(sys.executable).with_name("compgen")]):
+        done = subprocess.run(
+            [*words, "machines"],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        )
+        assert (done.returncode, done.stdout, done.stderr) == (130, "", "stopped\n")
+
+
+def test_public_names_are_loaded_on_first_use_and_are_not_hidden_by_sub_packages():
+    code = "import sys, compgen; assert not {m for m in sys.modules if m.startswith(('compgen.', 'numpy', 'scipy'))}; "
+    code += "import compgen.fit, compgen.identify; assert callable(compgen.fit) and callable(compgen.identify); "
+    code += "assert {'fit', 'Machine'} <= set(dir(compgen))"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_the_stub_for_type_checkers_names_what_the_package_offers():
+    package = Path(compgen.__file__)
+    stub = ast.parse(package.with_suffix(".pyi").read_text())
+    homes = {a.name: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    listed = next(ast.literal_eval(node.value) for node in stub.body if isinstance(node, ast.Assign))
+    assert homes == {name: home for home, names in compgen._HOMES.items() for name in names.split()}
+    assert sorted(homes) == sorted(listed) == compgen.__all__
+    assert all(getattr(compgen, name) is not None for name in compgen.__all__)
 
 
 # --- the width of a terminal -----------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 
 import compgen
 from compgen.controllers import SourceFile, controller_named
-from compgen.controllers.fanuc.pitch_build import lowest_free
+from compgen.controllers.integers import lowest_free
 from compgen.core.error_table import Curve
 from compgen.core.points import Points
 from compgen.core.reversal import ReversalCurves

@@ -37,6 +37,8 @@ def machine_of(tmp_path, options="", chain="WXYFZT", ranges=RANGES, reference=RE
         for letter, (low, high), nodes in zip("XYZ", ranges, (9, 6, 14), strict=True)
     )
     path = tmp_path / "machine.toml"
+    if "mode" not in options and "style_from" not in options:
+        options += '\nmode = "incremental"'
     path.write_text(
         f'name = "asymmetric"\nchain = "{chain}"\nreference_point_mm = {list(reference)}\n'
         f"tool_offset_mm = [10.0, -20.0, -150.0]\n{axes}\n[controllers.mitsubishi]\n{options}\n"
@@ -233,7 +235,7 @@ def test_order_crlf_blank_lines_and_missing_signs_do_no_harm(tmp_path):
         ("#4102,20,X at -100", "#4102,2", 18, "is the file cut"),
         ("#4003,4103", "#4003,4106", 5, "none of 4101 to 4105"),
         ("#4003,4103", "#4003,", 3, "#4003 of set 1 missing"),
-        ("#4003,4103", "#4003,40", 5, "4101 to 5124"),
+        ("#4003,4103", "#4003,40", 5, "4101 to 5999"),
         ("#4007,100.0", "#4007,1e2", 9, "interval in mm"),
         ("#4007,100.0", "#4007,0.0", 9, "interval in mm"),
         ("#4007,100.0", "#4007,-5.0", 9, "interval in mm"),
@@ -282,6 +284,203 @@ def test_garbage_is_refused_within_a_second(tmp_path, garbage):
 def test_settings_that_make_no_sense_are_refused(tmp_path, options):
     with pytest.raises(InputError):
         CONTROL.read_settings(machine_of(tmp_path, options))
+
+
+# --- the control's own file ------------------------------------------------------------------------------------------
+
+
+def backup(system=0, sets=(), values=None, last=5999, unit="B"):
+    """A parameter file in the form of an M80's: every number is there, a set without axes has empty names."""
+    rows = [
+        "%",
+        ";20240101 10:00",
+        ";MITSUBISHI CNC",
+        "PARA101()",
+        "N1P28",
+        f"N1006T1P{unit}",
+        f"N1006T2P{unit}",
+        "N1013A1PX",
+    ]
+    rows.append(f"N4000P{system}")
+    for k in range(10):
+        own = dict(sets).get(k, ("", "", 0, 0, 0, 0, "0.000"))
+        rows += [f"N{4001 + 10 * k + j}P{value}" for j, value in enumerate(own)]
+        rows += [f"N{4008 + 10 * k}P0", f"N{4009 + 10 * k}P0"]
+    rows += [f"N{number}P{(values or {}).get(number, 0)}" for number in range(4101, last + 1)]
+    return "\r\n".join([*rows, "N8001P", "N88140P0", "%", ""])
+
+
+#: X over itself in 9 points, and rotary axes A and C; that of C has its reference number below the first one.
+SETS = {
+    0: ("X", "X", 4103, 4101, 4109, 2, "100.000"),
+    3: ("A", "A", 4413, 4401, 4416, 2, "10.000"),
+    4: ("", "", 4401, 4414, 4416, 2, "10.000"),
+    5: ("C", "C", 4501, 4502, 4524, 2, "15.000"),
+}
+VALUES = {4101: -4, 4102: -3, 4104: 5, 4105: 9, 4413: 0, 4414: 7, 4502: 8, 4503: 7}
+ONLY_OWN = "relative_errors = false"
+
+
+@pytest.fixture
+def backup_file(tmp_path):
+    (tmp_path / "ALL.PRM").write_bytes(backup(sets=SETS, values=VALUES).encode())
+    return tmp_path / "ALL.PRM"
+
+
+def following(tmp_path, options=ONLY_OWN):
+    return machine_of(tmp_path, f'style_from = "ALL.PRM"\n{options}')
+
+
+def test_absolute_values_of_a_backup_are_sums_and_other_axes_are_kept_apart(tmp_path, backup_file):
+    """One count is 2 x 0.5 um; at 100 mm above the reference point 5 um, at 200 mm 9 um (not 14), below -3 and -4 um."""
+    machine = following(tmp_path)
+    read = compgen.read_tables(machine, [backup_file], "mitsubishi")
+    x = [-300.0, -200.0, -100.0, -50.0, 0.0, 50.0, 100.0]
+    found = added(machine, read.tables, [[value, 10.0, -500.0] for value in x])
+    np.testing.assert_allclose(found[:, 0], np.array([-4, -3, 0, 2.5, 5, 7, 9]) * UM, atol=ROUNDING_MM)
+    assert read.remarks[0].startswith("#4000 = 0: absolute values")
+    assert read.remarks[1] == "set 4 of A, numbers 4401 to 4416: not of the machine file, kept apart"
+    assert read.remarks[2] == "set 6 of C, numbers 4501 to 4524: not of the machine file, kept apart"
+    assert read.remarks[3] == "passed over: 5 lines that cannot change a table"
+
+
+def test_the_mode_sets_and_numbers_of_the_backup_are_kept(tmp_path, backup_file, make_errors):
+    """The rest of the file is as it was, byte for byte; no number of A and C changes, #4000 stays 0."""
+    machine = following(tmp_path)
+    errors = make_errors(machine, squareness_rad=(0.0, 0.0, 0.0))
+    made = export(machine, errors, "mitsubishi")
+    assert made.violations == []
+    before, after = backup_file.read_bytes().decode(), made.files["ALL-NEW.PRM"]
+    changed = [(a, b) for a, b in zip(before.split("\n"), after.split("\n"), strict=True) if a != b]
+    numbers = [int(b[1:5]) for _, b in changed]
+    assert all(number in range(4011, 4018) or number in range(4021, 4028) or number >= 4101 for number in numbers)
+    assert not [number for number in numbers if 4401 <= number <= 4416 or 4501 <= number <= 4524]
+    assert "\n#4000,0," in made.files["SETSHEET.CSV"]
+    tables = read_back(machine, made)
+    x = tables.sets[0]
+    assert (x.index, x.reference, x.first, x.last, x.scale, x.absolute) == (0, 4103, 4101, 4109, 2, True)
+    assert [table.index for table in tables.sets] == [0, 1, 2]
+    positions = np.random.default_rng(3).uniform(machine.lower_mm, machine.upper_mm, (50, 3))
+    sheet = CONTROL.parse(
+        machine, CONTROL.read_settings(machine), [SourceFile(Path("S.CSV"), made.files["SETSHEET.CSV"])]
+    )
+    np.testing.assert_array_equal(added(machine, tables, positions), added(machine, sheet, positions))
+    told = made.preflight.split("## What the files overwrite")[1]
+    assert told.index("Of other axes: nothing. set 4 (A over A") < told.index("Set 1 (#4001")
+
+
+@pytest.mark.parametrize(("system", "chain"), [(0, "WXYFZT"), (1, "WFYXZT")])
+def test_both_systems_correct_what_was_measured(tmp_path, make_errors, system, chain):
+    (tmp_path / "ALL.PRM").write_bytes(backup(system, {1: ("B", "B", 4200, 4200, 4236, 1, "10.000")}).encode())
+    machine = machine_of(tmp_path, 'style_from = "ALL.PRM"\nscale = 4', chain)
+    errors = make_errors(machine)
+    made = export(machine, errors, "mitsubishi")
+    assert made.violations == []
+    result = compgen.verify(machine, compgen.read_tables(machine, made.write(tmp_path / "out"), "mitsubishi"), errors)
+    assert result.accepted, result.reasons
+
+
+def test_the_values_of_both_systems_by_hand(tmp_path):
+    """10 um short over every 100 mm: steps of +20 on either side, or sums ... -40, -20, 0, 20, 40 ..."""
+    nodes = np.array([-300.0, -100.0, 500.0])
+    errors = ErrorTable({"EXX": Curve(nodes, -1e-4 * (nodes + 100.0), np.full(3, np.nan))})
+    options = "interval_mm = { X = 100.0 }\n" + ONLY_OWN
+    stored = {}
+    for mode in ("incremental", "absolute"):
+        machine = machine_of(tmp_path, f'{options}\nmode = "{mode}"')
+        stored[mode] = read_back(machine, export(machine, errors, "mitsubishi")).sets[0].values
+    assert stored["incremental"] == (20, 20, 0, 20, 20, 20, 20, 20, 20)
+    assert stored["absolute"] == (-40, -20, 0, 20, 40, 60, 80, 100, 120)
+
+
+def test_an_export_asks_for_the_mode_and_writes_nothing(tmp_path, make_errors):
+    machine = machine_of(tmp_path)
+    machine.controllers["mitsubishi"].data.pop("mode")
+    with pytest.raises(InputError, match="#4000 holds for the tables of ALL axes"):
+        export(machine, make_errors(machine), "mitsubishi")
+    assert parse(machine, SAMPLE).sets[0].absolute is False
+    assert parse(machine, SAMPLE.replace("#4000,1", "#4000,0")).sets[0].absolute is True
+
+
+def test_a_sum_out_of_range_names_the_scale_that_holds_it(tmp_path):
+    nodes = np.array([-300.0, -100.0, 500.0])
+    errors = ErrorTable({"EXX": Curve(nodes, -1e-4 * (nodes + 100.0) * 3, np.full(3, np.nan))})
+    machine = machine_of(tmp_path, f'mode = "absolute"\n{ONLY_OWN}')
+    assert any(
+        "the value 360 lies outside -128 ... 127; set scale = 3" in v
+        for v in export(machine, errors, "mitsubishi").violations
+    )
+    wider = machine_of(tmp_path, f'mode = "absolute"\n{ONLY_OWN}\nscale = 3')
+    assert export(wider, errors, "mitsubishi").violations == []
+
+
+def test_tables_of_another_pair_go_into_free_sets_and_numbers(tmp_path, backup_file, make_errors):
+    machine = following(tmp_path, 'relative_errors = ["Y(x)"]\nscale = 9')
+    tables = read_back(machine, export(machine, make_errors(machine), "mitsubishi"))
+    assert [(table.index, table.output, table.base) for table in tables.sets] == [
+        (0, 0, 0),
+        (1, 1, 1),
+        (2, 2, 2),
+        (4, 1, 0),
+    ]
+    taken = {*range(4401, 4417), *range(4501, 4525)}
+    assert not any(taken & set(range(table.first, table.last + 1)) for table in tables.sets)
+
+
+def test_a_set_of_ours_that_is_no_longer_used_is_switched_off(tmp_path, make_errors):
+    sets = {**SETS, 7: ("X", "Z", 4602, 4601, 4609, 2, "100.000")}
+    (tmp_path / "ALL.PRM").write_bytes(backup(sets=sets).encode())
+    machine = following(tmp_path)
+    made = export(machine, make_errors(machine, squareness_rad=(0.0, 0.0, 0.0)), "mitsubishi")
+    assert "\n#4071,," in made.files["SETSHEET.CSV"] and "\nN4071P\r\n" in made.files["ALL-NEW.PRM"]
+    assert "Switched off, because this export has no such table: set 8 (Z over X)" in made.preflight
+    assert len(read_back(machine, made).sets) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "words"),
+    [
+        (lambda t: t, 'mode = "incremental"\n' + ONLY_OWN, "#4000 = 0"),
+        (lambda t: t, "", "9|8 new sets are needed and 7 of the 10 sets"),
+        (lambda t: t[: t.rindex("%")], ONLY_OWN, "is the file cut"),
+        (lambda t: t.replace("N4000P0\r\n", ""), ONLY_OWN, "#4000 .* is missing"),
+        (lambda t: t.replace("N4102P-3", "N4102P-3\r\nN4102P1"), ONLY_OWN, "second time"),
+        (lambda t: t.replace("N4102P-3", "N4102A1P-3"), ONLY_OWN, "the word A1"),
+        (lambda t: t.replace("N4102P-3", "N4102 = -3"), ONLY_OWN, "is not understood"),
+        (lambda t: t.replace("N4012P\r", "N4012PY\r"), ONLY_OWN, "set 2 is not complete"),
+        (lambda t: t.replace("N4003P4103", "N4003P4110"), ONLY_OWN, "cannot be kept"),
+        (
+            lambda t: t.replace("N4035P4416", "N4035P4416").replace("N4034P4401", "N4034P4105"),
+            ONLY_OWN,
+            "4105 to 4416; 4101 to 4109",
+        ),
+        (lambda t: t.replace("MITSUBISHI", "M\u00dcLLER"), ONLY_OWN, "not ASCII"),
+        (lambda t: t.replace("%", ""), ONLY_OWN, "not a parameter file"),
+    ],
+)
+def test_a_file_of_the_control_that_does_not_fit_is_refused(tmp_path, backup_file, make_errors, change, options, words):
+    backup_file.write_bytes(change(backup(sets=SETS, values=VALUES)).encode("latin-1"))
+    with pytest.raises(InputError, match=words):
+        machine = following(tmp_path, options)
+        export(machine, make_errors(machine), "mitsubishi")
+
+
+def test_unit_and_last_number_follow_the_file(tmp_path):
+    (tmp_path / "ALL.PRM").write_bytes(backup(sets=SETS, unit="C").encode())
+    chosen = CONTROL.read_settings(following(tmp_path))
+    assert (chosen.setting_unit_um, chosen.last_number, chosen.absolute) == (0.1, 5999, True)
+    assert CONTROL.read_settings(machine_of(tmp_path, "last_number = 5999")).last_number == 5999
+
+
+def test_file_and_sheet_that_differ_are_refused(tmp_path, backup_file, make_errors):
+    machine = following(tmp_path)
+    made = export(machine, make_errors(machine, squareness_rad=(0.0, 0.0, 0.0)), "mitsubishi")
+    text = made.files["ALL-NEW.PRM"]
+    row = next(row for row in text.split("\r\n") if row.startswith("N4105P"))
+    damaged = {**made.files, "ALL-NEW.PRM": text.replace(row, "N4105P77")}
+    sources = [SourceFile(Path(name), text) for name, text in damaged.items()]
+    with pytest.raises(InputError, match="does not hold the same tables as SETSHEET.CSV"):
+        CONTROL.parse(machine, CONTROL.read_settings(machine), sources)
 
 
 PIECES = ["#", "4101", ",", "\n", "-", "128", "0", "X", ".", "e", " ", "9" * 12, "\u0663"]

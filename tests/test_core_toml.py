@@ -87,7 +87,9 @@ def test_a_missing_key_names_the_nearest_one_that_is_there_and_the_line_of_its_t
     path = saved(TEXT)
     section = tomlio.read_toml(path).section("axes").section("Y")
     message = message_of(section.take, "range_mm", tomlio.interval)
-    assert message.startswith(f"{path}:12: [axes.Y] range_mm: is missing; did you mean 'range_um'?")
+    assert message.startswith(
+        f"{path}:12: [axes.Y] range_mm: is missing; 'range_um' is not a key here, did you mean 'range_mm'?"
+    )
 
 
 def test_an_unknown_key_names_the_nearest_known_one(saved):
@@ -129,7 +131,9 @@ def test_what_is_optional_may_be_absent(saved):
 
 def test_a_section_that_came_from_no_file_still_names_the_key():
     section = tomlio.Section({"sing": "x"}, path=None, name="controllers.c")
-    assert message_of(section.take, "sign", tomlio.text).startswith("[controllers.c] sign: is missing; did you mean")
+    assert message_of(section.take, "sign", tomlio.text).startswith(
+        "[controllers.c] sign: is missing; 'sing' is not a key here, did you mean"
+    )
 
 
 HUGE = 10**400

@@ -141,7 +141,7 @@ def test_without_its_covariates_an_effect_has_no_columns(machine):
     }
     assert present == {
         *(f"periodic_{a}" for a in "XYZ"), *(f"cosine_error_{a}" for a in "XYZ"), "beam_sag", "ram_droop", "laser_scale",
-        "target_angle", "sign_EBY", *(f"tracer_runout_{name}" for name in STATIONS), "warmup_drift",
+        "target_angle", "sign_EBY", *(f"tracer_runout_{name}" for name in STATIONS), "warmup_drift", "linear_drift",
     }  # fmt: skip
 
 

@@ -473,7 +473,7 @@ def test_slips_are_remarked_on_and_deviations_of_more_than_100_mm_are_refused(tm
 
     assert not any("far from" in text for text in import_file(written(tmp_path, table(4.1))).notes)
     slip = import_file(written(tmp_path, table(4100)))
-    assert any("4.1 (mm or rad) at 400 mm, line 6, is far from all others" in text for text in slip.notes)
+    assert any("4100 um at 400 mm, line 6, is far from all others" in text for text in slip.notes)
     large = import_file(written(tmp_path, table(4.1e6)))
     assert any("numbers look like" in text for text in large.doubts)
     readings = "target [mm],measured [mm],axis\n" + "".join(

@@ -634,6 +634,37 @@ def test_joints_that_do_not_fit_the_ini_file_keep_the_machine_in_e_stop(
     assert re.search(f"NO COMPENSATION.*{said}", done.output)
 
 
+@pytest.mark.parametrize("unit", ["mm", "inch"])
+def test_volkins_never_steps_the_joints_at_homing_or_tool_changes(unit, workshop, small_machine, small_errors):
+    """Homed at X 905 mm, beyond the table: joints rest through homing, and follow a new tool as slowly as it is taken up."""
+    scale = 1.0 if unit == "mm" else 25.4
+    machine = small_machine.with_setting("linuxcnc-volumetric", "machine_units", unit)
+    files = compgen.export(machine, small_errors, "linuxcnc-volumetric").files
+    steps = [
+        {"home": -1},
+        {"mdi": "G21 G43.1 Z150"},
+        {"rest": "volkins.settling"},
+        {"mdi": "G49"},
+        {"rest": "volkins.settling"},
+    ]
+    names = [*VOLKINS_PINS, *USED_PINS]
+    done = session(
+        workshop, steps, names, kinematics="volkins file=volcomp.tab", files=files, units=unit,
+        home=(905.0 / scale, 250.0 / scale, -230.0 / scale),
+    )  # fmt: skip
+    assert done.messages == []
+    joints, used = columns(done.rows, VOLKINS_PINS[3:6]) * scale, columns(done.rows, USED_PINS) * scale
+    assert joints[-1] == pytest.approx([905.0, 250.0, -230.0], abs=0.1)
+    table = table_of(machine, files)
+    with_tool = used[:, 2] != 0
+    assert np.min(used[:, 2]) == pytest.approx(-150.0)
+    assert np.count_nonzero(with_tool & (used[:, 2] > -149.999)) > 500  # 150 mm at 200 mm/s, twice
+    turned = np.ptp(joints[with_tool], axis=0)
+    assert np.max(turned) > 0.002
+    tip = table.forward(joints[with_tool], used[with_tool])
+    assert np.max(np.ptp(tip, axis=0)) < AGREEMENT_MM  # the tip stays while the joints follow
+
+
 def test_a_tool_pin_that_is_not_a_number_stops_volkins_with_an_error(workshop, small_machine, small_errors):
     files = dict(compgen.export(small_machine, small_errors, "linuxcnc-volumetric").files)
     files["volkins.hal"] = files["volkins.hal"].replace("net volkins-tool-z", "# net volkins-tool-z")

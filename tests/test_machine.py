@@ -8,7 +8,7 @@ import pytest
 
 from compgen.core import machine as machine_module
 from compgen.core.machine import CHAINS, Chain, load_machine, machine_files, read_machine
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError
 from compgen.resources import data_folder
 
 GOOD = """\
@@ -94,7 +94,7 @@ REPLACEMENTS = [
     (
         "range_mm = [-800.0, 0.0]",
         "range_um = [-800.0, 0.0]",
-        r":8: \[axes.X\] range_mm: is missing; did you mean 'range_um'",
+        r":8: \[axes.X\] range_mm: is missing; 'range_um' is not a key here, did you mean 'range_mm'",
     ),
     (
         "screw_pitch_mm",
@@ -119,7 +119,7 @@ REPLACEMENTS = [
     ("[-500, -100, 0, 500]", "[-400, -100, 0, 500]", r":15: \[axes.Y\] nodes_mm: goes from -400 to 500 mm"),
     ("nodes_mm = [", "nodes = 5\nnodes_mm = [", r":15: \[axes.Y\] nodes: stands beside nodes_mm"),
     ("[axes.Y]", "[axes.X]", r":13: is not valid TOML: Cannot declare"),
-    ("[axes.Y]", "[axes.y]", r"\[axes\] Y: is missing; did you mean 'y'"),
+    ("[axes.Y]", "[axes.y]", r"\[axes\] Y: is missing; 'y' is not a key here, did you mean 'Y'"),
     ("[axes.Y]", "[axes.A]", r"\[axes\] Y: is missing"),
     ("[axes.Z]", "[axes.Z]\nrange_mm = 1\n[axes.A]", r":17: \[axes.Z\] range_mm: two numbers"),
     ('"WYFXZT"', '"WYXZT"', r":2: chain: chain 'WYXZT' is not valid: W first, T last, and X, Y, Z, F once each"),
@@ -246,7 +246,7 @@ def test_an_unknown_name_is_refused_with_the_nearest(shipped, saved):
 def test_two_machines_of_one_name_in_one_folder_are_refused(shipped, saved, change):
     first, second = saved(GOOD, "shipped/a.toml"), saved(GOOD + change, "shipped/b.toml")
     with pytest.raises(InputError, match="two machines are named 'mill'") as caught:
-        machine_files()
+        load_machine("mill")
     assert str(first) in str(caught.value) and str(second) in str(caught.value)
 
 
@@ -278,4 +278,19 @@ def test_a_copy_beside_its_original_is_a_second_machine_of_that_name(tmp_path):
     for name in ("a.toml", "b.toml"):
         (tmp_path / name).write_bytes(shipped.read_bytes())
     with pytest.raises(InputError, match="two machines are named 'zha-gantry'"):
-        machine_files((tmp_path,))
+        load_machine("zha-gantry", (tmp_path,))
+    with pytest.warns(CompgenWarning, match="left out: two machines are named 'zha-gantry'"):
+        assert "moving-table-mill" in machine_files((tmp_path,))
+
+
+def test_a_doubled_name_and_a_broken_file_do_not_block_the_other_machines(shipped, saved):
+    """A copied machine, a copied scenario, a job, a broken file: the machine that is asked for is used."""
+    saved(GOOD, "shipped/a.toml"), saved(GOOD, "shipped/b.toml")
+    wanted = saved(GOOD.replace('"mill"', '"lathe"'), "shipped/c.toml")
+    saved('name = "lathe"\nseed = 3\n[errors]\n', "shipped/lathe.scenario.toml")
+    assert load_machine("lathe").source == wanted
+    with pytest.warns(CompgenWarning, match="two machines are named 'mill'"):
+        assert machine_files() == {"lathe": wanted}
+    saved("name = = 3", "shipped/d.toml")
+    with pytest.warns(CompgenWarning, match=r"d\.toml:1"):
+        assert load_machine("lathe").source == wanted

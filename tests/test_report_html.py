@@ -14,8 +14,10 @@ import compgen
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.core.csvio import read_csv
+from compgen.core.error_table import format_errors
 from compgen.core.files import sha256_of
 from compgen.errors import CompgenWarning, InputError
+from compgen.pipeline import write_all
 from compgen.report.html import FILES, build_report, write_report
 from compgen.report.html.curves import describe_error
 from compgen.report.html.folder import read_folder
@@ -25,6 +27,7 @@ from compgen.report.html.svg import ROLES, colour, drawing, new_figure, to_svg
 from compgen.report.html.tables import table_curves
 from compgen.report.html.volume import grid_of, nice, projected
 from compgen.verify import read_tables, residuals
+from compgen.verify.evidence import verification_files
 
 ROUNDED_UM = 1e-3  # volume.csv has 4 decimals in um for each component
 TABLE_UM = 0.01  # values of a table that were found from its field, um and urad
@@ -466,3 +469,19 @@ def test_a_run_on_hostile_labels_comments_and_headers_gives_an_inert_page(
     }
     assert not [name for name, _ in found.attributes if name.startswith("on")]
     assert not re.search(r"(?<!\\)<", (out / "dossier.md").read_text())
+
+
+def test_the_report_of_a_verification_is_called_after_the_machine_not_after_the_folder(
+    small_machine, small_errors, tmp_path
+):
+    written = compgen.export(small_machine, small_errors, "isg-csv").write(tmp_path / "tables")
+    result = compgen.verify(small_machine, compgen.read_tables(small_machine, written, "isg-csv"), small_errors)
+    write_all(tmp_path / "check", verification_files(result))
+    assert build_report(tmp_path / "check").data["title"] == "small-gantry"
+
+
+def test_a_date_that_nobody_filled_in_is_not_a_date(small_machine, small_errors, tmp_path):
+    text = format_errors(small_errors, {"date": ""})
+    assert "# date = \n" in text
+    write_all(tmp_path, {"identified.errors.csv": text, "identify.json": "{}"})
+    assert build_report(tmp_path).data["provenance"]["date"] is None

@@ -1,8 +1,10 @@
-"""What users install: the wheel holds the package and every file of the data folders."""
+"""What users install: the wheel holds the package, every file of the data folders and both licences; pins have hashes."""
 
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -16,13 +18,12 @@ COPIED = ("compgen", *DATA_FOLDERS, "pyproject.toml", "README.md", "LICENSE", ".
 
 
 def build_wheel(folder):
-    """Build the project in ``folder`` and return the names of the files in its wheel."""
+    """Build the project in ``folder`` and return the path of its wheel."""
     command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder / "out"), str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     (wheel,) = (folder / "out").glob("compgen-*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        return set(archive.namelist())
+    return wheel
 
 
 def missing_data(folder, names):
@@ -46,8 +47,14 @@ def project(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def wheel_names(project):
+def wheel(project):
     return build_wheel(project)
+
+
+@pytest.fixture(scope="module")
+def wheel_names(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
 
 
 def test_every_file_of_the_data_folders_is_in_the_wheel(project, wheel_names):
@@ -76,3 +83,59 @@ def test_a_data_folder_that_is_nowhere_is_named_with_both_places():
     assert data_folder("machines") == ROOT / "machines"
     with pytest.raises(FileNotFoundError, match=r"no folder 'recipes' in .*_data.recipes or .*: the installation is"):
         data_folder("recipes")
+
+
+def test_the_wheel_names_both_licences_and_holds_their_texts(wheel, wheel_names):
+    (folder,) = {name.split("/")[0] for name in wheel_names if ".dist-info/" in name}
+    with zipfile.ZipFile(wheel) as archive:
+        metadata = archive.read(f"{folder}/METADATA").decode()
+        texts = {name: archive.read(name).decode() for name in wheel_names if "/licenses/" in name}
+    assert "\nLicense-Expression: BSD-3-Clause AND GPL-2.0-or-later\n" in metadata
+    copying = "templates/linuxcnc-volumetric/COPYING"
+    assert texts == {
+        f"{folder}/licenses/LICENSE": (ROOT / "LICENSE").read_text(),
+        f"{folder}/licenses/{copying}": (ROOT / copying).read_text(),
+    }
+    assert f"compgen/_data/{copying}" in wheel_names  # beside the sources that it belongs to
+
+
+def pins(name):
+    """Versions and number of hashes by package of a requirements file; each entry ends where the next begins."""
+    found = {}
+    for line in (ROOT / name).read_text().splitlines():
+        if entry := re.match(r"([A-Za-z0-9._-]+)(?:\[.*\])?==([^ ;]+)", line):
+            package = re.sub("[-_.]+", "-", entry[1]).lower()
+            assert package not in found
+            found[package] = [entry[2], 0]
+        elif re.fullmatch(r" +--hash=sha256:[0-9a-f]{64}( \\)?", line):
+            found[package][1] += 1
+        else:
+            assert line.strip().startswith("#"), line
+    return found
+
+
+def test_every_dependency_is_pinned_with_the_hashes_of_its_files():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    extras = project["project"]["optional-dependencies"].values()
+    wanted = [
+        *project["project"]["dependencies"],
+        *project["build-system"]["requires"],
+        *(x for y in extras for x in y),
+    ]
+    names = {re.sub("[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", text)[0]).lower() for text in wanted} - {"compgen"}
+    run, dev = pins("requirements.txt"), pins("requirements-dev.txt")
+    assert names <= set(run)
+    assert {"pytest", "ruff", "mypy"} <= set(dev) - set(run)
+    assert all(dev[name] == pin for name, pin in run.items())
+    assert all(count >= 1 for _, count in dev.values())
+    assert run["numpy"][1] > 20  # the wheels of all platforms, not of one
+
+
+def test_make_installs_nothing_without_hashes():
+    """The only other thing that pip gets is compgen itself, without its dependencies and with the pinned backend."""
+    makefile = (ROOT / "Makefile").read_text()
+    assert "pip install" not in makefile.replace(
+        "$(BIN)/python -m pip install --quiet --disable-pip-version-check", "", 1
+    )
+    for line in re.findall(r"^\t\$\(PIP\) (.*)$", makefile, re.MULTILINE):
+        assert line.startswith("--require-hashes -r ") or line == "--no-build-isolation --no-deps -e ."

@@ -46,6 +46,8 @@ CONTRACT_CONTROLLERS = (
     "linuxcnc-volumetric",
     "neutral",
 )
+#: In bash the bare word compgen is a builtin that does nothing; the program has a second name for that reason.
+PROGRAM_NAMES = ("compgen", "volcomp")
 #: Exit codes beyond the contract's, as shells use them: nothing is said about the result.
 STOPPED, READER_GONE = 130, 141
 #: Tables into a pipe or a file get the width that they need, not that of an unknown terminal.
@@ -140,7 +142,9 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
         warnings.simplefilter("always", CompgenWarning)
         warnings.showwarning = _show_warning
         try:
-            code = group.main(words, prog_name="compgen", standalone_mode=False)
+            called = Path(sys.argv[0]).name
+            name = called if called in PROGRAM_NAMES else PROGRAM_NAMES[0]
+            code = group.main(words, prog_name=name, standalone_mode=False)
             return code if isinstance(code, int) else 0
         except click.exceptions.Exit as error:
             return error.exit_code

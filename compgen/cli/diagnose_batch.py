@@ -12,7 +12,7 @@ from compgen.cli.parallel_options import mapper
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.core.steady import steady
-from compgen.diagnose import DiagnoseOptions, Diagnosis, diagnose
+from compgen.diagnose import AxisDiagnosis, DiagnoseOptions, Diagnosis, diagnose
 from compgen.diagnose.files import diagnosis_files, json_text
 from compgen.diagnose.measurement import read_diagnosed
 from compgen.diagnose.sixdof import SixDofDiagnosis, diagnose_sixdof, sixdof_text
@@ -52,7 +52,7 @@ class Found:
 
 def diagnosed(
     asked: Asked, measurements: Sequence[Path], show: Show
-) -> tuple[Diagnosis | SixDofDiagnosis, dict[str, str | bytes]]:
+) -> tuple[Diagnosis | AxisDiagnosis | SixDofDiagnosis, dict[str, str | bytes]]:
     """Diagnose files as one measurement; return the diagnosis and its files by name."""
     if asked.instrument is None:
         found = diagnose(asked.machine, read_diagnosed(measurements), asked.options, show=show)

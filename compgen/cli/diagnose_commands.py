@@ -14,6 +14,8 @@ from compgen.controllers.isg.error_files import read_error_file
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.diagnose import DiagnoseOptions
+from compgen.diagnose.axis_session import ORDERS, Order
+from compgen.diagnose.files import next_steps, summary
 from compgen.errors import InputError
 
 
@@ -34,6 +36,14 @@ from compgen.errors import InputError
     metavar="ERRORS",
     help="Errors (*.errors.csv) that the measurement is compared with: which have changed?",
 )
+@click.option(
+    "--order",
+    type=click.Choice(ORDERS),
+    default="auto",
+    show_default=True,
+    help="Order of axis runs in time: time_s or the column order, else run by run, up then down (auto); or as named. "
+    "The order of rows counts with 'rows' only.",
+)
 @click.option("--each", is_flag=True, help="Every measurement by itself, into a folder of --out by its name.")
 @fleet_options
 @json_option
@@ -47,6 +57,7 @@ def diagnose_command(
     instrument: Path | None,
     u_um: float | None,
     against: Path | None,
+    order: Order,
     each: bool,
     workers: int,
     cluster: str | None,
@@ -56,7 +67,8 @@ def diagnose_command(
 
     MEASUREMENTS are *.lengths.csv (mm), *.deviations.csv or *.axis.csv files (um), or *.sixdof.csv files (mm) with
     --instrument, whose readings are asked about their instrument. Writes diagnosis.json,
-    diagnosis.md, pages with pictures (index.html), and extended.toml: the machine with the effects that were found.
+    diagnosis.md, pages with pictures (index.html), and extended.toml: the machine with the effects that were found, to be
+    given to the next command in place of MACHINE. Axis runs (ISO 230-2): also removed.csv, what was taken off each reading.
 
     --each asks every file by itself; --workers and --cluster share those out.
 
@@ -69,7 +81,7 @@ def diagnose_command(
     OutputFolder(out)
     names = tuple(name.strip() for name in effects.split(",") if name.strip()) if effects else ()
     predicted = None if against is None else read_error_file(against)
-    options = DiagnoseOptions(max_effects, names, added, u_um, predicted)
+    options = DiagnoseOptions(max_effects, names, added, u_um, predicted, order)
     asked = Asked(machine, options, instrument)
     if each:
         return diagnose_each(asked, measurements, out, (workers, cluster), as_json=as_json)
@@ -85,7 +97,14 @@ def diagnose_command(
     if as_json:
         print_json(found.to_dict())
     else:
-        stdout.print(contents["diagnosis.md"])
+        data = found.to_dict()
+        stdout.print(
+            contents["diagnosis.md"] if instrument is not None else summary(machine.name, data, markdown=False),
+            soft_wrap=True,
+        )
+        steps = next_steps(contents, str(machine.source or machine.name), " ".join(map(str, measurements)), str(out))
+        if steps:
+            stdout.print(steps, soft_wrap=True)
     return 0 if found.acceptable else 1
 
 

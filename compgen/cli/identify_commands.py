@@ -28,7 +28,15 @@ from compgen.identify.evidence import evidence_files
 from compgen.identify.monte_carlo import self_check
 from compgen.identify.noise import METHODS
 from compgen.imports import open_errors, open_measurement
-from compgen.pipeline import failure_reported, fit_files, identification_files, identify_bare, provenance_of, write_all
+from compgen.pipeline import (
+    add_identification,
+    failure_reported,
+    fit_files,
+    identification_files,
+    identify_bare,
+    provenance_of,
+    write_all,
+)
 from compgen.report.text import fit_table, identification_table
 from compgen.verify.active import ActiveTables
 
@@ -197,7 +205,9 @@ def identify_command(
                     mapper=spread,
                 )
     files = identification_files(result, provenance_of(machine.source, *measurements, instrument), checked)
-    write_all(out, {**files, **evidence_files(machine, measurement, result)})
+    output = OutputFolder(out)
+    add_identification(output, {**files, **evidence_files(machine, measurement, result)})
+    output.commit()
     if as_json:
         print_json({**result.summary(), **({"monte_carlo": checked.summary()} if checked else {})})
     else:

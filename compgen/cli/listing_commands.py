@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from pathlib import Path
 
 import click
@@ -18,7 +19,7 @@ from compgen.core.plugins import Kind
 from compgen.core.text import nearest
 from compgen.effects import ANY_STATION, FAMILIES, catalogue, listed
 from compgen.effects.of_machine import STATION_NAME
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError
 from compgen.export import Format, load_format
 from compgen.export.card import control_card
 from compgen.model import modelled_errors
@@ -178,7 +179,11 @@ def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
     table.add_column("file", overflow="fold")
     listing = {}
     for name, path in sorted(files.items()):
-        machine = open_machine(str(path))
+        try:
+            machine = open_machine(str(path))
+        except InputError as error:  # the others are listed all the same
+            warnings.warn(f"left out of the machines: {error}", CompgenWarning, stacklevel=1)
+            continue
         travel = ", ".join(f"{axis.range_mm[0]:g} ... {axis.range_mm[1]:g}" for axis in machine.axes)
         names = modelled_errors(machine)
         table.add_row(name, machine.chain.name, travel, str(len(names)), str(path))

@@ -106,6 +106,9 @@ def run_command(
         if not no_report:
             show("drawing the report")
         report = None if no_report else report_beside(out)
+    if report is not None:  # the new one takes its place; without it the earlier one is kept as PREVIOUS-...
+        for path in result.earlier_report:
+            path.unlink(missing_ok=True)
     if explain:
         explain_run(machine, result, out, templates)
     if as_json:

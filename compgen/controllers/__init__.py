@@ -19,9 +19,11 @@ from compgen.controllers.siemens.cec import SiemensCec
 from compgen.controllers.siemens.cec_eec import SiemensCecEec
 from compgen.controllers.siemens.eec import SiemensEec
 from compgen.controllers.twincat.lists import TwincatLists
+from compgen.core.files import read_text
 from compgen.core.plugins import why_missing
 from compgen.core.text import nearest
 from compgen.errors import InputError
+from compgen.resources import data_folder
 
 #: Every control by its name on the command line.
 CONTROLLERS: dict[str, AnyController] = {
@@ -56,8 +58,21 @@ def controller_named(name: str) -> AnyController:
     if name in NOT_PUBLIC and name not in CONTROLLERS:
         raise InputError(f"no controller is named {name!r}: {NOT_PUBLIC[name]}")
     if name not in CONTROLLERS:
-        raise InputError(f"no controller is named {name!r}; {nearest(name, CONTROLLERS)}{why_missing('control', name)}")
+        raise InputError(f"no controller is named {name!r}; {_hint(name)}{why_missing('control', name)}")
     return CONTROLLERS[name]
+
+
+def _hint(name: str) -> str:
+    """What was probably meant: the controls with it in their name, in the title of their card, anywhere in the card."""
+    folders = {known: control.templates or data_folder("templates") for known, control in CONTROLLERS.items()}
+    cards = {known: folder / known / "format.toml" for known, folder in folders.items()}
+    texts = {known: read_text(path) for known, path in cards.items() if path.is_file()}
+    titles = {
+        known: next((line for line in text.splitlines() if line.startswith("title")), "")
+        for known, text in texts.items()
+    }
+    hint = nearest(name, CONTROLLERS, titles, alike=0.7)
+    return hint if "did you mean" in hint else nearest(name, CONTROLLERS, texts)
 
 
 __all__ = ["CONTROLLERS", "AnyController", "Controller", "Monomial", "SourceFile", "Term", "controller_named"]

@@ -16,6 +16,7 @@ reference node, none exists there, and J alone is minimised on that side.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -223,3 +224,16 @@ def _reachable(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[Fl
     gradient = 2.0 * np.cumsum((matrix @ (np.cumsum(steps) - wanted[1:]))[::-1])[::-1] / scale
     gap = float(np.sum(np.abs(gradient) * limit + gradient * steps))
     return np.concatenate([[0.0], np.cumsum(steps)]), max(gap, 0.0)
+
+
+def lowest_free(taken: Sequence[tuple[int, int]], start: int, count: int) -> int:
+    """Return the lowest first number, from ``start`` on, of ``count`` numbers that meet no taken block.
+
+    >>> lowest_free([(5, 9), (12, 12)], 1, 4), lowest_free([(5, 9), (12, 12)], 1, 5)
+    (1, 13)
+    """
+    first = start
+    for low, high in sorted(taken):
+        if low < first + count and high >= first:
+            first = high + 1
+    return first

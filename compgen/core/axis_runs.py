@@ -16,6 +16,8 @@ from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import InputError
 
 AXIS_COLUMNS = ("axis", "position_mm", "direction", "run", "deviation_um")
+#: Optional: time, number of the reading in the order of time, time at rest before it, speed on the way to it.
+AXIS_COVARIATES = ("time_s", "order", "dwell_s", "feed_mm_min")
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ def read_axis_runs(paths: str | Path | Sequence[str | Path]) -> AxisRuns:
     files = [paths] if isinstance(paths, str | Path) else list(paths)
     if not files:
         raise InputError("no measurement file was given")
-    tables = [read_csv(path, AXIS_COLUMNS, ("time_s",), ("temp_*_c",)) for path in files]
+    tables = [read_csv(path, AXIS_COLUMNS, AXIS_COVARIATES, ("temp_*_c",)) for path in files]
     check_distinct(tables)
     runs = AxisRuns(
         axis=np.concatenate([_axes(table) for table in tables]),

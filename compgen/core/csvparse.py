@@ -75,7 +75,7 @@ def _note_metadata(line: str, metadata: dict[str, str]) -> bool:
     """Whether a stripped line is a comment or empty; a comment ``# key = value`` goes to ``metadata``."""
     if line.startswith("#"):
         key, equals, value = line.lstrip("#").partition("=")
-        if equals:
+        if equals and value.strip():  # a date that nobody filled in is not a date
             metadata[key.strip()] = value.strip()
         return True
     return not line

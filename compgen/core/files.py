@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import filecmp
 import hashlib
+import itertools
 import os
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from compgen.errors import InputError
+
+TEMPORARY = ".tmp"
 
 
 def sha256_of(content: bytes) -> str:
@@ -28,12 +32,15 @@ class OutputFolder:
     """A folder that receives a set of files together.
 
     ``add`` keeps the contents in memory; ``commit`` writes every one to a temporary name beside its target and
-    only then renames them, so that an error leaves neither half a file nor half a set of new ones.
+    only then renames them, so that an error leaves neither half a file nor half a set of new ones. ``set_aside`` names a
+    file of the folder that ``commit`` renames to ``PREVIOUS-...`` before the new ones take their names: a process that is
+    killed in between leaves no old file that looks like one of the new set.
     """
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self._contents: dict[str, bytes] = {}
+        self._aside: list[str] = []
         try:
             existing = self.folder
             while not existing.exists() and existing != existing.parent:
@@ -42,13 +49,24 @@ class OutputFolder:
         except OSError as error:
             raise InputError(f"cannot be used: {error.strerror or error}", file=self.folder) from error
 
+    @property
+    def contents(self) -> Mapping[str, bytes]:
+        """What has been added, by name."""
+        return self._contents
+
     def add(self, name: str, content: str | bytes) -> None:
         """Remember ``content`` (text is encoded as UTF-8, line ends kept) for the file ``name``."""
         self._contents[name] = content.encode("utf-8") if isinstance(content, str) else content
 
+    def set_aside(self, name: str) -> Path:
+        """Keep the existing file ``name`` under the name that is returned, one that loses no other file."""
+        self._aside.append(name)
+        return _previous(self.folder / name)
+
     def commit(self) -> dict[str, Path]:
         """Write everything and return the path of each file by name."""
         paths = {name: self.folder / name for name in self._contents}
+        aside = [(self.folder / name, _previous(self.folder / name)) for name in dict.fromkeys(self._aside)]
         temporary: dict[str, Path] = {}
         made = _missing_folders(paths.values())
         try:
@@ -58,7 +76,7 @@ class OutputFolder:
                     raise IsADirectoryError(21, f"{path.name} is a folder")
             for name, content in self._contents.items():
                 temporary[name] = _write_temporary(paths[name], content)
-            _replace_all([(temporary[name], paths[name]) for name in paths])
+            _replace_all([*aside, *((temporary[name], paths[name]) for name in paths)])
         except OSError as error:
             _remove([*temporary.values()], made)
             raise InputError(
@@ -68,6 +86,15 @@ class OutputFolder:
             _remove([*temporary.values()], made)
             raise
         return paths
+
+
+def _previous(path: Path) -> Path:
+    """A name with ``PREVIOUS-`` that is free, or that a file with the same contents has."""
+    for count in itertools.count(1):
+        free = path.with_name(f"PREVIOUS-{'' if count == 1 else f'{count}-'}{path.name}")
+        if not free.exists() or (free.is_file() and path.is_file() and filecmp.cmp(free, path, shallow=False)):
+            return free
+    raise AssertionError("itertools.count never ends")
 
 
 def _missing_folders(targets: Iterable[Path]) -> list[Path]:
@@ -87,26 +114,27 @@ def _remove(files: Iterable[Path], folders: Iterable[Path]) -> None:
 
 
 def _replace_all(moves: Sequence[tuple[Path, Path]]) -> None:
-    """Rename each first path to the second; if one fails, put back what stood there before."""
-    before = {target: target.read_bytes() if target.exists() else None for _, target in moves}
-    done: list[Path] = []
+    """Rename each first path to the second; if one fails, put back all files as they were, the last first."""
+    done: list[tuple[Path, Path, bytes | None]] = []
     try:
         for source, target in moves:
+            before = target.read_bytes() if target.exists() else None
             os.replace(source, target)
-            done.append(target)
+            done.append((source, target, before))
     except BaseException:
-        for target in done:
-            content = before[target]
+        for source, target, before in reversed(done):
             with contextlib.suppress(OSError):
-                if content is None:
+                if not source.name.endswith(TEMPORARY):  # a file that was set aside: no byte of it is written again
+                    os.replace(target, source)
+                elif before is None:
                     target.unlink()
                 else:
-                    os.replace(_write_temporary(target, content), target)
+                    os.replace(_write_temporary(target, before), target)
         raise
 
 
 def _write_temporary(target: Path, content: bytes) -> Path:
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=TEMPORARY, dir=target.parent)
     path = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:

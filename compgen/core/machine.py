@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
 from pathlib import Path
@@ -16,7 +17,7 @@ from compgen.core.emphasis import Emphasis, take_emphasis
 from compgen.core.emphasis import Vector3 as Vector3
 from compgen.core.names import AXES, ERROR_NAMES
 from compgen.core.text import nearest
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError
 from compgen.resources import data_folder
 
 Reference = Literal["X", "Y"]
@@ -200,20 +201,39 @@ def _error_selection(value: Any) -> ErrorSelection:
 def machine_files(folders: tuple[Path, ...] = ()) -> dict[str, Path]:
     """Return the machine files by the name they declare: the shipped ones, and those in ``folders``.
 
-    Looked for are ``*.toml`` and ``*/machine.toml``. Two files with one name are an error, unless a file outside
-    the shipped folder is a byte-for-byte copy.
+    Looked for are ``*.toml`` and ``*/machine.toml`` that describe a chain or axes; other files (scenarios, jobs) may lie
+    beside them. A file that is no TOML, and names that several files declare, are left out with a warning: one bad file
+    must not keep the other machines from being used.
     """
-    found: dict[str, Path] = {}
+    found = _declared(folders)
+    for name, paths in found.items():
+        if len(paths) > 1:
+            warnings.warn(f"left out: {_several(name, paths)}", CompgenWarning, stacklevel=2)
+    return {name: paths[0] for name, paths in found.items() if len(paths) == 1}
+
+
+def _several(name: str, paths: Sequence[Path]) -> str:
+    return f"two machines are named {name!r}: {' and '.join(map(str, paths))}; rename one"
+
+
+def _declared(folders: tuple[Path, ...]) -> dict[str, list[Path]]:
+    """The files that declare each name; a byte-for-byte copy of a machine from another folder counts once."""
+    found: dict[str, list[Path]] = {}
+    here: dict[str, Path] = {}
     for folder in dict.fromkeys(path.resolve() for path in (data_folder("machines"), *folders)):
-        here: dict[str, Path] = {}
         for path in sorted([*folder.glob("*.toml"), *folder.glob("*/machine.toml")]):
-            name = tomlio.read_toml(path).take("name", tomlio.text)
-            first = here.get(name) or found.setdefault(name, path)
-            if first != path and (name in here or first.read_bytes() != path.read_bytes()):
-                raise InputError(
-                    f"two machines are named {name!r}: this file and {first}; rename one", file=path, field="name"
-                )
-            here[name] = path
+            try:
+                root = tomlio.read_toml(path)
+                name = root.take("name", tomlio.text) if {"chain", "axes"} & set(root.data) else None
+            except InputError as error:
+                warnings.warn(f"left out of the machines: {error}", CompgenWarning, stacklevel=3)
+                continue
+            if name is None:
+                continue
+            others = found.setdefault(name, [])
+            if here.get(name) == folder or all(other.read_bytes() != path.read_bytes() for other in others):
+                others.append(path)
+            here[name] = folder
     return found
 
 
@@ -235,9 +255,12 @@ def load_machine(machine: str | Path, folders: tuple[Path, ...] = ()) -> Machine
     if path.suffix == ".toml" or len(path.parts) > 1:
         return read_machine(path)
     local = Path("machines")
-    known = machine_files((*((local,) if local.is_dir() else ()), *folders))
-    if str(machine) not in known:
+    known = _declared((*((local,) if local.is_dir() else ()), *folders))
+    paths = known.get(str(machine), [])
+    if not paths:
         raise InputError(
             f"no machine is named {str(machine)!r}; {nearest(str(machine), known)}, or give the path of a TOML file"
         )
-    return read_machine(known[str(machine)])
+    if len(paths) > 1:
+        raise InputError(f"{_several(str(machine), paths)}, or give the path of one", file=paths[-1], field="name")
+    return read_machine(paths[0])

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Hashable, Iterable
+import re
+from collections.abc import Hashable, Iterable, Mapping
 from typing import TypeVar
 
 Item = TypeVar("Item", bound=Hashable)
 
 
-def nearest(word: str, known: Iterable[str]) -> str:
-    """Return a hint such as ``did you mean 'range_mm'? Known: ...`` for a misspelt ``word``."""
+def nearest(word: str, known: Iterable[str], described: Mapping[str, str] | None = None, alike: float = 0.5) -> str:
+    """Return a hint such as ``did you mean 'range_mm'? Known: ...`` for a misspelt ``word``.
+
+    All known words that contain ``word`` are proposed; without one, those whose ``described`` text has it as a word, and
+    last the one that is spelt most alike (``alike``: how much, 0 to 1).
+    """
     choices = sorted(known)
-    lowered = {choice.lower(): choice for choice in choices}
-    close = difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=0.5)
-    hint = f"did you mean {lowered[close[0]]!r}? " if close else ""
+    proposed = [choice for choice in choices if len(word) > 2 and word.lower() in choice.lower()]
+    if not proposed and len(word) > 2 and described:
+        whole = re.compile(rf"(?<![a-z0-9]){re.escape(word)}", re.IGNORECASE)
+        proposed = [choice for choice in choices if whole.search(described.get(choice, ""))]
+    if not proposed:
+        lowered = {choice.lower(): choice for choice in choices}
+        proposed = [lowered[close] for close in difflib.get_close_matches(word.lower(), lowered, n=1, cutoff=alike)]
+    hint = f"did you mean {' or '.join(map(repr, proposed))}? " if proposed else ""
     return f"{hint}Known: {', '.join(choices) if choices else 'none'}"
 
 

@@ -66,7 +66,7 @@ def analyse(
         fit = widened(fit, taken) if taken else fit
     named, missing = named_groups(fit.readings, only)
     groups = [*base_groups(fit.readings), *named, *generic_groups(fit.readings, fit.observed.layout)]
-    fixed = [group for group in named if group.scans == 1 or fit.readings.kind == "axis"]
+    fixed = [group for group in named if group.scans == 1]
     show("fitting the noise")
     noise = noise_of(fit, fixed if _repeats(fit) else [], sigma_mm=sigma_mm)
     show(f"comparing {len(groups)} groups")

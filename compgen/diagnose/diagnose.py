@@ -18,16 +18,15 @@ from compgen.core.threads import one_thread
 from compgen.diagnose.advice import advice_of
 from compgen.diagnose.against import compared
 from compgen.diagnose.analysis import Analysis, analyse
-from compgen.diagnose.axis_figures import WARM_UP_NOTE, figures_before_after
+from compgen.diagnose.axis_diagnosis import AxisDiagnosis, findings_of
+from compgen.diagnose.axis_session import Order
 from compgen.diagnose.base import BaseFit
 from compgen.diagnose.base_choice import fit_smooth
 from compgen.diagnose.classes import classes_of, gross_readings
-from compgen.diagnose.evidence import contribution
 from compgen.diagnose.gap import gap_of
 from compgen.diagnose.gross import correction_of, looks_gross
 from compgen.diagnose.measurement import Measurement
 from compgen.diagnose.observed import Observed, ObservedDeviations, ObservedLengths
-from compgen.diagnose.observed_axis import ObservedAxis, fit_axis
 from compgen.diagnose.refit import refit
 from compgen.diagnose.result import Classed, Diagnosis
 from compgen.diagnose.verdict import verdict_of
@@ -51,6 +50,7 @@ class DiagnoseOptions:
     add : names that are added whether they were found or not.
     u_um : standard uncertainty of a reading in um, if it is known; used without repeats.
     against : predicted errors that the measurement is compared with.
+    order : order of axis runs in time: as logged, else run by run, up then down; or what the user says.
     """
 
     max_effects: int = 4
@@ -58,6 +58,7 @@ class DiagnoseOptions:
     add: tuple[str, ...] = ()
     u_um: float | None = None
     against: ErrorTable | None = None
+    order: Order = "auto"
 
 
 def diagnose(
@@ -66,13 +67,13 @@ def diagnose(
     options: DiagnoseOptions | None = None,
     *,
     show: Show = lambda _: None,
-) -> Diagnosis:
+) -> Diagnosis | AxisDiagnosis:
     """Diagnose a measurement.
 
     Parameters
     ----------
     machine : chain, travel and which errors its model contains.
-    measurement : tracer lengths or measured deviations.
+    measurement : tracer lengths, measured deviations, or axis runs.
     options : what it may do.
     show : receives the stage in words.
 
@@ -82,6 +83,14 @@ def diagnose(
         for names that are no effects, and for too few readings.
     """
     chosen = options or DiagnoseOptions()
+    if isinstance(measurement, AxisRuns):
+        found = findings_of(
+            machine, measurement, order=chosen.order, most=chosen.max_effects, only=chosen.effects, add=chosen.add,
+            u_um=chosen.u_um, against=chosen.against, show=show,
+        )  # fmt: skip
+        return AxisDiagnosis(machine, measurement, tuple(found))
+    if chosen.order != "auto":
+        raise InputError("--order belongs to axis runs; the rows of other measurements are ordered by time_s")
     with one_thread():
         show("fitting the base model")
         observed = observed_of(machine, measurement)
@@ -116,17 +125,17 @@ def diagnose(
 
 def _base(observed: Observed) -> BaseFit:
     """Fit the base model, with what the machine file switches on taken off the readings."""
-    fit = fit_axis(observed) if isinstance(observed, ObservedAxis) else fit_smooth(observed)
+    fit = fit_smooth(observed)
     known = [effect.change_mm(fit.readings) for effect in active_effects(observed.machine)]
     present = [change for change in known if change is not None]
     if not present:
         return fit
     observed.value_mm = observed.value_mm - sum(present)
-    return fit_axis(observed) if isinstance(observed, ObservedAxis) else fit_smooth(observed)
+    return fit_smooth(observed)
 
 
 def _analysed(
-    measurement: Measurement, observed: Observed, fit: BaseFit, options: DiagnoseOptions, show: Show
+    measurement: Lengths | Deviations, observed: Observed, fit: BaseFit, options: DiagnoseOptions, show: Show
 ) -> Analysis:
     return analyse(
         fit,
@@ -137,16 +146,14 @@ def _analysed(
     )
 
 
-def observed_of(machine: Machine, measurement: Measurement) -> Observed:
+def observed_of(machine: Machine, measurement: Lengths | Deviations) -> Observed:
     """Return the measurement as scalar readings."""
     if isinstance(measurement, Lengths):
         return ObservedLengths(machine, measurement)
-    if isinstance(measurement, AxisRuns):
-        return ObservedAxis(machine, measurement)
     return ObservedDeviations(machine, measurement)
 
 
-def _sigma_mm(measurement: Measurement, observed: Observed, options: DiagnoseOptions) -> FloatArray | None:
+def _sigma_mm(measurement: Lengths | Deviations, observed: Observed, options: DiagnoseOptions) -> FloatArray | None:
     """Standard uncertainty of every reading if it was stated."""
     if options.u_um is not None:
         if not options.u_um > 0:
@@ -196,12 +203,7 @@ def _completed(
     if options.against is not None:
         against = compared(observed, analysis, options.against)
         done = replace(done, changes=against.changes, against_rms_mm=against.rms_mm)
-    if not isinstance(observed, ObservedAxis):
-        return done
-    warm = [item.group for item in verdict.named if item.name == "warmup_drift"]
-    change = sum((contribution(scene, analysis.chosen, g)[2] for g in warm), np.zeros(len(observed)))
-    notes = (WARM_UP_NOTE,) if warm else ()
-    return replace(done, notes=notes, iso_230_2=figures_before_after(observed, change))
+    return done
 
 
 def _wanted(analysis: Analysis, names: Sequence[str], present: Sequence[int]) -> list[int]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from html import escape
 from typing import Any
 
-from compgen.diagnose.pictures import pictures_of, suspects_of
+from compgen.diagnose.axis_diagnosis import AxisDiagnosis
+from compgen.diagnose.pictures import axis_pictures, pictures_of, suspects_of
 from compgen.diagnose.result import Diagnosis
 
 STYLE = (
@@ -15,9 +16,9 @@ STYLE = (
 )
 
 
-def page_of(found: Diagnosis) -> str:
-    """Return the text of ``index.html``."""
-    data, pictures = found.to_dict(), pictures_of(found)
+def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
+    """Return the text of ``index.html``; ``data`` is the content of ``diagnosis.json``."""
+    pictures = pictures_of(found)
     title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
     parts = [
         f"<h1>{escape(title)}</h1>",
@@ -34,6 +35,29 @@ def page_of(found: Diagnosis) -> str:
         _list("What this measurement cannot show", data["invisible"]),
         _list("Notes", [*data["reasons"], *data["notes"]]),
     ]
+    return _page(title, parts)
+
+
+def axis_page(found: AxisDiagnosis, data: dict[str, Any]) -> str:
+    """Return the text of ``index.html`` of axis runs."""
+    title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
+    parts = [f"<h1>{escape(title)}</h1>", _effects(data), _figures(data), _gap(data)]
+    for letter, text in axis_pictures(found).items():
+        parts += [
+            f"<h2>Axis {escape(letter)}</h2><p>Left: deviation less the mean of its target and direction, in the order of "
+            "time; red as measured, blue without what was taken off, hollow: left out. Right: all runs over the targets, "
+            "upwards (triangles up) and downwards, as measured and without.</p>",
+            text,
+        ]
+    parts += [
+        _list("What would decide or show more", data["advice"]),
+        _list("What this measurement cannot show", data["invisible"]),
+        _list("Notes", [*data["reasons"], *data["notes"]]),
+    ]
+    return _page(title, parts)
+
+
+def _page(title: str, parts: list[str]) -> str:
     head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(parts) + "\n</body></html>\n"
 
@@ -48,13 +72,37 @@ def _effects(data: dict[str, Any]) -> str:
         others = ", ".join(f"{o['name']} {o['weight']:.2f}" for o in item["alias_set"] if o["name"] != item["name"])
         text = f"<b>{escape(item['name'])}</b> <span class=grade>{escape(item['grade'].replace('_', ' '))}</span> "
         text += escape(values) + (f"; cannot be told from {escape(others)}" if others else "")
-        lines.append(text + escape("".join(f"; {reason}" for reason in item.get("reasons", []))))
+        text += escape("".join(f"; {reason}" for reason in item.get("reasons", [])))
+        if item.get("text"):
+            text += f"<br>{escape(item['text'])}"
+        if item.get("what_to_do"):
+            text += f"<br><i>What to do:</i> {escape(item['what_to_do'])}"
+        lines.append(text)
     for item in data["unknown"]:
         depends = ", ".join(item["covariates"]) or "nothing that was logged"
-        lines.append(f"<b>unknown</b>: {escape(item['text'])}, depends on {escape(depends)}")
+        lines.append(
+            f"<b>unknown</b>: {escape(item['text'])}, depends on {escape(depends)}"
+            + (f"; resembles {escape(item['resembles'])}" if item.get("resembles") else "")
+        )
     if not lines:
         return "<p>Model and measurement agree within the noise.</p>"
     return "<ul>" + "".join(f"<li>{line}</li>" for line in lines) + "</ul>"
+
+
+def _figures(data: dict[str, Any]) -> str:
+    """Figures of ISO 230-2 as measured and without what was taken off."""
+    parts = []
+    for axis, figures in data["iso_230_2"].items():
+        taken = ", ".join(data["taken_off"][axis]) or "nothing was taken off"
+        rows = "".join(
+            f"<tr><td>{key}</td><td>{pair['before']:.2f}</td><td>{pair['after']:.2f}</td></tr>"
+            for key, pair in figures.items()
+        )
+        parts.append(
+            f"<h2>ISO 230-2, axis {escape(axis)}</h2><table><tr><th>figure in um</th><th>as measured</th>"
+            f"<th>without ({escape(taken)})</th></tr>{rows}</table>"
+        )
+    return "".join(parts)
 
 
 def _gap(data: dict[str, Any]) -> str:

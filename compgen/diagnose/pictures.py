@@ -10,6 +10,7 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.core.names import MM_PER_UM
+from compgen.diagnose.axis_diagnosis import AxisDiagnosis, AxisFindings
 from compgen.diagnose.layout import IntArray
 from compgen.diagnose.result import Diagnosis
 from compgen.diagnose.search import beside, gains
@@ -32,6 +33,46 @@ def pictures_of(found: Diagnosis) -> dict[str, str]:
     matplotlib.use("svg")
     with matplotlib.rc_context(STYLE):
         return {"where": _where(found), "volume": _volume(found), "suspects": _suspects(found)}
+
+
+def axis_pictures(found: AxisDiagnosis) -> dict[str, str]:
+    """Return a picture of the runs of every axis by its letter."""
+    import matplotlib  # imported here: slow to load, and only the pages need it
+
+    matplotlib.use("svg")
+    with matplotlib.rc_context(STYLE):
+        return {part.session.letter: _runs(part) for part in found.axes}
+
+
+def _runs(part: AxisFindings) -> str:
+    """Scatter within the cells over time, and all runs over the targets, before and after."""
+    from matplotlib import pyplot
+
+    session = part.session
+    measured, without = session.deviation_mm / MM_PER_UM, (session.deviation_mm - part.removed_mm) / MM_PER_UM
+    kept = ~np.isin(np.arange(len(session)), part.left_out)
+    count = np.maximum(np.bincount(session.cell[kept], minlength=int(session.cell.max()) + 1), 1)
+    figure, axes = pyplot.subplots(1, 3, figsize=(10, 3.2))
+    figure.subplots_adjust(left=0.06, right=0.99, top=0.92, bottom=0.14, wspace=0.25)
+    for values, colour, rows in ((measured, BEFORE, np.ones_like(kept)), (without, AFTER, kept)):
+        means = np.bincount(session.cell[kept], values[kept], len(count)) / count
+        left = values - means[session.cell]
+        axes[0].plot(session.time[rows], left[rows], ".-", color=colour, lw=0.5, ms=4)
+    axes[0].plot(session.time[~kept], (measured - means[session.cell])[~kept], "o", mfc="none", color=BEFORE, ms=5)
+    axes[0].set_xlabel("time in s" if session.timed else "number of the reading in time")
+    axes[0].set_ylabel("deviation less its mean, um")
+    for panel, title, values, colour, rows in (
+        (axes[1], "as measured", measured, BEFORE, np.ones_like(kept)),
+        (axes[2], "without", without, AFTER, kept),
+    ):
+        for run in np.unique(session.leg):
+            own = (session.leg == run) & rows
+            marker = "^" if own.any() and session.direction[own][0] > 0 else "v"
+            panel.plot(session.position_mm[own], values[own], marker + "-", color=colour, lw=0.5, ms=3, alpha=0.8)
+        panel.set_title(title)
+        panel.set_xlabel(f"{session.letter} in mm")
+    axes[2].sharey(axes[1])
+    return _text_of(figure)
 
 
 def _text_of(figure: Any) -> str:

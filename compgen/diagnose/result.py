@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,8 @@ from compgen.diagnose.gap import Gap
 from compgen.diagnose.noise import TAU
 from compgen.diagnose.refit import Refit, extended_toml, settings_of
 from compgen.diagnose.verdict import Named, Unknown, Verdict
+from compgen.effects import Card, catalogue
+from compgen.effects.what_to_do import what_to_do
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,6 @@ class Diagnosis:
     analysis, verdict, refit, gap : the stages; all None if only a gross error was found.
     classed : noise classes and gross errors.
     advice : measurements that would decide or separate, in words.
-    iso_230_2 : figures of axis runs before and after, by axis and key.
     changes, against_rms_mm : errors that differ from those that were compared with, and the residual against them.
     notes : what was assumed or left out, in words.
     """
@@ -52,7 +53,6 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     changes: tuple[dict[str, Any], ...] = ()
     against_rms_mm: float | None = None
-    iso_230_2: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def acceptable(self) -> bool:
@@ -65,7 +65,10 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """The content of ``diagnosis.json``."""
         verdict, analysis = self.verdict, self.analysis
-        effects = [self._named(item) for item in verdict.named] + [_classed(item) for item in self.classed]
+        cards = self._cards
+        effects = [self._named(item) for item in verdict.named] + [
+            {**_classed(item), "what_to_do": what_to_do(cards[item.name])} for item in self.classed
+        ]
         word = "named" if verdict.word == "none" and self.classed else verdict.word
         gap: dict[str, Any] = {"train": self.gap.train.to_dict()}
         for key, pair in (
@@ -94,8 +97,11 @@ class Diagnosis:
                 "groups": len({group.name for group in analysis.scene.groups}),
             },
             **self._against(),
-            **({"iso_230_2": dict(self.iso_230_2)} if self.iso_230_2 else {}),
         }
+
+    @cached_property
+    def _cards(self) -> dict[str, Card]:
+        return {name: effect.card for name, effect in catalogue(self.analysis.fit.readings.stations).items()}
 
     def _named(self, item: Named) -> dict[str, Any]:
         group = self.analysis.scene.groups[item.group]
@@ -108,6 +114,7 @@ class Diagnosis:
             parameters[key] = {"value": value, "u": None}
         return {
             "name": item.name,
+            "what_to_do": what_to_do(self._cards[item.name]),
             "alias_set": [{"name": other.name, "weight": round(other.weight, 4)} for other in item.alternatives],
             "parameters": parameters,
             "confidence": round(item.confidence, 4),
@@ -142,7 +149,9 @@ class Diagnosis:
         }
 
     def extended(self) -> str:
-        """The machine file with the effects that were found."""
+        """The machine file with the effects that were found; empty without a name or a file."""
+        if not self.verdict.named or self.machine.source is None:
+            return ""
         groups = [i.group for i in self.verdict.named if i.name == self.analysis.scene.groups[i.group].name]
         return extended_toml(self.machine, self.analysis, self.refit, groups)
 

@@ -24,8 +24,6 @@ LEAST_VISIBLE = 0.05
 LEAST_SHARE = 0.1
 #: The same for a jump of the whole machine: among many times one suits any slow change a little.
 LEAST_JUMP_SHARE = 0.5
-#: Axis runs are short: a slow effect whose chi-square is below this may as well be a slow wandering of the sensor.
-LEAST_SLOW_CHI2 = 60.0
 #: p-value of the homogeneity below which a name is not confirmed beside something that has no name.
 HOMOGENEITY_BESIDE_P = 0.01
 #: Unevenness that explains less than this share of the chi-square of a name is its inexact shape, not another effect.
@@ -172,8 +170,6 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     share = LEAST_JUMP_SHARE if name == "machine_jump" else LEAST_SHARE
     if generic and chi2 < share * sum(evidence.chi2[g] for g in (*generic, *failed)):
         reasons.append("small beside what has no name")
-    if scene.groups[group].slow and scene.fit.readings.kind == "axis" and chi2 < LEAST_SLOW_CHI2:
-        reasons.append("noise that wanders slowly may look like it in a session this short")
     if name in NEVER_CONFIRMED or visible < LEAST_VISIBLE:
         reasons.append(f"the plan shows {100 * visible:.1f} % of it only: any misfit could be reshaped into it")
     if excess := _beyond_plausible(analysis, group):

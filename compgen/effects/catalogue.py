@@ -5,6 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from compgen.effects.angular import ANGULAR_NAMES
+from compgen.effects.axis_session import (
+    BadRun,
+    DisturbedReadings,
+    LinearDrift,
+    Settling,
+    StepBetweenRuns,
+    WarmupDrift,
+)
 from compgen.effects.backlash import Backlash
 from compgen.effects.base import (
     ANY_STATION,
@@ -40,7 +48,6 @@ from compgen.effects.target_angle import TargetAngle
 from compgen.effects.thermal_scale import ThermalScale
 from compgen.effects.tool_offset_error import ToolOffsetError
 from compgen.effects.tracer_runout import TracerRunout
-from compgen.effects.warmup_drift import WarmupDrift
 
 _BUILT_IN: tuple[Family, ...] = (
     PerAxis("thermal_scale", ThermalScale),
@@ -67,6 +74,11 @@ _BUILT_IN: tuple[Family, ...] = (
     PerName("sign", ANGULAR_NAMES, SignError),
     PerAxis("cosine_error", CosineError),
     Single("warmup_drift", WarmupDrift),
+    Single("linear_drift", LinearDrift),
+    Single("step_between_runs", StepBetweenRuns),
+    Single("bad_run", BadRun),
+    Single("disturbed_readings", DisturbedReadings),
+    PerAxis("settling", Settling),
     NoiseClasses(),
     SixDofEffects(),
 )

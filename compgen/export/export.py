@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from compgen.controllers import AnyController, SourceFile, controller_named
@@ -22,10 +22,8 @@ from compgen.effects import advice_of_effects
 from compgen.errors import InputError
 from compgen.export.companions import companion_files, errors_context
 from compgen.export.render import Format, load_format, render, render_files
+from compgen.export.superseded import MANIFEST, REJECTED_PREFIX, set_aside_superseded
 from compgen.export.synthesis import synthesize
-
-#: Put in front of the name of a table that was not accepted.
-REJECTED_PREFIX = "NOT-ACCEPTED-"
 
 
 def program_version() -> str:
@@ -62,27 +60,37 @@ class Export:
     def write(
         self, folder: str | Path, *, accepted: bool | None = None, beside: Mapping[str, str] | None = None
     ) -> list[Path]:
-        """Write everything atomically, with the texts ``beside`` them, and return the paths of the controller files.
+        """Write everything together, with the texts ``beside`` them, and return the paths of the controller files.
 
-        Tables that are not accepted (by default: that break a limit) get ``NOT-ACCEPTED-`` before their name; a table
-        of that name from an earlier run is then moved aside to ``PREVIOUS-`` so that it cannot be taken for the new one.
+        Tables that are not accepted (by default: that break a limit) get ``NOT-ACCEPTED-`` before their name. Tables of
+        an earlier export that have no successor of their name, and tables that were edited since, are renamed to
+        ``PREVIOUS-...``, see :func:`set_aside_superseded`.
         """
-        good = not self.violations if accepted is None else accepted
-        prefix = "" if good else REJECTED_PREFIX
         output = OutputFolder(folder)
-        for name, text in {**self.files, **self.companions}.items():
-            output.add(prefix + name, text.encode("ascii", "replace"))
-        manifest = {**self.manifest, "accepted": good, "file_prefix": prefix}
-        output.add("manifest.json", json.dumps(manifest, indent=2) + "\n")
-        output.add("preflight.md", self.preflight)
-        for name, text in (beside or {}).items():
-            output.add(name, text)
+        good = not self.violations if accepted is None else accepted
+        names = self.add_to(output, accepted=good, beside=beside)
+        set_aside_superseded(output)
         paths = output.commit()
-        for name in (*self.files, *self.companions):
-            stale = output.folder / (name if prefix else REJECTED_PREFIX + name)
-            if stale.exists():
-                stale.replace(output.folder / f"PREVIOUS-{stale.name}")
-        return [paths[prefix + name] for name in self.files]
+        return [paths[name] for name in names]
+
+    def add_to(
+        self, output: OutputFolder, sub_folder: str = "", *, accepted: bool, beside: Mapping[str, str] | None = None
+    ) -> list[str]:
+        """Add all files to ``output``, below ``sub_folder`` if one is given; return the names of the controller files."""
+        prefix = "" if accepted else REJECTED_PREFIX
+        manifest = {**self.manifest, "accepted": accepted, "file_prefix": prefix}
+        files: dict[str, str | bytes] = {
+            **{
+                prefix + name: text.encode("ascii", "replace")
+                for name, text in {**self.files, **self.companions}.items()
+            },
+            MANIFEST: json.dumps(manifest, indent=2) + "\n",
+            "preflight.md": self.preflight,
+            **(beside or {}),
+        }
+        for name, content in files.items():
+            output.add(str(PurePosixPath(sub_folder) / name), content)
+        return [str(PurePosixPath(sub_folder) / (prefix + name)) for name in self.files]
 
 
 @dataclass(frozen=True)

@@ -148,11 +148,13 @@ def _assembled(
     steps = np.sign(np.diff(order))
     if not (np.all(steps == steps[0]) and steps[0] != 0):
         raise source.fail("the targets neither ascend nor descend; the directions cannot be told")
+    # a cycle goes through the targets in their order (FWD) and back (BWD); the file lists all FWD before all BWD
+    readings = sorted(readings, key=lambda item: (item.cycle, -item.way, item.way * item.target))
     position = np.array([targets[item.target][0] for item in readings]) * scale
     actual = np.array([item.value for item in readings]) * scale
-    # FWD goes through the targets in their order: its direction is that of the motion, whatever its name says
+    # the direction of FWD is that of the motion, whatever its name says
     way = np.array([item.way for item in readings], dtype=np.int64) * int(steps[0])
     slope, offset = np.polyfit(position, actual, 1).tolist()
     cycle = np.array([item.cycle for item in readings], dtype=np.int64)
     line = np.array([item.line for item in readings], dtype=np.int64)
-    return Ecmc(OneAxis(position, way, cycle, actual - position, line), keys, slope, offset)
+    return Ecmc(OneAxis(position, way, cycle, actual - position, line, in_time=True), keys, slope, offset)

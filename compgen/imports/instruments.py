@@ -62,7 +62,7 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     if options.sign == "correction":
         runs = runs.negated()
         notes.append("the values were said to be corrections: their sign was turned round")
-    notes += remarks(runs, axis or "")
+    notes += remarks(runs, axis or "", angular=angular)
     understood = {
         "axis": axis,
         **_facts(runs, angular=angular),
@@ -149,7 +149,7 @@ def _with_directions(found: Renishaw, runs: OneAxis, options: ImportOptions, dou
     if options.directions == "alternate":
         _, order = np.unique(found.one_way, return_inverse=True)
         direction = np.where(order % 2 == 0, 1, -1).astype(np.int64)
-        return replace(runs, direction=direction, run=cycles(direction, found.one_way))
+        return replace(runs, direction=direction, run=cycles(direction, found.one_way), in_time=False)
     if found.sorted_rows and options.directions is None:
         doubts.append(
             "its flags say runs in both directions, but every run lists the targets in the same order; give --directions "
@@ -186,7 +186,7 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
         runs = replace(runs, direction=motion(runs.position_mm, 2 * runs.run + (runs.direction < 0)))
     if options.sign == "correction":
         runs = runs.negated()
-    notes += remarks(runs, axis or "")
+    notes += remarks(runs, axis or "", angular=False)
     understood = {
         "axis": axis,
         **_facts(runs, angular=False),

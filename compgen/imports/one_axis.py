@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
-from compgen.core.names import AXES, CURVE_NAMES, error_named
+from compgen.core.names import AXES, CURVE_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.core.reversal import ReversalCurves
 from compgen.core.text import nearest
 from compgen.errors import InputError
@@ -35,6 +35,7 @@ class OneAxis:
     value : measured minus target (n,), mm or rad.
     line : line of the file, (n,).
     covariates : further numbers by contract name (time_s, temp_..._c), each (n,).
+    in_time : whether the rows are in the order in which they were measured; tables by target or direction are not.
     """
 
     position_mm: FloatArray
@@ -43,6 +44,33 @@ class OneAxis:
     value: FloatArray
     line: IntArray
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    in_time: bool = False
+
+    def ordered(self) -> OneAxis:
+        """Return the rows in the order of time: run by run, up then down, unless the file says more.
+
+        Rows that are in the order of time already stay; where it is another one (a cycle that begins downwards), the column
+        ``order`` keeps it, since the order of rows by itself is never taken for time.
+        """
+        usual = np.lexsort((self.position_mm * self.direction, -self.direction, self.run))
+        if "time_s" in self.covariates and np.isfinite(self.covariates["time_s"]).all():
+            return self._rows(np.argsort(self.covariates["time_s"], kind="stable"))
+        if not self.in_time or not self.direction.all():
+            return self._rows(usual) if self.direction.all() else self
+        if np.array_equal(usual, np.arange(len(usual))):
+            return self
+        return replace(self, covariates={**self.covariates, "order": np.arange(1.0, len(usual) + 1)})
+
+    def _rows(self, rows: IntArray) -> OneAxis:
+        return replace(
+            self,
+            position_mm=self.position_mm[rows],
+            direction=self.direction[rows],
+            run=self.run[rows],
+            value=self.value[rows],
+            line=self.line[rows],
+            covariates={name: values[rows] for name, values in self.covariates.items()},
+        )
 
     def negated(self) -> OneAxis:
         """Return the readings with corrections turned into errors."""
@@ -138,7 +166,7 @@ def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[E
     return table, ReversalCurves({(name.axis, name.direction): gap}, dict(metadata))
 
 
-def remarks(runs: OneAxis, axis: str) -> list[str]:
+def remarks(runs: OneAxis, axis: str, *, angular: bool) -> list[str]:
     """Say which readings are missing, and which runs are equal to the last digit; nothing for a regular test."""
     found, name = [], f"axis {axis}" if axis else "the axis"
     keys = np.round(runs.position_mm / SAME_TARGET_MM).astype(np.int64)
@@ -152,17 +180,18 @@ def remarks(runs: OneAxis, axis: str) -> list[str]:
         at = runs.targets_mm[column]
         what = "reading is" if empty == 1 else "readings are"
         found.append(f"{name}: {empty} of {table.size} {what} missing, the first in one-way run {row + 1} at {at:g} mm")
-    return found + _outlier(runs, name) + _copies(runs, name, table, one_way.ravel())
+    return found + _outlier(runs, name, angular=angular) + _copies(runs, name, table, one_way.ravel())
 
 
-def _outlier(runs: OneAxis, name: str) -> list[str]:
+def _outlier(runs: OneAxis, name: str, *, angular: bool) -> list[str]:
     """Name the reading that is furthest from the median, if it is far beyond what the others spread over (0.1 mm, mrad)."""
     away = np.abs(runs.value - np.median(runs.value))
     worst = int(np.argmax(away))
     if len(away) < 3 or away[worst] < max(_NOTABLE, _FAR * float(np.quantile(np.delete(away, worst), 0.9))):
         return []
     at, value = runs.position_mm[worst], runs.value[worst]
-    return [f"{name}: {value:.4g} (mm or rad) at {at:g} mm, line {runs.line[worst]}, is far from all others; a slip?"]
+    size = f"{value / RAD_PER_URAD:.5g} urad" if angular else f"{value / MM_PER_UM:.5g} um"
+    return [f"{name}: {size} at {at:g} mm, line {runs.line[worst]}, is far from all others; a slip?"]
 
 
 def _copies(runs: OneAxis, name: str, table: FloatArray, one_way: IntArray) -> list[str]:

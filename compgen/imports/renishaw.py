@@ -205,7 +205,7 @@ def _assembled(source: Text, found: _File) -> Renishaw:
     if found.unread:
         notes.append(f"{len(found.unread)} lines in {' and '.join(BESIDE)} without a key were not used")
     flags = found.keys.get("flags", "").split()
-    runs = OneAxis(position, direction, cycles(direction, run), value, numbers)
+    runs = OneAxis(position, direction, cycles(direction, run), value, numbers, in_time=bool(np.all(np.diff(run) >= 0)))
     two_ways = flags[:2] == ["0", "0"] and alternating
     numbered = np.unique(run).tolist()
     zero = tuple(number for number in numbered if not value[run == number].any()) if value.any() else ()
@@ -219,7 +219,9 @@ def without_runs(found: Renishaw, numbers: tuple[int, ...]) -> Renishaw:
     keep = ~np.isin(found.one_way, numbers)
     one_way, old = found.one_way[keep], found.runs
     direction = old.direction[keep]
-    runs = OneAxis(old.position_mm[keep], direction, cycles(direction, one_way), old.value[keep], old.line[keep])
+    runs = OneAxis(
+        old.position_mm[keep], direction, cycles(direction, one_way), old.value[keep], old.line[keep], {}, old.in_time
+    )
     return replace(found, runs=runs, one_way=one_way)
 
 

@@ -60,8 +60,10 @@ def axis_readings(findings: Findings, *, angular: bool = False) -> tuple[dict[st
         line = np.array(findings.table.lines, dtype=np.int64)[rows.row[own]]
         direction, run = _directions(findings, target[own], rows.run[own], rows.label[own])
         beside = {name: values[rows.row[own]] for name, values in further.covariates.items()}
-        found[letter] = OneAxis(target[own], direction, run, value[own], line, beside)
-        findings.notes += remarks(found[letter], letter)
+        by_rows = not rows.label[own].any() and findings.options.directions != "alternate"
+        in_time = by_rows and bool(np.all(np.diff(rows.run[own]) >= 0))
+        found[letter] = OneAxis(target[own], direction, run, value[own], line, beside, in_time)
+        findings.notes += remarks(found[letter], letter, angular=angular)
     return found, further
 
 

@@ -127,7 +127,7 @@ def _described(runs: OneAxis, unit: float) -> dict[str, object]:
 
 def runs_of(found: dict[str, OneAxis], file: str, metadata: dict[str, str]) -> AxisRuns:
     """Return the readings of all axes as one object; an axis that is not known counts as X until the user has said it."""
-    parts = list(found.items())
+    parts = [(letter, item.ordered()) for letter, item in found.items()]
     runs = AxisRuns(
         axis=np.concatenate([np.full(len(item.value), AXES.index(letter or "X")) for letter, item in parts]),
         position_mm=np.concatenate([item.position_mm for _, item in parts]),

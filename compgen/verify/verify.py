@@ -224,6 +224,7 @@ class Verification:
     position_mm: FloatArray = field(repr=False)
     error_before_mm: FloatArray = field(repr=False)
     error_after_mm: FloatArray = field(repr=False)
+    machine: str = ""
 
     @property
     def accepted(self) -> bool:
@@ -260,6 +261,7 @@ class Verification:
             "notes": list(self.notes),
             "reasons": list(self.reasons),
             "controller": self.controller,
+            "machine": self.machine,
             "points": self.points,
             "before": self.before.as_dict(),
             "after": self.after.as_dict(),
@@ -335,6 +337,7 @@ def verify(
         position_mm=where.position_mm,
         error_before_mm=before,
         error_after_mm=after,
+        machine=machine.name,
     )
 
 

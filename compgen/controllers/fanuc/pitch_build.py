@@ -16,7 +16,7 @@ import numpy as np
 from compgen.controllers.base import Term
 from compgen.controllers.fanuc.pitch_settings import PitchSettings
 from compgen.controllers.fanuc.pitch_tables import PitchBlock, PitchTables, Shortfall, Wanted
-from compgen.controllers.integers import IntegerCurve, best_integers, section_weights
+from compgen.controllers.integers import IntegerCurve, best_integers, lowest_free, section_weights
 from compgen.controllers.terms import one_dimensional_name
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
@@ -152,16 +152,3 @@ def _placed(settings: PitchSettings, blocks: Sequence[PitchBlock | None]) -> lis
             taken.append((negative, negative + count - 1))
         placed[axis] = replace(block, reference=block.reference + first, first=first, negative_first=negative)
     return placed
-
-
-def lowest_free(taken: Sequence[Span], start: int, count: int) -> int:
-    """Return the lowest first number, from ``start`` on, of ``count`` numbers that meet no taken block.
-
-    >>> lowest_free([(5, 9), (12, 12)], 1, 4), lowest_free([(5, 9), (12, 12)], 1, 5)
-    (1, 13)
-    """
-    first = start
-    for low, high in sorted(taken):
-        if low < first + count and high >= first:
-            first = high + 1
-    return first

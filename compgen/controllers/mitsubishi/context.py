@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
+from decimal import Decimal, InvalidOperation
 from typing import Any
 
+from compgen.controllers.base import SourceFile
+from compgen.controllers.mitsubishi.records import BASE, FIRST_NUMBER, SET_STEP, SYSTEM, ControlSet
 from compgen.controllers.mitsubishi.settings import HIGHEST_VALUE, MitsubishiSettings
-from compgen.controllers.mitsubishi.tables import (
-    BASE,
-    SET_STEP,
-    SYSTEM,
-    MitsubishiTables,
-    SetTable,
-    shortfall_text,
-)
+from compgen.controllers.mitsubishi.tables import MitsubishiTables, SetTable, shortfall_text
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
 
@@ -30,13 +26,18 @@ MEANINGS = (
 
 def sheet_context(machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables) -> dict[str, Any]:
     """Return the context beyond the common one; ``rows`` are the sheet's, ``plan`` holds number -> value."""
-    parameters = [_row(SYSTEM, "1", "Pinc: 1 = increments")]
+    absolute = tables.sets[0].absolute
+    parameters = [_row(SYSTEM, str(int(not absolute)), _system(settings, absolute))]
     values: list[dict[str, str]] = []
-    for k, table in enumerate(tables.sets):
-        parameters += _set_rows(settings, settings.first_set - 1 + k, table)
+    for table in tables.sets:
+        parameters += _set_rows(settings, table.index, table)
         values += _value_rows(machine, table)
+    for item in _no_longer_used(settings, tables):
+        parameters += [
+            _row(BASE + k + SET_STEP * item.index, "", f"set {item.index + 1} is no longer used") for k in (0, 1)
+        ]
     return {
-        "sign_statement": _sign_statement(settings),
+        "sign_statement": _sign_statement(settings, tables),
         "parameters": [
             {"name": f"#{row['number']}", "value": row["value"], "meaning": row["meaning"]} for row in parameters
         ],
@@ -52,7 +53,86 @@ def sheet_context(machine: Machine, settings: MitsubishiSettings, tables: Mitsub
         "check": _check(machine, settings, tables.sets[0]),
         "stores": "correction" if settings.adds else "error",
         "count_um": settings.half_unit_mm / MM_PER_UM,
+        "absolute": absolute,
+        "has_sample": settings.sample.file is not None,
+        "container": "control's file" if settings.sample.file is not None else "sheet",
+        "control_file": _control_file(settings, {row["number"]: row["value"] for row in parameters + values}),
+        "overwrites": _overwrites(settings, tables, parameters + values),
     }
+
+
+def _system(settings: MitsubishiSettings, absolute: bool) -> str:
+    known = "as the control has it" if settings.sample.file is not None else "must be the control's own value"
+    return f"Pinc: {'absolute values' if absolute else 'increments'}; holds for the sets of ALL axes and {known}"
+
+
+def _control_file(settings: MitsubishiSettings, rows: dict[str, str]) -> SourceFile | None:
+    """The control's own parameter file with the rows put in, every other line byte for byte as it was."""
+    if settings.sample.file is None:
+        return None
+    lines = settings.sample.file.text.split("\n")
+    new = dict(rows)
+    for number, entry in settings.sample.entries.items():
+        value = new.pop(str(number), None)
+        if value is not None and number != SYSTEM:
+            line = lines[entry.line - 1]
+            behind = "\r" if line.endswith("\r") else ""
+            lines[entry.line - 1] = f"N{number}P{value}{behind}"
+    if new:
+        raise settings.sample.file.fail(
+            f"has no #{next(iter(new))}, which the tables need; state last_number or first_set"
+        )
+    return SourceFile(settings.sample.file.path, "\n".join(lines))
+
+
+def _overwrites(settings: MitsubishiSettings, tables: MitsubishiTables, rows: list[dict[str, str]]) -> list[str]:
+    """Say what sheet and file overwrite, other axes first."""
+    sample = settings.sample
+    others = [
+        f"set {item.index + 1} ({item.output} over {item.base}, numbers {item.span[0]} to {item.span[1]})"
+        for item in sample.others(settings.axis_names)
+    ]
+    if sample.file is None:
+        found = [
+            "Of other axes: NOT KNOWN, the control's own file was not given (`--style-from ALL.PRM`). Sets and numbers below "
+            f"that another axis uses are lost, and #{SYSTEM} changes how the values of every axis are read."
+        ]
+    else:
+        found = [f"Of other axes: nothing. {'; '.join(others) + ' stay' if others else 'No other axis has a set'}."]
+    for table in tables.sets:
+        first = BASE + SET_STEP * table.index
+        numbers = f"#{table.first} to #{table.last}"
+        pair = f"{AXES[table.output]}({AXES[table.base].lower()})"
+        found.append(f"Set {table.index + 1} (#{first} to #{first + 6}) and numbers {numbers}: {pair}")
+    changed = [
+        row for row in rows if (old := sample.entries.get(int(row["number"]))) and not _same(old.value, row["value"])
+    ]
+    if sample.file is not None:
+        parameters = [
+            f"#{row['number']} = {row['value']} (was {sample.entries[int(row['number'])].value or 'empty'})"
+            for row in changed
+            if int(row["number"]) < FIRST_NUMBER
+        ]
+        found.append(f"Parameters that change: {', '.join(parameters) or 'none'}")
+        found.append(f"Values that change: {len(changed) - len(parameters)}")
+    cleared = [f"set {item.index + 1} ({item.output} over {item.base})" for item in _no_longer_used(settings, tables)]
+    if cleared:
+        found.append(f"Switched off, because this export has no such table: {', '.join(cleared)}")
+    return found
+
+
+def _no_longer_used(settings: MitsubishiSettings, tables: MitsubishiTables) -> list[ControlSet]:
+    """Sets of X, Y, Z in the control's file that hold none of the tables: they would go on acting beside them."""
+    written = {table.index for table in tables.sets}
+    others = settings.sample.others(settings.axis_names)
+    return [item for item in settings.sample.sets if item.index not in written and item not in others]
+
+
+def _same(old: str, new: str) -> bool:
+    try:
+        return Decimal(old) == Decimal(new)
+    except InvalidOperation:
+        return old == new
 
 
 def _row(number: int, value: str, meaning: str) -> dict[str, str]:
@@ -92,14 +172,23 @@ def _summary(machine: Machine, table: SetTable) -> dict[str, Any]:
     }
 
 
-def _sign_statement(settings: MitsubishiSettings) -> str:
+def _sign_statement(settings: MitsubishiSettings, tables: MitsubishiTables) -> str:
     stored = "the correction" if settings.adds else "the error"
-    count_um = settings.count_mm / MM_PER_UM
+    scales = sorted({table.scale for table in tables.sets})
+    count_um = settings.half_unit_mm * scales[0] / MM_PER_UM
+    count = (
+        f"one count is {count_um:g} um (half of the setting unit {settings.setting_unit_um:g} um, times the scale "
+        f"{', '.join(map(str, scales))})"
+    )
+    if tables.sets[0].absolute:
+        return (
+            f"The numbers are {stored}, as sums up to their division point, zero at the reference point (#4000 = 0); {count}. An "
+            f"axis that stands {20 * count_um:g} um too low at a point gets {20 * settings.sign:+d} there (scale {scales[0]})."
+        )
     return (
-        f"The numbers are {stored}, as steps from one division point to the next away from the reference point; one count is "
-        f"{count_um:g} um (half of the setting unit {settings.setting_unit_um:g} um, times the scale {settings.scale}). "
-        f"An axis that travels {20 * count_um:g} um too short over one interval, in either direction away from the reference "
-        f"point, gets {20 * settings.sign:+d} there."
+        f"The numbers are {stored}, as steps from one division point to the next away from the reference point (#4000 = 1); "
+        f"{count}. An axis that travels {20 * count_um:g} um too short over one interval, in either direction away from the "
+        f"reference point, gets {20 * settings.sign:+d} there (scale {scales[0]})."
     )
 
 
@@ -107,9 +196,19 @@ def _warnings(settings: MitsubishiSettings, tables: MitsubishiTables) -> list[st
     return [
         "The parameter numbers are those that are remembered of the M series; no document was read. Compare them with "
         "the parameter manual of the control before anything is entered.",
+        *_system_warning(settings, tables),
         "The direction of the values on the negative side follows from the formula of the manual, not from an example: "
         "check it at one division on each side (part 3).",
         *(shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts <= 1.0),
+    ]
+
+
+def _system_warning(settings: MitsubishiSettings, tables: MitsubishiTables) -> list[str]:
+    if settings.sample.file is not None:
+        return []
+    return [
+        f"#{SYSTEM} holds for the tables of ALL axes. Read it at the control first: if it is not "
+        f"{int(not tables.sets[0].absolute)}, do not enter the sheet; set mode in the machine file and export again."
     ]
 
 
@@ -120,7 +219,8 @@ def _check(machine: Machine, settings: MitsubishiSettings, table: SetTable) -> d
     start_mm = machine.reference_point_mm[table.base]
     counts = min(20, HIGHEST_VALUE)
     step_mm = float(table.interval_mm) * (1 if upper else -1)
-    moved = settings.sign * counts * settings.half_unit_mm * table.scale / MM_PER_UM * (1 if upper else -1)
+    outwards = 1 if upper or table.absolute else -1
+    moved = settings.sign * counts * settings.half_unit_mm * table.scale / MM_PER_UM * outwards
     return {
         "axis": AXES[table.base],
         "number": number,
@@ -128,6 +228,7 @@ def _check(machine: Machine, settings: MitsubishiSettings, table: SetTable) -> d
         "to_mm": start_mm + step_mm,
         "counts": counts,
         "change_um": moved,
+        "other_change_um": moved if table.absolute else -moved,
         "both_sides": table.first < table.reference < table.last,
         "other_number": table.reference - 1,
         "other_to_mm": start_mm - float(table.interval_mm),

@@ -13,7 +13,7 @@ import numpy as np
 
 from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controllers.grids import Grid, curve_nodes_mm, equidistant_grid
-from compgen.controllers.integers import IntegerCurve, best_integers, section_weights
+from compgen.controllers.integers import IntegerCurve, best_integers, lowest_free, section_weights
 from compgen.controllers.mitsubishi.context import sheet_context
 from compgen.controllers.mitsubishi.settings import (
     HIGHEST_VALUE,
@@ -25,7 +25,7 @@ from compgen.controllers.mitsubishi.tables import (
     MitsubishiTables,
     SetTable,
     Shortfall,
-    parse_sheet,
+    parse_tables,
     sheet_usage,
     sheet_violations,
     values_of,
@@ -35,6 +35,7 @@ from compgen.controllers.transfer_plan import plan_contradictions
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
+from compgen.core.names import AXES
 from compgen.core.points import Points
 
 #: The final curve may be steeper than the estimate by this factor: angular errors are spread over the volume.
@@ -46,6 +47,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
 
     name = "mitsubishi"
     anchored = True
+    sample_setting = "style_from"
 
     def read_settings(self, machine: Machine) -> MitsubishiSettings:
         """Check ``[controllers.mitsubishi]``."""
@@ -53,41 +55,67 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
 
     def basis(self, machine: Machine, settings: MitsubishiSettings, errors: ErrorTable) -> list[Term]:
         """Return one term per set, its nodes the division points, the reference point one of them."""
-        nodes = [_grid(machine, settings, errors, axis).nodes_mm for axis in range(3)]
-        return one_dimensional_terms(machine, errors, nodes, settings.pairs, anchored=True)
+        chosen = [_grid(machine, settings, errors, axis).nodes_mm for axis in range(3)]
+        terms = []
+        for pair in settings.pairs:
+            kept = _kept_grid(machine, settings, pair)
+            nodes = chosen if kept is None else [kept.nodes_mm] * 3
+            terms += one_dimensional_terms(machine, errors, nodes, [pair], anchored=True)
+        return terms
 
     def build(
         self, machine: Machine, settings: MitsubishiSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
     ) -> MitsubishiTables:
         """Find the best whole curves within the range of the values, and give the sets consecutive numbers."""
+        if settings.absolute is None:
+            raise machine.controller_settings("mitsubishi").fail(
+                "mode",
+                "is missing: #4000 holds for the tables of ALL axes, and values of the wrong system are summed up. Give the "
+                "control's own parameter file (--style-from ALL.PRM), or look at #4000 and state mode = 'incremental' (1) or "
+                "'absolute' (0)",
+            )
         terms = {term.name: term for term in basis}
         sets: list[SetTable] = []
         shortfalls: list[Shortfall] = []
-        free = settings.first_number
-        for output, base in settings.pairs:
+        taken = [item.span for item in settings.sample.sets]
+        free = settings.free_sets()
+        for pair in settings.pairs:
+            output, base = pair
             term = terms[one_dimensional_name(output, base)]
             at = int(np.argmin(np.abs(term.nodes_mm - machine.reference_point_mm[base])))
-            best = _best_counts(machine, settings, base, term.nodes_mm, values[term.name], at)
-            numbers = values_of(best.counts, at)
-            sets.append(SetTable(base, output, free + at, free, numbers, settings.scale, _interval(term.nodes_mm)))
-            free += len(numbers)
+            best = _best_counts(machine, settings, pair, term.nodes_mm, values[term.name], at)
+            numbers = tuple(int(v) for v in best.counts) if settings.absolute else values_of(best.counts, at)
+            kept, own = settings.kept(pair), settings.own_set(pair)
+            first = lowest_free(taken, settings.first_number, len(numbers)) if kept is None else kept.first
+            _check_free(settings, pair, first, first + len(numbers) - 1)
+            taken.append((first, first + len(numbers) - 1))
+            index = free.pop(0) if own is None else own.index
+            interval = _interval(term.nodes_mm)
+            scale = settings.scale_of(pair)
+            sets.append(SetTable(base, output, first + at, first, numbers, scale, interval, settings.absolute, index))
             if best.limited:
                 shortfalls.append(Shortfall(output, base, best.largest))
-        return MitsubishiTables(tuple(sets), tuple(shortfalls))
+        return MitsubishiTables(tuple(sorted(sets, key=lambda table: table.index)), tuple(shortfalls))
 
     def context(self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables) -> dict[str, Any]:
         """Return the rows of the sheet, the plan number -> value, parameters and the statement of the sign."""
         return sheet_context(machine, settings, tables)
 
     def parse(self, machine: Machine, settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
-        """Read the set sheet; a ``.json`` plan is passed over."""
-        return parse_sheet(settings, files)
+        """Read the set sheet or the parameter file of the control; a ``.json`` plan is passed over."""
+        return parse_tables(settings, files)
 
     def contradictions(
         self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables, files: Sequence[SourceFile]
     ) -> list[str]:
         """Say where a plan beside the text differs from it."""
         return plan_contradictions(files, lambda: self.context(machine, settings, tables)["plan"])
+
+    def remarks(
+        self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables, files: Sequence[SourceFile]
+    ) -> list[str]:
+        """Say which system the values have, which sets were kept apart, and how many lines were passed over."""
+        return list(tables.remarks)
 
     def emulate(
         self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables, points: Points
@@ -116,7 +144,34 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
 
     def resolution_mm(self, settings: MitsubishiSettings) -> float:
         """Half a count of each table that acts on an axis, where the range of the values does not bind."""
-        return 0.5 * settings.count_mm * (3 if settings.relative else 1)
+        most = max(settings.count_mm(pair) for pair in settings.pairs)
+        return 0.5 * most * max(sum(1 for output, _ in settings.pairs if output == axis) for axis in range(3))
+
+
+def _kept_grid(machine: Machine, settings: MitsubishiSettings, pair: tuple[int, int]) -> Grid | None:
+    """Division points of the control's own set for a table, None if there is none that is kept."""
+    kept = settings.kept(pair)
+    if kept is None:
+        return None
+    if not kept.first <= kept.reference <= kept.last:
+        raise kept.entry.fail(
+            f"set {kept.index + 1} has the reference number {kept.reference} and the numbers {kept.first} to {kept.last}, "
+            "which cannot be kept: state interval_mm in the machine file for new ones"
+        )
+    start = Decimal(repr(machine.reference_point_mm[pair[1]])) + (kept.first - kept.reference) * kept.interval_mm
+    return Grid(start, kept.interval_mm, kept.last - kept.first + 1)
+
+
+def _check_free(settings: MitsubishiSettings, pair: tuple[int, int], first: int, last: int) -> None:
+    """Refuse numbers that a set of another table in the control's file uses."""
+    own = settings.own_set(pair)
+    for item in settings.sample.sets:
+        low, high = item.span
+        if item is not own and first <= high and last >= low:
+            raise item.entry.fail(
+                f"set {item.index + 1} ({item.output} over {item.base}) uses the numbers {low} to {high}; {first} to {last} of "
+                f"{AXES[pair[0]]}({AXES[pair[1]].lower()}) would overwrite them. State interval_mm for new numbers"
+            )
 
 
 def _grid(machine: Machine, settings: MitsubishiSettings, errors: ErrorTable, axis: int) -> Grid:
@@ -125,10 +180,12 @@ def _grid(machine: Machine, settings: MitsubishiSettings, errors: ErrorTable, ax
     The interval is the user's, else the widest that loses nothing that matters and keeps every value, with a margin,
     within its range, as far as the numbers suffice.
     """
-    most = (settings.last_number - settings.first_number + 1) // len(settings.pairs)
+    new = [pair for pair in settings.pairs if settings.kept(pair) is None]
+    used = sum(item.span[1] - item.span[0] + 1 for item in settings.sample.sets)
+    most = max(3, (settings.last_number - settings.first_number + 1 - used) // max(len(new), 1))
 
     def grid_of(step_mm: float | None) -> Grid:
-        output = None if settings.relative else axis
+        output = None if settings.across else axis
         return equidistant_grid(
             machine, errors, axis, most=most, step_mm=step_mm, anchor=True, loss_mm=settings.loss_mm, output=output
         )
@@ -137,7 +194,7 @@ def _grid(machine: Machine, settings: MitsubishiSettings, errors: ErrorTable, ax
     if asked is not None:
         return grid_of(asked)
     grid = grid_of(None)
-    largest = _largest_step(machine, settings, errors, axis, grid)
+    largest = 0.0 if settings.absolute else _largest_step(machine, settings, errors, axis, grid)
     share = min(1.0, (HIGHEST_VALUE - 1) / max(STEEPER * largest, 1e-9))
     if share == 1.0 and not grid.step % INTERVAL_QUANTUM_MM:
         return grid
@@ -153,8 +210,11 @@ def _largest_step(machine: Machine, settings: MitsubishiSettings, errors: ErrorT
     fine = np.unique(np.concatenate([grid.nodes_mm, curve_nodes_mm(machine, errors, axis)]))
     pairs = [pair for pair in settings.pairs if pair[1] == axis]
     terms = one_dimensional_terms(machine, errors, [fine] * 3, pairs)
-    steepest = max(float(np.max(np.abs(np.diff(term.start) / np.diff(fine)))) for term in terms)
-    return steepest * float(grid.step) / settings.count_mm
+    steepest = max(
+        float(np.max(np.abs(np.diff(term.start) / np.diff(fine)))) / settings.count_mm(pair)
+        for term, pair in zip(terms, pairs, strict=True)
+    )
+    return steepest * float(grid.step)
 
 
 def _interval(nodes_mm: FloatArray) -> Decimal:
@@ -162,10 +222,20 @@ def _interval(nodes_mm: FloatArray) -> Decimal:
 
 
 def _best_counts(
-    machine: Machine, settings: MitsubishiSettings, base: int, nodes_mm: FloatArray, values_mm: FloatArray, at: int
+    machine: Machine,
+    settings: MitsubishiSettings,
+    pair: tuple[int, int],
+    nodes_mm: FloatArray,
+    values_mm: FloatArray,
+    at: int,
 ) -> IntegerCurve:
-    """Return the best curve in counts at the division points for corrections (n,), zero at index ``at``."""
-    wanted = settings.sign * (np.asarray(values_mm) - values_mm[at]) / settings.count_mm
+    """Return the best curve in counts at the division points for corrections (n,), zero at index ``at``.
+
+    In the absolute system steps of any size can be stored; the limits say where a sum is out of range.
+    """
+    base = pair[1]
+    wanted = settings.sign * (np.asarray(values_mm) - values_mm[at]) / settings.count_mm(pair)
     emphasis = machine.emphasis
     sections = section_weights(nodes_mm, machine.axes[base].range_mm, emphasis.zone_mm[base], emphasis.zone_weight)
-    return best_integers(wanted, sections, at, HIGHEST_VALUE)
+    limit = int(2 * np.max(np.abs(wanted))) + 2 if settings.absolute else HIGHEST_VALUE
+    return best_integers(wanted, sections, at, limit)

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Any
 
 from compgen.controllers.grids import take_loss_mm
+from compgen.controllers.mitsubishi.records import (
+    FIRST_NUMBER,
+    MOST_NUMBER,
+    SETS,
+    ControlFile,
+    ControlSet,
+    read_control_file,
+)
 from compgen.core import tomlio
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
 
 #: Smallest step of the division interval.
 INTERVAL_QUANTUM_MM = Decimal("0.001")
-#: Numbers of the compensation values, and how many sets of parameters there are before them.
-FIRST_NUMBER, LAST_NUMBER, SETS = 4101, 5124, 10
 #: Values per division point (E68 manual p. II-292, C64 manual 9.2).
 LOWEST_VALUE, HIGHEST_VALUE = -128, 127
 
@@ -27,26 +33,30 @@ class MitsubishiSettings:
     Parameters
     ----------
     setting_unit_um : setting unit of the control; one count of the table is half of it, times ``scale``.
-    scale : compensation scale factor (parameter sc) of every set.
+    scale : compensation scale factor (parameter sc) of every set; None: that of the control's file, else 1.
+    absolute : whether values are sums up to their point (#4000 = 0) and not steps (1); None: not known.
     adds : True if the control adds the numbers (corrections), False if it subtracts them.
-    relative : whether one axis may be corrected as a function of another (straightness, squareness).
+    across : tables of one axis as a function of another (straightness, squareness), as (output, base axis).
     interval_mm : division interval per base axis, None: chosen.
     loss_mm : loss by interpolation between division points that is worth no shorter interval.
     first_number, last_number : numbers of values that may be used.
     first_set : first set of parameters that may be used, 1 to 10.
     axis_names : names of X, Y, Z on the control.
+    sample : the control's own parameter file.
     """
 
     setting_unit_um: float
-    scale: int
+    scale: int | None
+    absolute: bool | None
     adds: bool
-    relative: bool
+    across: tuple[tuple[int, int], ...]
     interval_mm: tuple[float | None, float | None, float | None]
     loss_mm: float
     first_number: int
     last_number: int
     first_set: int
     axis_names: tuple[str, str, str]
+    sample: ControlFile = field(default_factory=ControlFile, compare=False)
 
     @property
     def sign(self) -> int:
@@ -58,44 +68,89 @@ class MitsubishiSettings:
         """One unit of output: half of the setting unit, mm."""
         return 0.5 * self.setting_unit_um * MM_PER_UM
 
-    @property
-    def count_mm(self) -> float:
-        """One count of a written table, mm."""
-        return self.half_unit_mm * self.scale
+    def scale_of(self, pair: tuple[int, int]) -> int:
+        """Scale of a table (output, base axis): that of the machine file, else of the control's own set, else 1."""
+        own = self.own_set(pair)
+        return self.scale or (own.scale if own is not None and own.scale else 1)
+
+    def count_mm(self, pair: tuple[int, int]) -> float:
+        """One count of a written table (output, base axis), mm."""
+        return self.half_unit_mm * self.scale_of(pair)
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
         """(output, base axis) of the tables: positioning of the three axes first."""
-        own = [(axis, axis) for axis in range(3)]
-        across = [(output, base) for base in range(3) for output in range(3) if output != base]
-        return own + across if self.relative else own
+        return [*((axis, axis) for axis in range(3)), *self.across]
+
+    def own_set(self, pair: tuple[int, int]) -> ControlSet | None:
+        """Return the set of the control's file that holds a table (output, base axis)."""
+        output, base = (self.axis_names[axis] for axis in pair)
+        return next((item for item in self.sample.sets if (item.output, item.base) == (output, base)), None)
+
+    def kept(self, pair: tuple[int, int]) -> ControlSet | None:
+        """Return the set of the control whose numbers and interval a table keeps: unless another interval is stated."""
+        own, stated = self.own_set(pair), self.interval_mm[pair[1]]
+        same = own is not None and (stated is None or Decimal(repr(stated)) == own.interval_mm)
+        return own if same else None
+
+    def free_sets(self) -> list[int]:
+        """Return the sets (0 to 9) that no table of the control's file needs, from ``first_set`` on."""
+        used = {item.index for item in self.sample.sets}
+        return [index for index in range(self.first_set - 1, SETS) if index not in used]
 
 
 def read_mitsubishi_settings(machine: Machine) -> MitsubishiSettings:
-    """Read and check ``[controllers.mitsubishi]``; every key has a default."""
+    """Read and check ``[controllers.mitsubishi]``.
+
+    Every key has a default but ``mode``, which an export needs unless the control's own file is given.
+    """
     section = machine.controller_settings("mitsubishi")
+    sample = read_control_file(section.files("style_from"))
+    mode = section.take("mode", tomlio.choice("incremental", "absolute"), None)
+    absolute = sample.absolute if mode is None else mode == "absolute"
+    if sample.file is not None and absolute != sample.absolute:
+        raise section.fail("mode", f"{mode!r} is stated, but {sample.file.path} has #4000 = {int(not sample.absolute)}")
     settings = MitsubishiSettings(
-        setting_unit_um=section.take("setting_unit_um", tomlio.positive, 1.0),
-        scale=section.take("scale", tomlio.whole(1, 99), 1),
+        setting_unit_um=section.take("setting_unit_um", tomlio.positive, sample.unit_um or 1.0),
+        scale=section.take("scale", tomlio.whole(1, 99), None),
+        absolute=absolute,
         adds=section.take("stores", tomlio.choice("correction", "error"), "correction") == "correction",
-        relative=section.take("relative_errors", tomlio.flag, True),
+        across=section.take("relative_errors", _across, ACROSS),
         interval_mm=_intervals(section),
         loss_mm=take_loss_mm(section),
-        first_number=section.take("first_number", tomlio.whole(FIRST_NUMBER, LAST_NUMBER), FIRST_NUMBER),
-        last_number=section.take("last_number", tomlio.whole(FIRST_NUMBER, LAST_NUMBER), LAST_NUMBER),
+        first_number=section.take("first_number", tomlio.whole(FIRST_NUMBER, MOST_NUMBER), FIRST_NUMBER),
+        last_number=section.take("last_number", tomlio.whole(FIRST_NUMBER, MOST_NUMBER), sample.last_number),
         first_set=section.take("first_set", tomlio.whole(1, SETS), 1),
         axis_names=_names(section),
+        sample=sample,
     )
     if settings.last_number - settings.first_number + 1 < 3 * len(settings.pairs):
         raise section.fail("last_number", f"leaves too few numbers from {settings.first_number} on")
-    if settings.first_set + len(settings.pairs) - 1 > SETS:
+    new = [pair for pair in settings.pairs if settings.own_set(pair) is None]
+    free = settings.free_sets()
+    if len(new) > len(free):
+        others = "".join(f", set {item.index + 1} of {item.base}" for item in sample.others(settings.axis_names))
         raise section.fail(
             "first_set",
-            f"{len(settings.pairs)} sets from {settings.first_set} on go beyond the {SETS} sets of the control; "
-            "relative_errors = false needs 3",
+            f"{len(new)} new sets are needed and {len(free)} of the {SETS} sets of the control are free{others}; state which "
+            'tables are wanted, e.g. relative_errors = ["Y(x)", "X(y)"], or false for positioning alone',
         )
     section.finish()
     return settings
+
+
+#: All tables of one axis as a function of another.
+ACROSS = tuple((output, base) for base in range(3) for output in range(3) if output != base)
+
+
+def _across(value: Any) -> tuple[tuple[int, int], ...]:
+    """True for all tables of one axis as a function of another, false for none, or a list of names."""
+    known = {f"{AXES[output]}({AXES[base].lower()})": (output, base) for output, base in ACROSS}
+    if isinstance(value, bool):
+        return ACROSS if value else ()
+    if not isinstance(value, list) or any(item not in known for item in value) or len(set(value)) < len(value):
+        raise ValueError(f"true, false or a list of {', '.join(map(repr, known))} is expected")
+    return tuple(known[item] for item in value)
 
 
 def _intervals(section: tomlio.Section) -> tuple[float | None, float | None, float | None]:

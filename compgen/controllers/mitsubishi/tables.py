@@ -1,15 +1,16 @@
-"""Numbers of machine error compensation: the set sheet read from text, the curves it means, the limits it must keep.
+"""Numbers of machine error compensation: tables read from text, the curves they mean, the limits they must keep.
 
 Increment system, E60/E68 manual p. II-292 and C64 manual 9.2. On the positive side of the reference point the value of
 point n is (division interval - actual movement) x 2 for a feed from n-1 to n, on the negative side (division interval +
 actual movement) x 2 for a feed from n+1 to n. So with the curve A in units of output, zero at the reference number,
 
     A[n] = A[n-1] + v[n] on the positive side,   A[n] = A[n+1] - v[n] on the negative side.
+
+In the absolute system (#4000 = 0) the value of a point is A itself. That system holds for the sets of all axes.
 """
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,36 +21,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.controllers.base import SourceFile, Usage, coverage_violations
-from compgen.controllers.mitsubishi.settings import (
+from compgen.controllers.mitsubishi.records import (
+    BASE,
     FIRST_NUMBER,
-    HIGHEST_VALUE,
-    LAST_NUMBER,
-    LOWEST_VALUE,
+    INTERVAL,
+    MOST_NUMBER,
+    NEGATIVE,
+    OUTPUT,
+    POSITIVE,
+    REFERENCE,
+    SCALE,
+    SET_STEP,
     SETS,
-    MitsubishiSettings,
+    SYSTEM,
+    Entry,
+    by_number,
+    file_entries,
+    is_parameter_file,
+    sheet_entries,
 )
+from compgen.controllers.mitsubishi.settings import HIGHEST_VALUE, LOWEST_VALUE, MitsubishiSettings
 from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.core.text import one_line
 from compgen.errors import CompgenWarning, InputError
 
-#: No set sheet is anywhere near this long, or has lines of this length.
-MOST_CHARACTERS, MOST_IN_LINE = 1_000_000, 500
-SYSTEM = 4000
-#: Parameters of set k stand at these numbers plus 10 (k - 1).
-BASE, OUTPUT, REFERENCE, NEGATIVE, POSITIVE, SCALE, INTERVAL = range(4001, 4008)
-SET_STEP = 10
-
-_WHOLE = re.compile(r"[+-]?\d{1,9}", re.ASCII)
-_DECIMAL = re.compile(r"\d{1,6}(?:\.\d{1,6})?", re.ASCII)
-
 
 @dataclass(frozen=True)
 class SetTable:
     """One set: the axis ``output`` is corrected as a function of the axis ``base``.
 
-    ``values`` are the numbers as stored for ``first`` ... ``last``; ``reference`` is the number at the reference point.
+    ``values`` are the numbers as stored for ``first`` ... ``last``; ``reference`` is the number at the reference point;
+    ``absolute`` tells how they count; ``index`` is the place of the set, 0 to 9.
     """
 
     base: int
@@ -59,6 +63,8 @@ class SetTable:
     values: tuple[int, ...]
     scale: int
     interval_mm: Decimal
+    absolute: bool = False
+    index: int = 0
 
     @property
     def last(self) -> int:
@@ -70,6 +76,8 @@ class SetTable:
         """Curve A in counts at the numbers ``first`` ... ``last``, zero at the reference number, shape (n,)."""
         at = self.reference - self.first
         values = np.array(self.values, dtype=np.int64)
+        if self.absolute:
+            return values
         above = np.cumsum(values[at + 1 :])
         below = -np.cumsum(values[:at][::-1])[::-1]
         return np.concatenate([below, [0], above]).astype(np.int64)
@@ -91,116 +99,118 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class MitsubishiTables:
-    """All sets of X, Y, Z; ``shortfalls`` is known of tables that were built."""
+    """All sets of X, Y, Z; ``shortfalls`` is known of tables that were built.
+
+    ``others`` are the sets of other axes in a parameter file, as (name, first, last number); ``remarks`` say what reading
+    kept apart and passed over.
+    """
 
     sets: tuple[SetTable, ...]
     shortfalls: tuple[Shortfall, ...] = field(default=(), compare=False)
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One row of the sheet."""
-
-    number: int
-    value: str
-    file: SourceFile
-    line: int
-
-    def fail(self, message: str) -> InputError:
-        """Return the error that points at this row."""
-        return self.file.fail(f"#{self.number}: {message}", self.line)
-
-    def whole(self, low: int, high: int) -> int:
-        """Return the value as a whole number within limits."""
-        if not _WHOLE.fullmatch(self.value) or not low <= int(self.value) <= high:
-            raise self.fail(f"{one_line(self.value)[:30]!r} is given; a whole number from {low} to {high} is due")
-        return int(self.value)
+    others: tuple[tuple[str, int, int], ...] = field(default=(), compare=False)
+    remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
 def values_of(curve: NDArray[np.int64], at: int) -> tuple[int, ...]:
-    """Return the numbers to store for a curve (n,) in counts that is zero at the index ``at``."""
+    """Return the numbers of the increment system for a curve (n,) in counts that is zero at the index ``at``."""
     steps = np.diff(curve)
     return tuple(int(value) for value in (*steps[:at], 0, *steps[at:]))
 
 
-def parse_sheet(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
-    """Read a set sheet; files that end in ``.json`` (the plan beside it) are left out."""
-    sheets = [file for file in files if file.path.suffix.lower() != ".json"]
-    if not sheets:
-        raise InputError("no set sheet is given", file=files[0].path if files else None)
-    entries: dict[int, Entry] = {}
-    for file in sheets:
-        for entry in _entries(file):
-            before = entries.setdefault(entry.number, entry)
-            if before is not entry:
-                raise entry.fail(f"stands here a second time (first in {before.file.path}:{before.line})")
-    if SYSTEM not in entries:
-        raise sheets[0].fail(f"#{SYSTEM} (increment system) is missing", 1)
-    if entries[SYSTEM].whole(0, 1) == 0:
-        raise entries[SYSTEM].fail(
-            "0 is the absolute system, whose values are not documented; only increments are read"
-        )
-    found = [_set_table(settings, entries, number) for number in range(1, SETS + 1)]
-    tables = tuple(table for table in found if table is not None)
-    if not tables:
-        raise sheets[0].fail(f"holds no set of the axes {', '.join(settings.axis_names)} (#4001, #4011, ...)", 1)
-    return MitsubishiTables(tables)
+def parse_tables(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
+    """Read set sheets, or the control's own parameter file; files that end in ``.json`` (the plan) are left out.
 
-
-def _entries(file: SourceFile) -> list[Entry]:
-    """Rows ``#number,value,meaning``; blank lines and lines that begin with '#' and no digit (the header) are skipped."""
-    if len(file.text) > MOST_CHARACTERS:
-        raise file.fail(f"holds {len(file.text)} characters; no set sheet is longer than {MOST_CHARACTERS}", 1)
-    found = []
-    for line, raw in enumerate(file.text.removeprefix("\ufeff").split("\n"), start=1):
-        text = raw.strip(" \t\r")
-        if len(text) > MOST_IN_LINE or not text.isascii():
-            raise file.fail(f"is not a row of a set sheet: {one_line(text[:30])!r} ...", line)
-        if text and not re.match(r"#\s*(?!\d)", text):
-            found.append(_entry(file, line, text))
+    A parameter file beside a sheet must hold the same tables.
+    """
+    texts = [file for file in files if file.path.suffix.lower() != ".json"]
+    if not texts:
+        raise InputError("no set sheet or parameter file is given", file=files[0].path if files else None)
+    own = [file for file in texts if is_parameter_file(file)]
+    sheets = [file for file in texts if not is_parameter_file(file)]
+    if len(own) > 1:
+        raise own[1].fail("a second parameter file; one is expected")
+    if not own:
+        return _sets_of(settings, sheets[0], by_number([entry for file in sheets for entry in sheet_entries(file)]))
+    entries, passed_over = file_entries(own[0])
+    found = _sets_of(settings, own[0], by_number(entries), passed_over)
+    if sheets and parse_tables(settings, sheets).sets != found.sets:
+        raise own[0].fail(f"does not hold the same tables as {sheets[0].path.name} beside it")
     return found
 
 
-def _entry(file: SourceFile, line: int, text: str) -> Entry:
-    cells = [cell.strip() for cell in text.split(",", 2)]
-    number = cells[0].removeprefix("#").strip()
-    if not re.fullmatch(r"\d{1,6}", number, re.ASCII):
-        raise file.fail(f"{one_line(cells[0])[:30]!r} is not the number of a parameter such as #4101", line)
-    if len(cells) < 3:
-        raise file.fail(f"#{number}: number, value and meaning are due, separated by commas (is the file cut?)", line)
-    return Entry(int(number), cells[1], file, line)
+def _sets_of(
+    settings: MitsubishiSettings, file: SourceFile, entries: dict[int, Entry], passed_over: int | None = None
+) -> MitsubishiTables:
+    """Tables of the entries of a sheet, or (``passed_over`` is not None) of a parameter file of the control."""
+    if SYSTEM not in entries:
+        raise file.fail(f"#{SYSTEM} (absolute or increment system) is missing", 1)
+    absolute = entries[SYSTEM].whole(0, 1) == 0
+    if settings.absolute is not None and absolute != settings.absolute:
+        stated = "absolute" if settings.absolute else "incremental"
+        raise entries[SYSTEM].fail(
+            f"{int(not absolute)} is the {'absolute' if absolute else 'increment'} system, but mode = {stated!r} is stated or is "
+            "that of the control's file"
+        )
+    sets, others = [], []
+    for number in range(1, SETS + 1):
+        table, name = _set_table(settings, entries, number, absolute, passed_over is not None)
+        sets += [] if table is None else [table]
+        others += [] if name is None else [(f"set {number} of {name[0]}", *name[1])]
+    if not sets:
+        raise file.fail(f"holds no set of the axes {', '.join(settings.axis_names)} (#4001, #4011, ...)", 1)
+    if passed_over is None:
+        return MitsubishiTables(tuple(sets))
+    system = "absolute values" if absolute else "increments"
+    said = [
+        f"#{SYSTEM} = {int(not absolute)}: {system}; unit: the machine is taken to be metric, the setting unit "
+        f"{settings.setting_unit_um:g} um"
+    ]
+    said += [f"{name}, numbers {first} to {last}: not of the machine file, kept apart" for name, first, last in others]
+    said += [f"passed over: {passed_over} lines that cannot change a table"] if passed_over else []
+    return MitsubishiTables(tuple(sets), others=tuple(others), remarks=tuple(said))
 
 
-def _set_table(settings: MitsubishiSettings, entries: dict[int, Entry], number: int) -> SetTable | None:
-    """Return set ``number`` (1 to 10), None if it is empty or belongs to another axis."""
+def _set_table(
+    settings: MitsubishiSettings, entries: dict[int, Entry], number: int, absolute: bool, is_file: bool
+) -> tuple[SetTable | None, tuple[str, tuple[int, int]] | None]:
+    """Return set ``number`` (1 to 10), None if it is empty; or the name of another axis and the numbers of its set.
+
+    In a parameter file of the control a set without axes is empty, whatever its numbers are.
+    """
     shift = SET_STEP * (number - 1)
     due = {parameter: entries.get(parameter + shift) for parameter in range(BASE, INTERVAL + 1)}
     present = {parameter: entry for parameter, entry in due.items() if entry is not None}
-    if not any(entry.value for entry in present.values()):
-        return None
+    names = [present[parameter].value for parameter in (BASE, OUTPUT) if parameter in present]
+    if not any(names if is_file else [entry.value for entry in present.values()]):
+        return None, None
     first_entry = next(iter(present.values()))
     missing = [f"#{parameter + shift}" for parameter, entry in due.items() if entry is None or not entry.value]
     if missing:
         raise first_entry.file.fail(f"{', '.join(missing)} of set {number} missing", first_entry.line)
-    names = [present[parameter].value for parameter in (BASE, OUTPUT)]
     strange = [name for name in names if name not in settings.axis_names]
     if strange:
-        message = f"set {number} belongs to the axis {one_line(strange[0])[:10]}, not of the machine file: not used"
-        warnings.warn(message, CompgenWarning, stacklevel=5)
-        return None
-    first, last = (present[key].whole(FIRST_NUMBER, LAST_NUMBER) for key in (NEGATIVE, POSITIVE))
-    reference = present[REFERENCE].whole(FIRST_NUMBER, LAST_NUMBER)
+        name = one_line(strange[0])[:10]
+        if not is_file:
+            message = f"set {number} belongs to the axis {name}, not of the machine file: not used"
+            warnings.warn(message, CompgenWarning, stacklevel=6)
+        numbers = [present[key].whole(0, 99999) for key in (NEGATIVE, POSITIVE, REFERENCE)]
+        return None, (name, (min(numbers), max(numbers)))
+    first, last = (present[key].whole(FIRST_NUMBER, MOST_NUMBER) for key in (NEGATIVE, POSITIVE))
+    reference = present[REFERENCE].whole(FIRST_NUMBER, MOST_NUMBER)
     if not first <= reference <= last:
         raise present[REFERENCE].fail(f"the reference number {reference} is none of {first} to {last} of its set")
-    return SetTable(
+    table = SetTable(
         base=settings.axis_names.index(names[0]),
         output=settings.axis_names.index(names[1]),
         reference=reference,
         first=first,
         values=_values(entries, first, last, present[POSITIVE]),
         scale=present[SCALE].whole(0, 99),
-        interval_mm=_interval(present[INTERVAL]),
+        interval_mm=present[INTERVAL].interval_mm(),
+        absolute=absolute,
+        index=number - 1,
     )
+    return table, None
 
 
 def _values(entries: dict[int, Entry], first: int, last: int, who: Entry) -> tuple[int, ...]:
@@ -209,12 +219,6 @@ def _values(entries: dict[int, Entry], first: int, last: int, who: Entry) -> tup
         some = ", ".join(f"#{number}" for number in missing[:5])
         raise who.fail(f"points {first} to {last} are given, {some} ({len(missing)} in all) missing")
     return tuple(entries[number].whole(LOWEST_VALUE, HIGHEST_VALUE) for number in range(first, last + 1))
-
-
-def _interval(entry: Entry) -> Decimal:
-    if not _DECIMAL.fullmatch(entry.value) or not Decimal(entry.value):
-        raise entry.fail(f"{one_line(entry.value)[:30]!r} is given; an interval in mm as a plain decimal number is due")
-    return Decimal(entry.value)
 
 
 def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables) -> list[str]:
@@ -226,7 +230,9 @@ def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: Mit
         found += coverage_violations(machine, table.base, float(start_mm), float(end_mm), what)
         wide = [value for value in table.values if not LOWEST_VALUE <= value <= HIGHEST_VALUE]
         if wide:
-            found.append(f"{what}: the value {wide[0]} lies outside {LOWEST_VALUE} ... {HIGHEST_VALUE}")
+            most = max(map(abs, wide))
+            cure = f"; set scale = {-(-most * table.scale // HIGHEST_VALUE)} or more" if table.absolute else ""
+            found.append(f"{what}: the value {most} lies outside {LOWEST_VALUE} ... {HIGHEST_VALUE}{cure}")
         if table.last > settings.last_number:
             found.append(f"{what}: numbers go up to {table.last}, the last free one is {settings.last_number}")
         if table.scale == 0:
@@ -237,7 +243,15 @@ def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: Mit
         if one.first <= other.last and other.first <= one.last:
             found.append(f"the numbers of {set_name(one)} and {set_name(other)} overlap")
         if (one.base, one.output) == (other.base, other.output):
-            found.append(f"{set_name(one)} stands in two sets")
+            found.append(f"{set_name(one)} is given in two sets")
+    others = [
+        *tables.others,
+        *((f"set {k.index + 1} of {k.base}", *k.span) for k in settings.sample.others(settings.axis_names)),
+    ]
+    for name, first, last in dict.fromkeys(others):
+        for table in tables.sets:
+            if table.first <= last and table.last >= first:
+                found.append(f"the numbers of {set_name(table)} overwrite those of {name}, {first} to {last}")
     missing = [AXES[axis] for axis in range(3) if not any(t.base == t.output == axis for t in tables.sets)]
     found += [f"{letter} has no table of its own position" for letter in missing]
     return found + [shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts > 1.0]
@@ -250,10 +264,11 @@ def set_name(table: SetTable) -> str:
 
 def shortfall_text(settings: MitsubishiSettings, item: Shortfall) -> str:
     """Say that the range of the values keeps a table from what was wanted, and what helps."""
+    count_um = settings.count_mm((item.output, item.base)) / MM_PER_UM
     return (
         f"the table {AXES[item.output]}({AXES[item.base].lower()}) is too steep for {HIGHEST_VALUE} counts of "
-        f"{settings.count_mm / MM_PER_UM:g} um per division: it misses by up to "
-        f"{item.missed_counts * settings.count_mm / MM_PER_UM:.1f} um; a larger scale or a shorter interval_mm is needed"
+        f"{count_um:g} um per division: it misses by up to {item.missed_counts * count_um:.1f} um; a larger scale or a "
+        "shorter interval_mm is needed"
     )
 
 

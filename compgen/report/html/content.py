@@ -57,7 +57,10 @@ def _machine_name(source: ResultFolder) -> str:
             return str(name)
     if source.identified is not None and source.identified.metadata.get("machine"):
         return source.identified.metadata["machine"]
-    return str(source.compare.get("machine", source.accuracy.get("machine", source.folder.resolve().name)))
+    for data in (source.compare, source.accuracy, *(item.result for item in source.controls)):
+        if data.get("machine"):
+            return str(data["machine"])
+    return "Machine without a name"  # a folder's name says nothing about what is in it
 
 
 def _control(item: ControlFolder) -> dict[str, Any]:
@@ -255,7 +258,7 @@ def _provenance(source: ResultFolder) -> dict[str, Any]:
         inputs = source.controls[0].manifest.get("inputs", [])
     inputs = inputs or source.compare.get("inputs", []) or source.accuracy.get("inputs", [])
     programs = {str(item.manifest.get("program", "")) for item in source.controls} - {""}
-    date = source.identified.metadata.get("date", "") if source.identified is not None else ""
+    date = None if source.identified is None else source.identified.metadata.get("date")
     return {
         "tables_made_by": sorted(programs),
         "report_made_by": f"compgen {program_version()}",

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from compgen.core.files import OutputFolder
+from compgen.export import REPORT_FILES
 from compgen.report.html.certificate import calibration_record
 from compgen.report.html.content import content
 from compgen.report.html.curves import Picture, draw_curves, draw_squareness, draw_tables
@@ -22,7 +23,7 @@ from compgen.report.html.tables import TableCurve, table_curves
 from compgen.report.html.volume import draw_slices, draw_space, grid_of
 
 #: The files of a report.
-FILES = ("report.html", "report.json", "dossier.md", "dossier.json", "calibration.json")
+FILES = REPORT_FILES
 Further = Callable[[Mapping[str, Any]], Mapping[str, bytes]]
 
 

@@ -1,0 +1,216 @@
+"""What may change within a session of axis runs: names of the catalogue, and smooth terms without a name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.core.csvio import FloatArray
+from compgen.diagnose.axis_model import GENERIC_HANDICAP, RUN_HANDICAP, Candidate
+from compgen.diagnose.axis_session import AxisSession
+from compgen.diagnose.layout import IntArray
+from compgen.effects import Effect, catalogue
+
+#: Number of positions that count for the time constant of a warm-up (the columns are nearly alike), and for a drift at a
+#: constant rate: as slow as these sessions are, most drifts are the beginning or the end of a warm-up.
+WARMUP_SCANS, LINEAR_SCANS = 2.0, 4.0
+#: Periods of a wave in time, as shares of the session.
+PERIODS = (2.0, 1.0, 2 / 3, 1 / 2, 1 / 3, 1 / 4)
+#: Windows of disturbed readings are looked for in sessions up to this size; beyond it, one reading in several begins one.
+MOST_WINDOWS = 1500
+#: Numbers of readings in a burst that are tried; those up to LONGEST_FREE may each have a value of their own.
+BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
+
+
+def candidates_of(session: AxisSession, only: Sequence[str] = ()) -> list[Candidate]:
+    """Return everything that is compared; ``only`` limits the names."""
+    found = [*_slow(session), *_disturbed(session), *_steps(session), *_logged(session)]
+    found = [c for c in found if not only or c.name in only]
+    return [*found, *_generic(session)]
+
+
+def invisible_of(session: AxisSession) -> tuple[str, ...]:
+    """Names that these runs cannot show: what is equal in every run is part of the curve of the axis."""
+    letter = session.letter
+    hidden = [f"periodic_{letter}"]
+    seen = {candidate.name for candidate in _logged(session)}
+    hidden += [name for name in _logged_names(letter) if name not in seen]
+    if not len(session.both):
+        hidden += [f"backlash_{letter}", f"lost_motion_{letter}"]
+    return tuple(hidden)
+
+
+def _logged_names(letter: str) -> tuple[str, ...]:
+    return (f"thermal_scale_{letter}", f"spindle_growth_{letter}", f"settling_{letter}", f"servo_lag_{letter}")
+
+
+def _candidate(session: AxisSession, effect: Effect, scans: float, text: str = "") -> Candidate | None:
+    columns = effect.columns(session.readings)
+    if columns is None or not np.isfinite(columns).all():
+        return None
+    first, last = (int(effect.settings.get(key, -1)) for key in ("first", "last"))
+    return Candidate(
+        effect.card.name,
+        "named",
+        columns,
+        scans,
+        text or effect.card.title,
+        effect.card.covariates,
+        effect,
+        first,
+        last,
+    )
+
+
+def _slow(session: AxisSession) -> list[Candidate]:
+    known = catalogue()
+    warm = known["warmup_drift"]
+    found = [_candidate(session, warm.at(tau), WARMUP_SCANS) for tau in warm.positions(session.readings)]
+    found.append(_candidate(session, known["linear_drift"], LINEAR_SCANS))
+    return [item for item in found if item is not None]
+
+
+def _steps(session: AxisSession) -> list[Candidate]:
+    step = catalogue()["step_between_runs"]
+    at = (np.flatnonzero(np.diff(session.leg)) + 1).tolist()
+    found = [
+        _candidate(session, step.at(float(k)), _runs(session), f"step before {session.window(k, _leg_end(session, k))}")
+        for k in at
+    ]
+    return [item for item in found if item is not None]
+
+
+def _leg_end(session: AxisSession, first: int) -> int:
+    return int(np.flatnonzero(session.leg == session.leg[first])[-1])
+
+
+def _runs(session: AxisSession) -> float:
+    """Positions that count for a step or a bad run; equal, so that the first run off and a step after it weigh the same."""
+    return float(session.leg.max()) + 1.0
+
+
+def _disturbed(session: AxisSession) -> list[Candidate]:
+    """One run (or one way of it) that is off, and shorter bursts."""
+    bad, burst = catalogue()["bad_run"], catalogue()["disturbed_readings"]
+    runs = {_ends(session.leg == k) for k in range(int(session.leg.max()) + 1)}
+    runs |= {_ends(session.cycle == k) for k in range(int(session.cycle.max()) + 1)}
+    if len(runs) < 2:
+        return []
+    found = []
+    for first, last in sorted(runs):
+        chosen = bad.with_settings({"first": float(first), "last": float(last)})
+        item = _candidate(session, chosen, _runs(session), session.window(first, last))
+        assert item is not None
+        found.append(item)
+        columns = np.zeros((len(session), last - first + 1))
+        columns[np.arange(first, last + 1), np.arange(last - first + 1)] = 1.0
+        found.append(_free(item, columns))
+    n, longest = len(session), int(np.bincount(session.leg).max()) - 1
+    windows = [(k, k + size - 1) for size in BURSTS if size <= longest for k in range(n - size + 1)]
+    windows = windows[:: max(1, len(windows) // MOST_WINDOWS)] if len(windows) > MOST_WINDOWS else windows
+    windows = [window for window in windows if window not in runs]
+    for first, last in windows:
+        item = _candidate(
+            session, burst.with_settings({"first": float(first), "last": float(last)}), len(windows),
+            session.window(first, last),
+        )  # fmt: skip
+        assert item is not None
+        found.append(item)
+        if 1 < last - first + 1 <= LONGEST_FREE:
+            columns = np.zeros((n, last - first + 1))
+            columns[np.arange(first, last + 1), np.arange(last - first + 1)] = 1.0
+            found.append(_free(item, columns))
+    return found
+
+
+def _free(item: Candidate, columns: FloatArray) -> Candidate:
+    """The same readings with a value of their own each."""
+    return Candidate(
+        item.name, "named", columns, item.scans, item.text, item.covariates, item.effect, item.first, item.last, True
+    )
+
+
+def _ends(chosen: NDArray[np.bool_]) -> tuple[int, int]:
+    rows = np.flatnonzero(chosen)
+    return int(rows[0]), int(rows[-1])
+
+
+def _logged(session: AxisSession) -> list[Candidate]:
+    """Effects that need a temperature or a dwell that was logged and changed between repeats."""
+    known, found = catalogue(), []
+    for name in _logged_names(session.letter):
+        effect = known[name]
+        positions = effect.positions(session.readings)
+        every = [effect.at(p) for p in positions] if positions else [effect]
+        for item in (_candidate(session, one, max(len(every), 1)) for one in every):
+            if item is not None and _varies(session, item.columns):
+                found.append(item)
+    return found
+
+
+def _varies(session: AxisSession, columns: FloatArray) -> bool:
+    """Whether something is left of columns beside the means of the cells."""
+    count = np.bincount(session.cell)[:, None]
+    means = np.stack([np.bincount(session.cell, column) for column in columns.T], axis=1) / count
+    return bool(np.linalg.norm(columns - means[session.cell]) > 1e-3 * np.linalg.norm(columns))
+
+
+def _generic(session: AxisSession) -> list[Candidate]:
+    t = session.time - session.time[0]
+    t = 2.0 * t / t[-1] - 1.0
+    s, way = session.s, session.direction.astype(np.float64)
+    found = []
+
+    def add(
+        text: str,
+        covariates: tuple[str, ...],
+        columns: FloatArray,
+        scans: float = 1.0,
+        handicap: float = GENERIC_HANDICAP,
+    ) -> None:
+        columns = columns.reshape(len(session), -1)
+        columns = columns / np.maximum(np.sqrt(np.mean(columns**2, axis=0)), 1e-12)
+        if columns.shape[1] and columns.shape[1] < len(session) // 2 and _varies(session, columns):
+            found.append(Candidate(text, "generic", columns, scans, text, covariates, handicap=handicap))
+
+    add("the readings wander smoothly with time", ("time",), np.column_stack([t, t**2, t**3]))
+    add("the readings wander smoothly with time", ("time",), np.column_stack([t, t**2]))
+    for period in PERIODS:
+        angle = 2 * np.pi * (t + 1) / 2 / period
+        text = f"the readings swing with time, period {period:.2g} of the session"
+        add(text, ("time",), np.column_stack([np.sin(angle), np.cos(angle)]), len(PERIODS))
+    saturating = [-np.expm1(-(t + 1) / 2 / tau) for tau in (0.2, 0.6)]
+    for shape in (t, *saturating):
+        add("the scale of the axis changes with time", ("time", "x"), shape * s, 3)
+        add("the reversal changes with time", ("time", "approach"), shape * way, 3)
+        own = _indicators(session.target)
+        own = own - own.mean(axis=1, keepdims=True)
+        add("each target drifts in its own way", ("time", "x"), shape[:, None] * own, 3)
+    cycles, legs = _indicators(session.cycle), _indicators(session.leg)
+    if cycles.shape[1] > 2:
+        add("every run has a level of its own", ("run",), cycles[:, 1:], handicap=RUN_HANDICAP)
+        add("every run has a slope of its own", ("run", "x"), cycles * s[:, None])
+    if legs.shape[1] > cycles.shape[1]:
+        add("every way of every run has a level of its own", ("run", "approach"), legs[:, 1:], handicap=RUN_HANDICAP)
+    inside = [k for k in range(1, len(session)) if session.leg[k] == session.leg[k - 1]]
+    for k in inside:
+        add(f"jump within {_way(session, k)}, before {session.place(k)}", ("time",), _from(session, k), len(inside))
+    for k in (np.flatnonzero(np.diff(session.leg)) + 1).tolist():
+        legs_count = int(session.leg.max())
+        add(f"the scale changes at {session.place(k)}", ("time", "x"), _from(session, k) * s, legs_count)
+        add(f"the reversal changes at {session.place(k)}", ("time", "approach"), _from(session, k) * way, legs_count)
+    return found
+
+
+def _from(session: AxisSession, k: int) -> FloatArray:
+    return (np.arange(len(session)) >= k).astype(np.float64)
+
+
+def _way(session: AxisSession, k: int) -> str:
+    return f"run {session.run[k]} {'up' if session.direction[k] > 0 else 'down'}"
+
+
+def _indicators(number: IntArray) -> FloatArray:
+    return np.asarray(np.eye(int(number.max()) + 1)[number])

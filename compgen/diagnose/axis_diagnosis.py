@@ -1,0 +1,909 @@
+"""Diagnosis of axis runs (ISO 230-2): what changed during the session, what the reversal is, and figures without the former.
+
+First what changes with time, from the scatter within the cells (one target in one direction), in which everything static
+cancels. Then the reversal, from the means of the cells, with the noise and the changes found before. What changed with
+time is taken off the readings in one piece, and B, M, E, R and A follow from the same readings before and after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from scipy import stats
+
+from compgen.accuracy import positioning_test, run_statistics
+from compgen.core.axis_runs import AxisRuns
+from compgen.core.csvio import FloatArray, format_csv
+from compgen.core.error_table import ErrorTable
+from compgen.core.files import read_text
+from compgen.core.machine import Machine
+from compgen.core.names import AXES, ERROR_NAMES, MM_PER_UM
+from compgen.core.threads import one_thread
+from compgen.diagnose.axis_candidates import candidates_of, invisible_of
+from compgen.diagnose.axis_model import LEAST_GAIN, LEAST_MM, Candidate, NoiseGrid, Search
+from compgen.diagnose.axis_session import ORDER_TEXTS, AxisSession, Order, sessions_of
+from compgen.diagnose.layout import IntArray
+from compgen.effects import Effect, active_effects, catalogue, section_text
+from compgen.effects.what_to_do import what_to_do
+from compgen.errors import InputError
+
+Grade = Literal["confirmed", "beside_unknown", "tentative"]
+Show = Callable[[str], None]
+
+#: What statistics cannot tell.
+WARM_UP_NOTE = (
+    "a warm-up of the machine and one of the sensor look alike: only a stationary drift test tells them apart"
+)
+#: Figures that are shown: reversal, its mean, systematic deviations, repeatability and accuracy, um.
+SHOWN = ("B", "M", "E", "R", "A")
+#: Readings beside the means of the targets, and beside those of the cells, below which nothing is said.
+LEAST_FREEDOM, LEAST_REPEATS = 20, 8
+#: p-value of backlash, and of a reversal that varies along the axis.
+REVERSAL_P = 2e-3
+#: The smooth part must explain this share of a reversal that varies, else its law is not known.
+SMOOTH_SHARE = 0.7
+#: Names within this of the best criterion are reported as alternatives (99 %).
+ALIAS = 9.2
+#: A name that explains less than this share of what has no name is tentative.
+LEAST_SHARE = 0.5
+#: An effect must not depend on position, direction or time by more than this share of itself.
+UNEVEN_SHARE, UNEVEN_P = 0.05, 1e-3
+#: A warm-up with a time constant beyond this share of the session has hardly begun to level off.
+HARDLY_LEVELS = 1.5
+#: Effects whose readings are left out of the figures; all other changes are taken off.
+LEFT_OUT = ("bad_run", "disturbed_readings")
+#: Effects of the machine that a machine file keeps; a warm-up of one session is not among them.
+MACHINE_EFFECTS = ("thermal_scale", "spindle_growth", "servo_lag")
+
+
+@dataclass(frozen=True)
+class AxisEffect:
+    """A named effect: parameters as (value, u) by name in the unit of the name; ``shift_mm`` (n,) is what it adds.
+
+    ``left_out`` are readings (numbers in time) that are of no use because of it.
+    """
+
+    name: str
+    grade: Grade
+    text: str
+    parameters: Mapping[str, tuple[float, float | None]]
+    alias: tuple[tuple[str, float], ...]
+    gain: float
+    p: float
+    reasons: tuple[str, ...]
+    shift_mm: FloatArray
+    left_out: IntArray
+    static: bool
+    effect: Effect
+    values: FloatArray
+    homogeneity_p: float = 1.0
+
+
+@dataclass(frozen=True)
+class AxisUnknown:
+    """Something without a name, in words, what it depends on, its RMS, and the name that it resembles, if any."""
+
+    text: str
+    covariates: tuple[str, ...]
+    rms_mm: float
+    resembles: str = ""
+
+
+@dataclass(frozen=True)
+class AxisFindings:
+    """What was found on one axis; ``phi`` is the correlation of neighbouring readings, ``sigma_mm`` their scatter."""
+
+    session: AxisSession
+    effects: tuple[AxisEffect, ...]
+    unknown: tuple[AxisUnknown, ...]
+    invisible: tuple[str, ...]
+    sigma_mm: float
+    phi: float
+    noise_source: str
+    removed_mm: FloatArray
+    left_out: IntArray
+    taken_off: tuple[str, ...]
+    figures: Mapping[str, Mapping[str, float]]
+    residual_before_mm: FloatArray
+    residual_after_mm: FloatArray
+    held_out: tuple[float, float] | None
+    suspects: tuple[tuple[str, float], ...]
+    notes: tuple[str, ...]
+    against: Mapping[str, Any] | None = None
+
+    @property
+    def word(self) -> str:
+        """Verdict on this axis."""
+        if any(item.grade != "tentative" for item in self.effects):
+            return "named"
+        return "unknown" if self.unknown or self.effects else "none"
+
+
+def check_axis_names(machine: Machine, runs: AxisRuns, names: Sequence[str]) -> None:
+    """Raise InputError for names that no axis run can show."""
+    letters = {AXES[axis] for axis in runs.axes}
+    known = [
+        name for name, effect in catalogue().items()
+        if "axis" in effect.card.kinds and (name[-2:-1] != "_" or name[-1] in letters)
+    ]  # fmt: skip
+    for name in names:
+        if name not in known:
+            raise InputError(f"{name!r} cannot be added to this measurement; possible are {', '.join(sorted(known))}")
+
+
+def findings_of(
+    machine: Machine,
+    runs: AxisRuns,
+    *,
+    order: Order = "auto",
+    most: int = 4,
+    only: Sequence[str] = (),
+    add: Sequence[str] = (),
+    u_um: float | None = None,
+    against: ErrorTable | None = None,
+    show: Show = lambda _: None,
+) -> list[AxisFindings]:
+    """Diagnose every axis by itself.
+
+    Parameters
+    ----------
+    machine, runs : the machine and its runs.
+    order : where the order of time comes from.
+    most : most changes with time at once.
+    only : names to look for; default all.
+    add : names that are added whether they were found or not.
+    u_um : standard uncertainty of a reading; used where nothing was repeated.
+    against : errors that the mean curve is compared with.
+    """
+    check_axis_names(machine, runs, add)
+    if u_um is not None and not u_um > 0:
+        raise InputError(f"an uncertainty of {u_um:g} um was given; it must be above zero")
+    found = []
+    for session in sessions_of(machine, _without_known(machine, runs, order), order):
+        freedom = len(session) - len(session.targets_mm)
+        if freedom < LEAST_FREEDOM:
+            raise InputError(
+                f"{session.letter}: {len(session)} readings leave {freedom} degrees of freedom beside the mean of every "
+                f"target; a diagnosis needs at least {LEAST_FREEDOM}: measure more runs"
+            )
+        show(f"comparing what may change along {session.letter}")
+        with one_thread():
+            found.append(_findings(session, most, only, add, u_um, against))
+    return found
+
+
+def _without_known(machine: Machine, runs: AxisRuns, order: Order) -> AxisRuns:
+    """Take off what the effects of the machine file say."""
+    value = runs.deviation_mm.copy()
+    active = active_effects(machine)
+    if active:
+        for session in sessions_of(machine, runs, order):
+            for item in active:
+                change = item.change_mm(session.readings)
+                if change is not None:
+                    value[session.row] -= change
+    return replace(runs, deviation_mm=value)
+
+
+def _findings(
+    session: AxisSession,
+    most: int,
+    only: Sequence[str],
+    add: Sequence[str],
+    u_um: float | None,
+    against: ErrorTable | None,
+) -> AxisFindings:
+    names = (*only, *add) if only else ()
+    grid = NoiseGrid(session)
+    repeated = session.repeated and grid.freedom >= LEAST_REPEATS
+    search = Search(session, grid, candidates_of(session, names) if repeated else [])
+    members = search.run(most) if repeated else []
+    members = _added(search, members, add)
+    changes = _Changes(search, members)
+    source = "repeats" if repeated else "stated" if u_um is not None else "assumed"
+    reversal = _Reversal(changes, None if repeated else u_um)
+    generic = [k for k in members if search.candidates[k].tier == "generic"]
+    unknown = [_unknown_of(changes, k) for k in generic]
+    if len(members) >= most > 0 and search.criteria(members)[1].max() >= LEAST_GAIN:
+        unknown.append(AxisUnknown(f"more than {most} changes: the session does not repeat", ("time", "run"), np.nan))
+    effects = [_change(changes, k, generic) for k in members if k not in generic]
+    bad = [item for item in effects if item.name == "bad_run"]
+    if len(bad) > 1:
+        effects = [
+            _doubted(item, "more than one run is off, so the runs do not repeat") if item.name == "bad_run" else item
+            for item in effects
+        ]
+        unknown.append(AxisUnknown("the runs do not repeat: more than one of them is off", ("run",), np.nan, "bad_run"))
+    static, irregular = reversal.found(names, add, source)
+    if any({"time", "approach"} <= set(item.covariates) for item in unknown):
+        static = [_doubted(item, "the reversal changes with time") for item in static]
+    unknown += irregular
+    effects = [*sorted(effects, key=lambda item: -item.gain), *static]
+    if unknown:
+        effects = [replace(e, grade="beside_unknown") if e.grade == "confirmed" else e for e in effects]
+    if not unknown and effects and all(e.grade == "tentative" for e in effects) and repeated:
+        first = effects[0]
+        unknown = [AxisUnknown(f"resembles {first.name} but {first.reasons[0]}", (), np.nan, first.name)]
+    removed, left_out, taken, figures, notes = _taken_off(session, effects)
+    before, after = _residuals(session, grid, effects)
+    return AxisFindings(
+        session, tuple(effects), tuple(unknown), invisible_of(session),
+        changes.sigma_mm if repeated else reversal.sigma_mm, changes.phi if repeated else 0.0, source,
+        removed, left_out, taken, figures, before, after, _held_out(session, effects, left_out),
+        _suspects(search) if repeated else (), tuple(notes),
+        None if against is None else _compared(changes, against),
+    )  # fmt: skip
+
+
+def _doubted(item: AxisEffect, reason: str) -> AxisEffect:
+    return replace(item, grade="tentative", reasons=(*item.reasons, reason))
+
+
+def _added(search: Search, members: list[int], add: Sequence[str]) -> list[int]:
+    """Members with the best position of every name that the user wants."""
+    for name in add:
+        own = [k for k, c in enumerate(search.candidates) if c.name == name]
+        if own and not any(search.candidates[k].name == name for k in members):
+            criteria = search.criteria(members)[1]
+            members = [*members, max(own, key=lambda k: criteria[k])]
+    return members
+
+
+class _Changes:
+    """The chosen changes with time, fitted beside the means of the cells, weighted over the grid of noise."""
+
+    def __init__(self, search: Search, members: Sequence[int]) -> None:
+        self.search, self.members, self.session = search, list(members), search.session
+        self.grid = search.grid
+        self.columns = search.columns_of(members)
+        if self.grid.freedom - self.columns.shape[1] < 1:
+            self.weights = np.zeros(len(self.grid.points))
+            self.weights[0], self.freedom, self.sigma_mm, self.phi = 1.0, 0, float("nan"), 0.0
+            self.square = np.full(len(self.grid.points), np.nan)
+            return
+        self.square = search.square(search.state(members)[0])
+        self.weights = self.grid.weights(self.square)
+        self.freedom = max(self.grid.freedom - self.columns.shape[1], 1)
+        self.sigma_mm = float(np.sqrt(self.weights @ self.square / self.freedom))
+        points = np.array(self.grid.points)
+        self.phi = float(self.weights @ (points[:, 0] * (1.0 - points[:, 1])))
+
+    def estimate(self, columns: FloatArray, extra: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Values and covariance of ``extra`` (n, k) beside ``columns`` (n, m), both weighted over the grid."""
+        design = np.hstack([columns, extra])
+        value, square, total = np.zeros(extra.shape[1]), np.zeros((extra.shape[1],) * 2), []
+        for weight, own, rss in zip(self.weights, self.grid.inverse, self.square, strict=True):
+            if weight < 1e-4:
+                continue
+            middle = design.T @ own @ design
+            inverse = np.linalg.pinv(middle, rcond=1e-10, hermitian=True)
+            fitted = (inverse @ (design.T @ own @ self.search.y))[-extra.shape[1] :]
+            value += weight * fitted
+            square += weight * inverse[-extra.shape[1] :, -extra.shape[1] :] * rss / max(self.freedom, 1)
+            total.append((weight, fitted))
+        square += sum(w * np.outer(f - value, f - value) for w, f in total)
+        return value, square
+
+
+def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffect:
+    """Grade and parameters of a named change with time."""
+    search, session = changes.search, changes.session
+    item = search.candidates[member]
+    assert item.effect is not None
+    rest = [k for k in changes.members if k != member]
+    gains, criteria = search.criteria(rest)
+    alias = _alias(search, criteria, member)
+    values, covariance = changes.estimate(np.hstack([changes.grid.cells, search.columns_of(rest)]), item.columns)
+    shift = item.columns @ values
+    reasons, p = [], 1.0
+    lost = item.name in LEFT_OUT
+    if not lost and item.columns.shape[1] == 1:
+        p, share = _uneven(changes, member, shift)
+        if p < UNEVEN_P and share > UNEVEN_SHARE:
+            reasons.append(f"does not behave like it at all positions, directions and times (p = {p:.1e})")
+    unnamed = sum(float(search.criteria([k for k in changes.members if k != g])[0][g]) for g in generic)
+    if unnamed and gains[member] < LEAST_SHARE * unnamed:
+        reasons.append("small beside what has no name")
+    own = np.array([float(values.mean())]) if item.free else values
+    u = np.sqrt(np.diag(covariance))
+    first = float(np.mean(u)) if item.free else float(u[0])
+    parameters: dict[str, tuple[float, float | None]] = {
+        parameter.name: (float(v) / parameter.si_per_unit, first / parameter.si_per_unit)
+        for parameter, v in zip(item.effect.card.parameters, own, strict=False)
+    }
+    parameters |= {key: (value, None) for key, value in item.effect.used(session.readings).items()}
+    window = np.arange(item.first, item.last + 1) if lost else np.zeros(0, dtype=np.int64)
+    return AxisEffect(
+        item.name, "tentative" if reasons else "confirmed", _text(session, item, parameters, alias), parameters, alias,
+        float(gains[member]), float(stats.chi2.sf(gains[member], item.columns.shape[1])), tuple(reasons), shift, window,
+        False, item.effect, own, p,
+    )  # fmt: skip
+
+
+def _alias(search: Search, criteria: FloatArray, member: int) -> tuple[tuple[str, float], ...]:
+    """Names that explain the readings nearly as well in place of a member, with their weights."""
+    best: dict[str, float] = {}
+    for k, candidate in enumerate(search.candidates):
+        if candidate.tier == "named" and criteria[member] - criteria[k] < ALIAS:
+            best[candidate.name] = max(best.get(candidate.name, -np.inf), float(criteria[k]))
+    weights = {name: float(np.exp(0.5 * (value - criteria[member]))) for name, value in best.items()}
+    total = sum(weights.values())
+    own = search.candidates[member].name
+    ranked = sorted(weights.items(), key=lambda entry: (-entry[1], entry[0] != own))
+    return tuple((name, value / total) for name, value in ranked if value / total >= 0.01 or name == own)
+
+
+def _uneven(changes: _Changes, member: int, shift: FloatArray) -> tuple[float, float]:
+    """p-value that an effect depends on position, direction or time, and the share of it that does."""
+    session = changes.session
+    half = np.where(session.time > np.median(session.time), 1.0, -1.0)
+    unit = shift / max(float(np.abs(shift).max()), 1e-12)
+    columns = np.hstack([changes.grid.cells, changes.columns])
+    extra = np.column_stack([unit * session.s, unit * session.direction, unit * half])
+    beside = extra - columns @ np.linalg.lstsq(columns, extra, rcond=None)[0]
+    extra = extra[:, np.linalg.norm(beside, axis=0) > 0.05 * np.linalg.norm(extra, axis=0)]
+    count = extra.shape[1]
+    if not count or changes.freedom < count + 6:
+        return 1.0, 0.0
+    value, covariance = changes.estimate(columns, extra)
+    wald = float(value @ np.linalg.pinv(covariance, rcond=1e-8, hermitian=True) @ value) / count
+    own = (extra - columns @ np.linalg.lstsq(columns, extra, rcond=None)[0]) @ value
+    share = float(np.sum((own - own.mean()) ** 2) / max(np.sum((shift - shift.mean()) ** 2), 1e-18))
+    return float(stats.f.sf(wald, count, changes.freedom - count)), share
+
+
+def _text(
+    session: AxisSession,
+    item: Candidate,
+    parameters: Mapping[str, tuple[float, float | None]],
+    alias: Sequence[tuple[str, float]],
+) -> str:
+    """Say in words what was found."""
+    size = next((value for key, (value, _) in parameters.items() if key.startswith("c")), float("nan"))
+    span = float(session.time[-1] - session.time[0])
+    if item.name == "warmup_drift":
+        tau = parameters["tau"][0]
+        cycles = tau / session.cycle_span
+        unit = f"{tau:.3g} s" if session.timed else f"{tau:.3g} readings"
+        inside = size * -np.expm1(-span / tau)
+        text = (
+            f"the readings {'rise' if size > 0 else 'fall'} by {abs(inside):.3g} um during the session and level off: "
+            f"{size:+.3g} um in the end, time constant {unit} ({cycles:.2g} runs there and back); machine or sensor"
+        )
+        if tau > HARDLY_LEVELS * span:
+            text += "; it has hardly begun to level off, so that its end is extrapolated"
+        return text
+    if item.name == "linear_drift":
+        return (
+            f"the readings drift by {size:+.3g} um from the first to the last; machine or sensor cannot be told apart"
+        )
+    if item.name == "step_between_runs":
+        return (
+            f"all readings from {item.text.removeprefix('step before ')} on are {size:+.3g} um off against those before"
+        )
+    if item.name == "bad_run":
+        return f"{item.text} is {size:+.3g} um off against all others"
+    if item.name == "disturbed_readings":
+        return f"disturbed readings {item.text}: {size:+.3g} um against their repeats"
+    return item.text
+
+
+def _unknown_of(changes: _Changes, member: int) -> AxisUnknown:
+    """A smooth term without a name, and the name that comes nearest to it."""
+    search = changes.search
+    item = search.candidates[member]
+    rest = [k for k in changes.members if k != member]
+    values, _ = changes.estimate(np.hstack([changes.grid.cells, search.columns_of(rest)]), item.columns)
+    shift = item.columns @ values
+    means = np.bincount(changes.session.cell, shift) / np.bincount(changes.session.cell)
+    gains = search.criteria(rest)[0]
+    named = [k for k, c in enumerate(search.candidates) if c.tier == "named" and not c.free]
+    nearest = max(named, key=lambda k: gains[k], default=None)
+    resembles = ""
+    if nearest is not None and gains[nearest] > 0.3 * gains[member]:
+        resembles = search.candidates[nearest].name
+    return AxisUnknown(
+        item.text, item.covariates, float(np.sqrt(np.mean((shift - means[changes.session.cell]) ** 2))), resembles
+    )
+
+
+class _Reversal:
+    """Half the difference of both directions at every target, with its covariance, beside the changes with time."""
+
+    def __init__(self, changes: _Changes, u_um: float | None) -> None:
+        self.changes, self.session = changes, changes.session
+        session = self.session
+        self.targets = session.both
+        self.known = changes.freedom >= LEAST_REPEATS
+        self.sigma_mm = changes.sigma_mm
+        self.half = np.zeros(0)
+        if not len(self.targets):
+            return
+        self.s = session.s[[int(np.flatnonzero(session.target == k)[0]) for k in self.targets]]
+        if self.known:
+            base = np.eye(len(session.targets_mm))[session.target]
+            one_way = [k for k in range(base.shape[1]) if k not in self.targets]
+            extra = np.eye(len(session.targets_mm))[session.target][:, self.targets] * session.direction[:, None]
+            assert not one_way or base.shape[1]
+            self.half, self.covariance = changes.estimate(np.hstack([base, changes.columns]), extra)
+            self.freedom = changes.freedom
+            return
+        up, down = (
+            np.array(
+                [session.deviation_mm[(session.target == k) & (session.direction == way)].mean() for k in self.targets]
+            )
+            for way in (1, -1)
+        )
+        self.half = 0.5 * (up - down)
+        shape = self._shapes(2)
+        left = self.half - shape @ np.linalg.lstsq(shape, self.half, rcond=None)[0]
+        self.freedom = max(len(self.half) - shape.shape[1], 1)
+        own = max(float(np.sqrt(left @ left / self.freedom)), LEAST_MM)
+        if u_um is not None:
+            own, self.freedom = u_um * MM_PER_UM / 2.0**0.5, 10_000
+        self.sigma_mm = own * 2.0**0.5
+        self.covariance = np.eye(len(self.half)) * own**2
+
+    def _shapes(self, degree: int) -> FloatArray:
+        degree = min(degree, len(self.s) - 1)
+        return np.asarray(np.polynomial.legendre.legvander(self.s, degree))
+
+    def _fit(self, shapes: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Coefficients, covariance and chi-square that is left."""
+        inverse = np.linalg.pinv(self.covariance, rcond=1e-10, hermitian=True)
+        covariance = np.linalg.pinv(shapes.T @ inverse @ shapes, rcond=1e-12, hermitian=True)
+        value = np.asarray(covariance @ (shapes.T @ inverse @ self.half))
+        left = self.half - shapes @ value
+        return value, np.asarray(covariance), float(left @ inverse @ left)
+
+    def _p(self, chi2: float, count: int) -> float:
+        return float(stats.f.sf(chi2 / count, count, self.freedom)) if count > 0 else 1.0
+
+    def found(self, only: Sequence[str], add: Sequence[str], source: str) -> tuple[list[AxisEffect], list[AxisUnknown]]:
+        """Backlash and lost motion, and a reversal that follows no law."""
+        backlash, lost = f"backlash_{self.session.letter}", f"lost_motion_{self.session.letter}"
+        if not len(self.targets):
+            return [], []
+        count = len(self.targets)
+        inverse = np.linalg.pinv(self.covariance, rcond=1e-10, hermitian=True)
+        everything = float(self.half @ inverse @ self.half)
+        constant, _, left_0 = self._fit(self._shapes(0))
+        smooth, covariance, left_2 = self._fit(self._shapes(2))
+        varies = min(self._p(left_0 - left_2, len(smooth) - 1), self._p(left_0, count - 1)) < 0.5 * REVERSAL_P
+        irregular = count > 3 and self._p(left_2, count - len(smooth)) < 0.5 * REVERSAL_P
+        law = left_0 - left_2 >= SMOOTH_SHARE * left_0
+        reasons = ("the noise is assumed, not measured",) if source == "assumed" else ()
+        effects, unknown = [], []
+        varies = (varies and (not only or lost in only)) or lost in add
+        if varies:
+            why = reasons if law or not irregular else (*reasons, "it follows no smooth law along the axis")
+            effects.append(self._lost_motion(lost, smooth, covariance, left_0, why, exact=not irregular))
+        if irregular and (not varies or not law):
+            rest = self.half - self._shapes(2) @ smooth
+            text = "the reversal differs from target to target without a smooth law"
+            size = float(np.sqrt(np.mean(rest**2)))
+            unknown.append(AxisUnknown(text, ("x", "approach"), size, lost if varies else ""))
+        if (
+            self._constant(varies, smooth, covariance, everything - left_0, irregular)
+            and (not only or backlash in only)
+        ) or (backlash in add):
+            mean = smooth[:1] if varies else constant
+            effects.append(self._backlash(backlash, mean, covariance[:1, :1], everything - left_0, reasons))
+        return effects, unknown
+
+    def _constant(self, varies: bool, smooth: FloatArray, covariance: FloatArray, gain: float, irregular: bool) -> bool:
+        """Whether there is a backlash: a reversal of one sign that is not the mean of one that begins at zero at an end."""
+        if irregular:  # then the scatter from target to target is the noise of the mean
+            spread = self.half.std(ddof=1) / np.sqrt(len(self.half))
+            p = 2.0 * float(stats.t.sf(abs(self.half.mean()) / max(spread, 1e-12), len(self.half) - 1))
+            if p > 0.02:
+                return False
+        if not varies:
+            return self._p(gain, 1) < REVERSAL_P
+        if self._p(float(smooth[0] ** 2 / covariance[0, 0]), 1) >= REVERSAL_P:
+            return False
+        ends = np.polynomial.legendre.legvander(np.array([-1.0, 1.0]), len(smooth) - 1)
+        at = ends @ smooth
+        u = np.sqrt(np.einsum("ij,jk,ik->i", ends, covariance, ends))
+        return bool(np.all(np.abs(at) > 2.5 * u)) and bool(
+            np.prod(np.sign(at)) > 0 or abs(smooth[0]) > np.abs(at).min()
+        )
+
+    def _backlash(
+        self, name: str, mean: FloatArray, covariance: FloatArray, gain: float, reasons: tuple[str, ...]
+    ) -> AxisEffect:
+        c, u = float(mean[0]) / MM_PER_UM, float(np.sqrt(covariance[0, 0])) / MM_PER_UM
+        text = f"reversal of {2 * c:+.3g} um (mean of up less down)"
+        return self._effect(name, text, {"c_um": (c, u)}, gain, reasons, self.session.direction * mean[0], mean)
+
+    def _lost_motion(
+        self,
+        name: str,
+        smooth: FloatArray,
+        covariance: FloatArray,
+        gain: float,
+        reasons: tuple[str, ...],
+        *,
+        exact: bool,
+    ) -> AxisEffect:
+        um, u = smooth / MM_PER_UM, np.sqrt(np.diag(covariance)) / MM_PER_UM
+        low, high = self.session.targets_mm[[0, -1]]
+        ends = 2 * np.polynomial.legendre.legvander(np.array([-1.0, 1.0]), len(smooth) - 1) @ um
+        text = f"the reversal varies along the axis: {ends[0]:+.3g} um at {low:g} mm, {ends[1]:+.3g} um at {high:g} mm"
+        parameters: dict[str, tuple[float, float | None]] = {
+            f"c{k}_um": (float(um[k]), float(u[k])) for k in range(1, len(um))
+        }
+        shape = np.polynomial.legendre.legvander(self.session.s, len(smooth) - 1)
+        shift = self.session.direction * (shape[:, 1:] @ smooth[1:])
+        found = self._effect(name, text, parameters, gain, reasons, shift, smooth)
+        return found if exact else replace(found, homogeneity_p=0.0)
+
+    def _effect(
+        self,
+        name: str,
+        text: str,
+        parameters: Mapping[str, tuple[float, float | None]],
+        gain: float,
+        reasons: tuple[str, ...],
+        shift: FloatArray,
+        values: FloatArray,
+    ) -> AxisEffect:
+        nothing = np.zeros(0, dtype=np.int64)
+        return AxisEffect(
+            name, "tentative" if reasons else "confirmed", text, parameters, ((name, 1.0),), gain,
+            float(stats.chi2.sf(gain, 1)), reasons, shift, nothing, True, catalogue()[name], values,
+        )  # fmt: skip
+
+
+def figures_of(session: AxisSession, deviation_mm: FloatArray, kept: IntArray) -> dict[str, float]:
+    """B, M, E, R, A of some readings in um, as far as they show them."""
+    try:
+        test = positioning_test(
+            run_statistics(session.position_mm[kept], session.direction[kept].astype(np.float64), deviation_mm[kept])
+        )
+    except InputError:
+        return {}
+    figures = test.figures
+    if not len(session.both):
+        figures = {key.partition("_")[0]: value for key, value in figures.items()}
+    return {key: float(figures[key].value) for key in SHOWN if key in figures}
+
+
+def _taken_off(
+    session: AxisSession, effects: Sequence[AxisEffect]
+) -> tuple[FloatArray, IntArray, tuple[str, ...], dict[str, dict[str, float]], list[str]]:
+    """What is taken off each reading, which are left out, the names, and the figures before and after.
+
+    An effect without which R or A would be larger is not taken off: a small one can do that by chance.
+    """
+    everything = np.arange(len(session))
+    before = figures_of(session, session.deviation_mm, everything)
+    wanted = sorted((e for e in effects if not e.static and e.grade != "tentative"), key=lambda e: -e.gain)
+    kept_effects = list(wanted)
+    notes: list[str] = []
+    while True:
+        left_out = _left_out(session, kept_effects)
+        removed = np.zeros(len(session))
+        for item in kept_effects:
+            if not len(item.left_out) or not np.isin(item.left_out, left_out).all():
+                removed = removed + item.shift_mm
+        kept = np.setdiff1d(everything, left_out)
+        after = figures_of(session, session.deviation_mm - removed, kept)
+        grows = [key for key in ("R", "A") if after.get(key, 0.0) > before.get(key, np.inf) * (1 + 1e-9)]
+        if not kept_effects or (after and not grows):
+            break
+        item = kept_effects.pop()
+        notes.append(
+            f"{item.name} is named but not taken off: {' and '.join(grows) or 'the figures'} would not improve"
+        )
+    figures = {key: {"before": before[key], "after": after.get(key, before[key])} for key in before}
+    return removed, left_out, tuple(item.name for item in kept_effects), figures, notes
+
+
+def _left_out(session: AxisSession, effects: Sequence[AxisEffect]) -> IntArray:
+    """Readings that are left out; none of a cell that would keep fewer than two."""
+    chosen: IntArray = np.zeros(0, dtype=np.int64)
+    for item in effects:
+        trial = np.union1d(chosen, item.left_out).astype(np.int64)
+        rest = np.bincount(np.delete(session.cell, trial), minlength=int(session.cell.max()) + 1)
+        if not len(item.left_out) or rest.min() >= 2:
+            chosen = trial
+    return chosen
+
+
+def _residuals(session: AxisSession, grid: NoiseGrid, effects: Sequence[AxisEffect]) -> tuple[FloatArray, FloatArray]:
+    """Readings less the means of their targets, without and with the effects, (n,)."""
+    base = np.eye(len(session.targets_mm))[session.target]
+
+    def freed(values: FloatArray) -> FloatArray:
+        means = np.linalg.lstsq(base, values, rcond=None)[0]
+        return np.asarray(values - base @ means)
+
+    shift = sum((item.shift_mm for item in effects), np.zeros(len(session)))
+    return freed(session.deviation_mm), freed(session.deviation_mm - shift)
+
+
+def _held_out(session: AxisSession, effects: Sequence[AxisEffect], left_out: IntArray) -> tuple[float, float] | None:
+    """RMS of readings predicted from the others, without and with the changes that predict; one repeat of each cell in turn."""
+    changes = [item for item in effects if not item.static and not len(item.left_out)]
+    if not changes or not session.repeated:
+        return None
+    kept = np.setdiff1d(np.arange(len(session)), left_out)
+    columns = np.column_stack([item.shift_mm for item in changes])[kept]
+    y, cell = session.deviation_mm[kept], session.cell[kept]
+    number = np.array([np.count_nonzero(cell[:k] == cell[k]) for k in range(len(cell))])
+    fold = (number + session.target[kept]) % max(int(number.max()) + 1, 2)
+    squares: list[tuple[float, float]] = []
+    for k in np.unique(fold):
+        test = (fold == k) & np.isin(cell, cell[fold != k])
+        train = fold != k
+        base = np.eye(int(session.cell.max()) + 1)[cell]
+        for_both = []
+        for design in (base, np.hstack([base, columns / np.abs(columns).max()])):
+            value = np.linalg.lstsq(design[train], y[train], rcond=None)[0]
+            for_both.append(float(np.sum((y[test] - design[test] @ value) ** 2)))
+        squares.append((for_both[0], for_both[1]))
+    total = np.sum(squares, axis=0) / len(kept)
+    return float(np.sqrt(total[0])), float(np.sqrt(total[1]))
+
+
+def _suspects(search: Search) -> tuple[tuple[str, float], ...]:
+    """Names by what each explains by itself."""
+    gains = search.criteria([])[0]
+    best: dict[str, float] = {}
+    for candidate, gain in zip(search.candidates, gains, strict=True):
+        if candidate.tier == "named" and not candidate.free:
+            best[candidate.name] = max(best.get(candidate.name, 0.0), float(gain))
+    return tuple(sorted(best.items(), key=lambda item: -item[1]))
+
+
+def _compared(changes: _Changes, errors: ErrorTable) -> dict[str, Any]:
+    """The mean curve against predicted errors: RMS of the difference without its mean, and whether it is more than noise."""
+    session = changes.session
+    name = f"E{session.letter}{session.letter}"
+    predicted = errors.at(session.readings.position_mm)[:, ERROR_NAMES.index(name)]
+    base = np.eye(len(session.targets_mm))[session.target]
+    reversal = session.direction[:, None] * base[:, session.both]
+    curve, covariance = changes.estimate(np.hstack([changes.columns, reversal]), base)
+    at = [int(np.flatnonzero(session.target == k)[0]) for k in range(base.shape[1])]
+    difference = curve - predicted[at]
+    middle = np.eye(len(curve)) - 1.0 / len(curve)
+    difference = middle @ difference
+    chi2 = float(difference @ np.linalg.pinv(middle @ covariance @ middle, rcond=1e-8, hermitian=True) @ difference)
+    p = float(stats.chi2.sf(chi2, len(curve) - 1))
+    largest = float(difference[np.argmax(np.abs(difference))])
+    entry = {"error": name, "largest": largest / MM_PER_UM, "unit": "um", "chi2": chi2}
+    return {"rms_um": float(np.sqrt(np.mean(difference**2))) / MM_PER_UM, "changes": [entry] if p < 1e-3 else []}
+
+
+@dataclass(frozen=True)
+class AxisDiagnosis:
+    """Diagnosis of axis runs, one part for each axis."""
+
+    machine: Machine
+    runs: AxisRuns
+    axes: tuple[AxisFindings, ...]
+
+    @property
+    def word(self) -> str:
+        """Verdict: the most telling one of all axes."""
+        words = [part.word for part in self.axes]
+        return next((word for word in ("named", "unknown") if word in words), "none")
+
+    @property
+    def acceptable(self) -> bool:
+        """Whether the gap shrinks on readings left out wherever something was named that predicts."""
+        return all(part.held_out is None or part.held_out[1] < part.held_out[0] for part in self.axes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``diagnosis.json``."""
+        several = len(self.axes) > 1
+        effects = [_effect_dict(part, item) for part in self.axes for item in part.effects]
+        unknown = [
+            {
+                "covariates": list(item.covariates),
+                "direction": f"d{part.session.letter}",
+                "rms_um": item.rms_mm / MM_PER_UM if np.isfinite(item.rms_mm) else None,
+                "text": (f"{part.session.letter}: " if several else "") + item.text,
+                "resembles": item.resembles or None,
+                "axis": part.session.letter,
+            }
+            for part in self.axes
+            for item in part.unknown
+        ]
+        against = [part.against for part in self.axes if part.against is not None]
+        found = {
+            "verdict": self.word,
+            "effects": effects,
+            "unknown": unknown,
+            "invisible": list(dict.fromkeys(name for part in self.axes for name in part.invisible)),
+            "secondary": [],
+            "gap": self._gap(),
+            "advice": self._advice(),
+            "reasons": self._reasons(),
+            "notes": self._notes(),
+            "noise": {part.session.letter: _noise_dict(part) for part in self.axes}
+            if several
+            else _noise_dict(self.axes[0]),
+            "evidence": {
+                "readings": len(self.runs),
+                "unknowns": sum(int(part.session.cell.max()) + 1 for part in self.axes),
+                "order": {part.session.letter: ORDER_TEXTS[part.session.order] for part in self.axes},
+            },
+            "iso_230_2": {part.session.letter: dict(part.figures) for part in self.axes},
+            "taken_off": {part.session.letter: list(part.taken_off) for part in self.axes},
+        }
+        if against:
+            rms = float(np.sqrt(np.mean([item["rms_um"] ** 2 for item in against])))
+            found["against"] = {"rms_um": rms, "changes": [entry for item in against for entry in item["changes"]]}
+        return found
+
+    def _gap(self) -> dict[str, Any]:
+        before = np.concatenate([part.residual_before_mm for part in self.axes])
+        after = np.concatenate([part.residual_after_mm for part in self.axes])
+        held = [(part.held_out, len(part.session)) for part in self.axes if part.held_out is not None]
+        times = None
+        if held:
+            total = sum(count for _, count in held)
+            squares = [sum(pair[k] ** 2 * count for pair, count in held if pair) / total for k in (0, 1)]
+            times = _pair(np.sqrt(squares[0]), np.sqrt(squares[1]))
+        sources = {part.noise_source for part in self.axes}
+        floor = np.sqrt(np.mean([part.sigma_mm**2 for part in self.axes]))
+        return {
+            "train": _pair(np.sqrt(np.mean(before**2)), np.sqrt(np.mean(after**2))),
+            "heldout_lines": None,
+            "heldout_stations": None,
+            "heldout_times": times,
+            "noise_floor_um": float(floor) / MM_PER_UM,
+            "noise_floor_source": sources.pop() if len(sources) == 1 else "repeats and assumed",
+        }
+
+    def _advice(self) -> list[str]:
+        found = []
+        for part in self.axes:
+            for item in part.effects:
+                others = [name for name, _ in item.alias if name != item.name]
+                if others and item.effect.card.breaker:
+                    found.append(f"{item.effect.card.breaker}: separates {item.name} from {', '.join(others)}")
+            if part.noise_source != "repeats":
+                found.append("measure at least three runs in each direction: only repeats tell noise from effects")
+            if any(item.covariates for item in part.unknown):
+                depends = ", ".join(part.unknown[0].covariates)
+                found.append(
+                    f"two more runs with the temperatures logged: show whether what depends on {depends} comes again"
+                )
+            shown: dict[str, list[str]] = {}
+            for name in part.invisible:
+                shown.setdefault(catalogue()[name].card.breaker, []).append(name)
+            found += [f"{how}: would show {', '.join(names)}, which these runs cannot" for how, names in shown.items()]
+        return list(dict.fromkeys(found))
+
+    def _reasons(self) -> list[str]:
+        assumed = [part.session.letter for part in self.axes if part.noise_source == "assumed"]
+        if not assumed:
+            return []
+        return [
+            f"{', '.join(assumed)}: no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"
+        ]
+
+    def _notes(self) -> list[str]:
+        found = []
+        for part in self.axes:
+            letter = part.session.letter
+            found.append(f"{letter}: order of time by {ORDER_TEXTS[part.session.order]}")
+            found += [f"{letter}: {text}" for text in part.notes]
+            if any(item.name in ("warmup_drift", "linear_drift") for item in part.effects):
+                found.append(f"{letter}: {WARM_UP_NOTE}")
+            grown = [key for key, pair in part.figures.items() if pair["after"] > pair["before"] * 1.001]
+            if grown and part.taken_off:
+                found.append(f"{letter}: {', '.join(grown)} had been hidden a little by what was taken off")
+            if part.taken_off:
+                found.append(f"{letter}: removed.csv lists what was taken off each reading")
+        return found
+
+    def extended(self) -> str:
+        """The machine file with what of the effects belongs to the machine; empty without such an effect or a file."""
+        sections = [text for part in self.axes for text in _sections(part)]
+        if not sections or self.machine.source is None:
+            return ""
+        text = read_text(self.machine.source).rstrip("\n")
+        return "\n".join([text, "", "", "# found by compgen diagnose in axis runs", *sections])
+
+    def removed_csv(self) -> str:
+        """What was taken off which reading, um: one row for each reading in the order of time."""
+        rows: dict[str, list[Any]] = {}
+        names = list(
+            dict.fromkeys(item.name for part in self.axes for item in part.effects if item.name in part.taken_off)
+        )
+        for part in self.axes:
+            session = part.session
+            out = np.isin(np.arange(len(session)), part.left_out)
+            columns: dict[str, Any] = {
+                "axis": [session.letter] * len(session),
+                "position_mm": session.position_mm,
+                "direction": session.direction.astype(np.float64),
+                "run": session.run.astype(np.float64),
+                "order": np.arange(1.0, len(session) + 1),
+                "deviation_um": session.deviation_mm / MM_PER_UM,
+            }
+            for name in names:
+                own = [
+                    i.shift_mm
+                    for i in part.effects
+                    if i.name == name and name in part.taken_off and not len(i.left_out)
+                ]
+                columns[f"{name}_um"] = sum(own, np.zeros(len(session))) / MM_PER_UM
+            columns["removed_um"] = part.removed_mm / MM_PER_UM
+            columns["left_out"] = out.astype(np.float64)
+            columns["remaining_um"] = (session.deviation_mm - part.removed_mm) / MM_PER_UM
+            for name, values in columns.items():
+                rows.setdefault(name, []).extend(values)
+        digits = {"position_mm": 6, "direction": 0, "run": 0, "order": 0, "left_out": 0}
+        table = {
+            name: values if name == "axis" else np.array(values, dtype=np.float64) for name, values in rows.items()
+        }
+        return format_csv(table, {}, digits | {name: 4 for name in table if name.endswith("_um")})
+
+
+def _sections(part: AxisFindings) -> list[str]:
+    """``[effects.NAME]`` sections: the reversal in the normalisation of the machine file, and what follows temperatures."""
+    session, found = part.session, []
+    reversal = np.zeros(3)
+    for item in part.effects:
+        if item.grade == "tentative":
+            continue
+        if item.static:
+            taken = item.values[1:] if item.name.startswith("lost_motion") else item.values[:1]
+            reversal[1 : 1 + len(taken)] += taken if item.name.startswith("lost_motion") else 0.0
+            reversal[0] += 0.0 if item.name.startswith("lost_motion") else float(taken[0])
+            if item.name.startswith("lost_motion") and not any(e.name.startswith("backlash") for e in part.effects):
+                reversal[0] += float(item.values[0])
+        elif item.name.rpartition("_")[0] in MACHINE_EFFECTS:
+            found.append(section_text(item.effect, session.readings, item.values))
+    if not reversal.any():
+        return found
+    low, high = session.machine.axes[session.axis].range_mm
+    first, last = session.targets_mm[[0, -1]]
+    middle, half = 0.5 * (first + last), max(0.5 * (last - first), 1e-9)
+    mine = np.polynomial.Polynomial(np.polynomial.legendre.leg2poly(reversal))
+    inner = np.polynomial.Polynomial([(0.5 * (low + high) - middle) / half, 0.5 * (high - low) / half])
+    values = np.asarray(np.polynomial.legendre.poly2leg(mine(inner).coef), dtype=np.float64)
+    values = np.pad(values, (0, 3 - len(values)))
+    known = catalogue()
+    found.append(section_text(known[f"backlash_{session.letter}"], session.readings, values[:1]))
+    if values[1:].any():
+        found.append(section_text(known[f"lost_motion_{session.letter}"], session.readings, values[1:]))
+    return found
+
+
+def _pair(before_mm: float, after_mm: float) -> dict[str, float]:
+    return {"before_rms_um": float(before_mm) / MM_PER_UM, "after_rms_um": float(after_mm) / MM_PER_UM}
+
+
+def _effect_dict(part: AxisFindings, item: AxisEffect) -> dict[str, Any]:
+    return {
+        "name": item.name,
+        "axis": part.session.letter,
+        "text": item.text,
+        "what_to_do": what_to_do(item.effect.card),
+        "alias_set": [{"name": name, "weight": round(weight, 4)} for name, weight in item.alias],
+        "parameters": {key: {"value": value, "u": u} for key, (value, u) in item.parameters.items()},
+        "confidence": round(next((w for name, w in item.alias if name == item.name), 1.0), 4),
+        "grade": item.grade,
+        "visible_fraction": 1.0,
+        "chi2": item.gain,
+        "homogeneity_p": item.homogeneity_p,
+        "shape_exact": item.homogeneity_p >= UNEVEN_P,
+        "reasons": list(item.reasons),
+    }
+
+
+def _noise_dict(part: AxisFindings) -> dict[str, Any]:
+    return {
+        "sigma_um": part.sigma_mm / MM_PER_UM,
+        "correlation_of_neighbours": part.phi,
+        "source": part.noise_source,
+    }

@@ -1,0 +1,230 @@
+"""One axis of ISO 230-2 runs in the order of time: readings, cells of repeats, one-way runs, and what can be fitted to them.
+
+A cell is one target in one direction: five runs of it are five repeats, and their scatter is the noise plus whatever
+changes with time. Everything static (the curve of the axis, its reversal) is in the means of the cells, so that the
+scatter within the cells knows nothing of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+
+from compgen.core.axis_runs import AxisRuns
+from compgen.core.csvio import FloatArray
+from compgen.core.machine import Machine
+from compgen.core.names import AXES
+from compgen.diagnose.layout import IntArray
+from compgen.effects import Readings
+
+#: Order of the readings in time: as logged, run by run up then down, down then up, all up runs first, rows of the file.
+Order = Literal["auto", "up-down", "down-up", "one-way", "rows"]
+ORDERS: tuple[Order, ...] = get_args(Order)
+ORDER_TEXTS = {
+    "time": "time_s",
+    "label": "the column order",
+    "up-down": "run by run, up then down",
+    "down-up": "run by run, down then up",
+    "one-way": "all runs up, then all runs down",
+    "rows": "the rows of the file",
+}
+#: Targets closer than this are the same one, mm.
+SAME_TARGET_MM = 1e-4
+
+
+@dataclass(frozen=True)
+class AxisSession:
+    """n readings of one axis, ascending in time.
+
+    Parameters
+    ----------
+    machine, axis : the machine, and the axis 0, 1, 2.
+    row : row of each reading in the runs that were given.
+    position_mm, direction, run, deviation_mm : as in :class:`AxisRuns`, each (n,).
+    target : number of the target, ascending in position, (n,).
+    cell : number of target and direction, (n,).
+    leg : number of the one-way run in time, from 0, (n,).
+    cycle : number of the run in time, from 0; both ways of a run have the same, (n,).
+    time : time in s if ``timed``, else number of the reading, (n,).
+    timed : whether times were logged and used.
+    order : where the order comes from, a key of ``ORDER_TEXTS``.
+    readings : the same readings as the effects of the catalogue take them.
+    """
+
+    machine: Machine
+    axis: int
+    row: IntArray
+    position_mm: FloatArray
+    direction: IntArray
+    run: IntArray
+    deviation_mm: FloatArray
+    target: IntArray
+    cell: IntArray
+    leg: IntArray
+    cycle: IntArray
+    time: FloatArray
+    timed: bool
+    order: str
+    readings: Readings
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.row)
+
+    @property
+    def letter(self) -> str:
+        """Letter of the axis."""
+        return AXES[self.axis]
+
+    @property
+    def targets_mm(self) -> FloatArray:
+        """Targets, ascending."""
+        return self.position_mm[np.unique(self.target, return_index=True)[1]]
+
+    @property
+    def s(self) -> FloatArray:
+        """Position over the measured range, -1 ... +1, (n,)."""
+        low, high = self.targets_mm[[0, -1]]
+        return np.asarray((2.0 * self.position_mm - low - high) / max(high - low, 1e-9))
+
+    @property
+    def both(self) -> IntArray:
+        """Targets that were read in both directions."""
+        return np.intersect1d(self.target[self.direction > 0], self.target[self.direction < 0])
+
+    @property
+    def repeated(self) -> bool:
+        """Whether most readings have repeats in their cell."""
+        return float(np.mean(np.bincount(self.cell)[self.cell] > 1)) >= 0.5
+
+    @property
+    def cycle_span(self) -> float:
+        """Mean duration of a run there and back, in the unit of ``time``."""
+        span = float(self.time[-1] - self.time[0]) * len(self) / max(len(self) - 1, 1)
+        return span / (int(self.cycle.max()) + 1)
+
+    def place(self, k: int) -> str:
+        """Say in words which reading ``k`` is."""
+        way = "up" if self.direction[k] > 0 else "down"
+        return f"run {self.run[k]} {way} at {self.position_mm[k]:g} mm"
+
+    def window(self, first: int, last: int) -> str:
+        """Say in words which readings ``first`` ... ``last`` are: a run, a way of it, or readings from .. to .."""
+        rows = np.arange(first, last + 1)
+        legs = np.unique(self.leg[rows])
+        if len(rows) == np.count_nonzero(np.isin(self.leg, legs)):
+            if len(legs) == 1:
+                return f"run {self.run[first]} {'up' if self.direction[first] > 0 else 'down'}"
+            if len(np.unique(self.run[rows])) == 1:
+                return f"run {self.run[first]}"
+        return self.place(first) if first == last else f"from {self.place(first)} to {self.place(last)}"
+
+    def part(self, kept: IntArray) -> AxisSession:
+        """Return some of the readings; numbers of runs and times stay as they are."""
+        names = ("row", "position_mm", "direction", "run", "deviation_mm", "target", "leg", "cycle", "time")
+        taken = {name: getattr(self, name)[kept] for name in names}
+        _, cell = np.unique(self.cell[kept], return_inverse=True)
+        return replace(self, **taken, cell=cell.ravel(), readings=_part(self.readings, kept))
+
+
+def sessions_of(machine: Machine, runs: AxisRuns, order: Order = "auto") -> list[AxisSession]:
+    """Return the readings of every axis by itself, in the order of time."""
+    return [_session(machine, runs, axis, order) for axis in runs.axes]
+
+
+def _session(machine: Machine, runs: AxisRuns, axis: int, order: Order) -> AxisSession:
+    rows = np.flatnonzero(runs.axis == axis)
+    sequence, time, source = _in_time(runs, rows, order)
+    rows = rows[sequence]
+    position, direction, run = runs.position_mm[rows], runs.direction[rows], runs.run[rows]
+    _, target = np.unique(np.round(position / SAME_TARGET_MM), return_inverse=True)
+    _, cell = np.unique(2 * target.ravel() + (direction > 0), return_inverse=True)
+    leg = np.cumsum(np.concatenate([[False], (np.diff(run) != 0) | (np.diff(direction) != 0)]))
+    return AxisSession(
+        machine, axis, rows, position, direction, run, runs.deviation_mm[rows], target.ravel(), cell.ravel(),
+        leg.astype(np.int64), _cycles(run, direction, leg), time, source == "time", source,
+        _readings(machine, runs, axis, rows, np.arange(len(rows), dtype=np.float64), timed=source == "time"),
+    )  # fmt: skip
+
+
+def _in_time(runs: AxisRuns, rows: IntArray, order: Order) -> tuple[IntArray, FloatArray, str]:
+    """Rows in the order of time, the time of each (s, or number of the reading), and where the order comes from.
+
+    The order of the rows counts only where the user says so: files list all runs up and then all runs down, or go by
+    targets, far more often than by time.
+    """
+    run, way = runs.run[rows], runs.direction[rows]
+    along = runs.position_mm[rows] * way
+    keys = {
+        "up-down": (along, -way, run),
+        "down-up": (along, way, run),
+        "one-way": (along, run, -way),
+    }
+    number = np.arange(len(rows), dtype=np.float64)
+    if order == "rows":
+        return np.arange(len(rows)), number, "rows"
+    if order in keys:
+        return np.lexsort(keys[order]), number, order
+    for name, source in (("time_s", "time"), ("order", "label")):
+        logged = runs.covariates.get(name)
+        if logged is None or not np.isfinite(logged[rows]).all() or np.ptp(logged[rows]) == 0.0:
+            continue
+        # readings of one time (a time for each run) follow each other as the axis moves
+        sequence = np.lexsort((*keys["up-down"], logged[rows]))
+        distinct = len(np.unique(logged[rows])) == len(rows)
+        return (
+            sequence,
+            logged[rows][sequence] if distinct and source == "time" else number,
+            (source if distinct else "label"),
+        )
+    return np.lexsort(keys["up-down"]), number, "up-down"
+
+
+def _cycles(run: IntArray, direction: IntArray, leg: IntArray) -> IntArray:
+    """Number of the run there and back of each reading: by its label, or two ways where every way has a number of its own."""
+    changed = np.concatenate([[False], np.diff(run) != 0])
+    cycle = np.cumsum(changed).astype(np.int64)
+    single = all(len(np.unique(direction[cycle == k])) == 1 for k in range(int(cycle.max()) + 1))
+    both = len(np.unique(direction)) == 2
+    return (leg // 2).astype(np.int64) if single and both else cycle
+
+
+def _readings(
+    machine: Machine, runs: AxisRuns, axis: int, rows: IntArray, number: FloatArray, *, timed: bool
+) -> Readings:
+    count = len(rows)
+    position = np.tile(np.asarray(machine.reference_point_mm, dtype=np.float64), (count, 1))
+    position[:, axis] = runs.position_mm[rows]
+    approach = np.zeros((count, 3))
+    approach[:, axis] = runs.direction[rows]
+    covariates = {name: values[rows] for name, values in runs.covariates.items() if timed or name != "time_s"}
+    return Readings(
+        machine=machine,
+        kind="axis",
+        position_mm=position,
+        direction=np.tile(np.eye(3)[axis], (count, 1)),
+        tool_mm=np.tile(np.asarray(machine.tool_offset_mm, dtype=np.float64), (count, 1)),
+        stations=(),
+        station=np.zeros(count, dtype=np.int64),
+        range_mm=np.zeros(count),
+        approach=approach,
+        covariates={**covariates, "order": number},
+        labels={"run": runs.run[rows]},
+    )
+
+
+def _part(readings: Readings, kept: IntArray) -> Readings:
+    assert readings.approach is not None
+    return replace(
+        readings,
+        position_mm=readings.position_mm[kept],
+        direction=readings.direction[kept],
+        tool_mm=readings.tool_mm[kept],
+        station=readings.station[kept],
+        range_mm=readings.range_mm[kept],
+        approach=readings.approach[kept],
+        covariates={name: values[kept] for name, values in readings.covariates.items()},
+        labels={name: values[kept] for name, values in readings.labels.items()},
+    )
