@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from compgen.core.text import visible
+
 
 class CompgenError(Exception):
     """Base of every error that compgen raises on purpose; the command line turns it into ``exit_code``."""
@@ -29,7 +31,7 @@ class InputError(CompgenError, ValueError):
         field: str | None = None,
     ) -> None:
         self.message, self.file, self.line, self.field = message, file, line, field
-        place = str(file) if file is not None else ""
+        place = visible(str(file), flat=True) if file is not None else ""
         if line is not None:
             place += f":{line}" if place else f"line {line}"
         if field:

@@ -767,3 +767,11 @@ def test_the_line_number_in_a_message_stays_a_number(call, small_machine_file, s
     bad.write_text("\n".join(rows) + "\n")
     _, _, stderr = call("identify", small_machine_file, bad, "--out", tmp_path / "out")
     assert "bad.lengths.csv:100: column" in stderr
+
+
+@pytest.mark.parametrize("name", ["a\x1b[2Jb.csv", "a\x9b31mb.csv", "a\u202eb.csv", "a\x07b.csv"])
+def test_control_characters_of_names_reach_no_terminal(name, capsys):
+    assert run_command(cli, ["identify", "zha-gantry", name, "--out", "out"]) == 2
+    said = capsys.readouterr().err
+    assert name not in said
+    assert name.encode("unicode_escape").decode() in said

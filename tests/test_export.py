@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import shutil
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from compgen.controllers import CONTROLLERS
 from compgen.core import tomlio
 from compgen.core.files import sha256_of
 from compgen.errors import InputError
-from compgen.export import Provenance, export, load_format
+from compgen.export import Provenance, export, load_format, render
 from compgen.pipeline import export_and_verify, run
 from compgen.resources import data_folder
 
@@ -83,6 +84,31 @@ def test_the_users_folder_is_searched_first_file_by_file(small_machine, small_er
     assert ours.files["volcomp0.csv"] == theirs.files["volcomp0.csv"].replace("// Volumetric", "// OURS Volumetric", 1)
     assert ours.files["volcomp0.lis"] == theirs.files["volcomp0.lis"]
     assert ours.preflight.startswith("# Preflight")
+
+
+ENDLESS = {
+    "silent": "{% for a in range(99999) %}{% for b in range(99999) %}{% endfor %}{% endfor %}",
+    "writing": "{% for a in range(99999) %}{% for b in range(99999) %}xxxxxxxxxxxxxxxxxxxx{% endfor %}{% endfor %}",
+    "macro": "{% macro m() %}{{ m() }}{% endmacro %}{{ m() }}",
+    "power": "{{ 9 ** (9 ** 9) }}",
+    "text": "{{ 'a' * 10 ** 12 }}",
+    "list": "{{ [0] * 10 ** 12 }}",
+    "squares": "{% set n = namespace(x=3) %}{% for a in range(9999) %}{% set n.x = n.x * n.x %}{% endfor %}",
+}
+
+
+@pytest.mark.parametrize("name", ENDLESS)
+def test_a_template_that_never_ends_is_ended(small_machine, small_errors, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(render, "LONGEST_S", 1.0)
+    monkeypatch.setattr(render, "MOST_CHARACTERS", 3_000_000)
+    templates = own_templates(tmp_path, "isg-csv", **{"volcomp.csv.j2": lambda old: old + ENDLESS[name]})
+    began = time.monotonic()
+    with pytest.raises(InputError, match="template cannot be rendered") as caught:
+        export(small_machine, small_errors, "isg-csv", templates=templates)
+    assert time.monotonic() - began < 20.0
+    assert name == "writing" or str(tmp_path) in str(caught.value.file)
+    export(small_machine, small_errors, "isg-csv")  # nothing strikes later
+    time.sleep(1.2)
 
 
 def test_a_templates_folder_that_is_not_there_is_an_error(small_machine, small_errors, tmp_path):

@@ -23,7 +23,7 @@ from compgen.core.files import sha256_of
 from compgen.core.names import ERROR_INDEX
 from compgen.errors import InputError
 from compgen.model.gauge import gauge_directions
-from compgen.recal import change, claims, database, decisions, exclude, notify, overview, results, schema
+from compgen.recal import actions, change, claims, database, decisions, exclude, notify, overview, results, schema
 from compgen.recal.backup import backup, restore
 from compgen.recal.database import StoreError
 from compgen.recal.records import NewMeasurement, NewResult, TableFile
@@ -486,3 +486,38 @@ def test_the_version_of_a_store_changes_with_everything_that_is_added(store):
     seen.add(store.version())
     assert len(seen) == 5
     assert store.version() in seen
+
+
+# --- who decides, and what is shown --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "actor", ["automatic", " Automatic ", "AUTOMATIC", "ada\x1b[2J", "ada\nrollback by ben", "a\u202eb"]
+)
+@pytest.mark.parametrize("kind", ["approve", "reject", "rollback"])
+def test_nobody_signs_as_the_program_or_with_what_a_terminal_obeys(store, actor, kind):
+    machine = store.add_machine("mill")
+    for number in (1, 2):
+        processed(store, machine, number, approve=number == 1)
+    before = store.decisions(machine)
+    with pytest.raises(decisions.DecisionError, match="automatic|control characters"):
+        if kind == "rollback":
+            decisions.rollback(store, machine, actor, "why")
+        else:
+            getattr(decisions, kind)(store, machine, 2, actor, "why")
+    assert store.decisions(machine) == before
+
+
+def test_without_a_version_nothing_is_approved_that_replaced_what_somebody_may_have_seen(store):
+    machine = store.add_machine("mill")
+    processed(store, machine, 1)
+    assert actions.waiting_version(store, machine) == 1
+    processed(store, machine, 2)
+    with pytest.raises(decisions.DecisionError, match="version 2 took the place of version 1"):
+        actions.waiting_version(store, machine)
+    decisions.reject(store, machine, 2, "ada", "why")
+    processed(store, machine, 3)
+    assert actions.waiting_version(store, machine) == 3
+    processed(store, machine, 4, hold=("late",))
+    with pytest.raises(decisions.DecisionError, match="versions 3 .pending., 4 .held. wait"):
+        actions.waiting_version(store, machine)

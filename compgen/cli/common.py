@@ -16,11 +16,12 @@ from typing import Any, TypeVar
 
 import click
 from rich.console import Console
+from rich.text import Text
 
 from compgen.controllers import CONTROLLERS
 from compgen.core.machine import Machine, load_machine
 from compgen.core.plugins import restored, why_missing
-from compgen.core.text import nearest
+from compgen.core.text import nearest, visible
 from compgen.effects import active_effects
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.plugins import KINDS
@@ -52,9 +53,19 @@ PROGRAM_NAMES = ("compgen", "volcomp")
 STOPPED, READER_GONE = 130, 141
 #: Tables into a pipe or a file get the width that they need, not that of an unknown terminal.
 PIPE_WIDTH = None if sys.stdout.isatty() else 130
+
+
+class Terminal(Console):
+    """A console that shows the control characters of names, reasons and files as escapes: no text commands a terminal."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Turn text into what is shown; printing and the cells of tables come through here."""
+        return super().render_str(visible(text), **options)
+
+
 # emoji=False: rich would turn the place file.csv:100: into a picture
-stdout = Console(highlight=False, emoji=False, markup=False, width=PIPE_WIDTH)
-stderr = Console(stderr=True, highlight=False, emoji=False, markup=False)
+stdout = Terminal(highlight=False, emoji=False, markup=False, width=PIPE_WIDTH)
+stderr = Terminal(stderr=True, highlight=False, emoji=False, markup=False)
 
 
 def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from compgen.errors import InputError
 
 if TYPE_CHECKING:
     from compgen.recal.job import Job
+    from compgen.recal.store import Store
 
 
 def who_option(*, reason: bool) -> Callable[[Command], Command]:
@@ -47,9 +49,11 @@ def actor_of(name: str | None) -> str:
 def approve_command(
     machine: str, version: int | None, job: Job, override: bool, actor: str | None, reason: str, as_json: bool
 ) -> int:
-    """Make VERSION of MACHINE's tables active (default: the only one that waits).
+    """Make VERSION of MACHINE's tables active.
 
-    Tables that the round trip did not accept can never be approved.
+    Without VERSION the only one that waits is meant: on a terminal it is shown first and asked about; elsewhere it is
+    refused if it took the place of another one that somebody may have looked at. Tables that the round trip did not
+    accept can never be approved.
 
     \b
     Example:
@@ -57,7 +61,27 @@ def approve_command(
     """
     from compgen.recal.actions import approve
 
+    if version is None:
+        version = opened(job, lambda store: _shown(store, job.machine(machine).name, ask=not as_json))
     return _decided(job, machine, approve(job, machine, version, actor_of(actor), reason, override=override), as_json)
+
+
+def _shown(store: Store, name: str, *, ask: bool) -> int:
+    """Return the version that waits; on a terminal after a person has seen which one it is."""
+    from compgen.recal import actions, decisions
+
+    machine = store.machine(name)
+    if not (ask and sys.stdin.isatty()):
+        return actions.waiting_version(store, machine)
+    waiting = decisions.pending(store, machine)
+    if len(waiting) != 1:
+        return actions.waiting_version(store, machine)
+    (table,) = waiting
+    measured = store.measurement_behind(table)
+    at = measured.measured_at.isoformat(timespec="minutes")
+    stdout.print(f"{name}: version {table.version} ({table.state}) from {measured.name}, measured {at}", soft_wrap=True)
+    click.confirm("Make it active?", abort=True, err=True)
+    return table.version
 
 
 @recal.command("reject")

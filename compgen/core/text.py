@@ -8,6 +8,10 @@ from collections.abc import Hashable, Iterable, Mapping
 from typing import TypeVar
 
 Item = TypeVar("Item", bound=Hashable)
+#: Characters that a terminal obeys instead of showing them, or that turn the direction of a line; not line end and tab.
+_OBEYED = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 
 
 def nearest(word: str, known: Iterable[str], described: Mapping[str, str] | None = None, alike: float = 0.5) -> str:
@@ -36,6 +40,16 @@ def doubled(items: Iterable[Item]) -> Item | None:
             return item
         seen.add(item)
     return None
+
+
+def visible(text: str, *, flat: bool = False) -> str:
+    r"""Return ``text`` with escapes such as ``\x1b`` for what a terminal would obey; with ``flat`` for line ends as well.
+
+    >>> print(visible("a\x1b[2J"))
+    a\x1b[2J
+    """
+    shown = _OBEYED.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+    return shown.replace("\n", "\\n") if flat else shown
 
 
 def one_line(text: object) -> str:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
+import threading
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path, PurePath
 from typing import Any
 
 from jinja2 import ChoiceLoader, FileSystemLoader, StrictUndefined, TemplateError, TemplateSyntaxError
+from jinja2.runtime import Context
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from compgen.controllers import CONTROLLERS
@@ -21,6 +25,19 @@ from compgen.resources import data_folder
 
 #: Files that are written beside those of the control.
 OWN_FILES = ("manifest.json", "preflight.md", "result.json", "explain.md")
+#: Longest time that one template may take, s, and most characters that it may write or hold in one text.
+LONGEST_S, MOST_CHARACTERS = 60.0, 400_000_000
+#: Largest whole number that a template may calculate, bits.
+MOST_BITS = 10_000
+
+
+class EndlessTemplateError(Exception):
+    """A template takes too long or becomes too large; those of users may hold any loop."""
+
+    def __init__(self, message: str = "it takes too long: does a loop end?") -> None:
+        super().__init__(message)
+
+
 #: What a wrong template may raise: Jinja's own errors, and those of the expressions in it.
 _TEMPLATE_FAULTS = (
     TemplateError,
@@ -31,6 +48,7 @@ _TEMPLATE_FAULTS = (
     AttributeError,
     RecursionError,
     UnicodeError,
+    EndlessTemplateError,
 )
 
 
@@ -164,8 +182,26 @@ def _read_format(path: Path, name: str) -> Format:
     return card
 
 
+class _Bounded(ImmutableSandboxedEnvironment):
+    """A sandbox in which no product or power is larger than a text or a number can sensibly be."""
+
+    intercepted_binops = frozenset({"*", "**"})
+
+    def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:
+        """Calculate, unless the result would not end or fit into the memory."""
+        sizes = [len(item) for item in (left, right) if isinstance(item, str | bytes | list | tuple)]
+        factors = [item for item in (left, right) if isinstance(item, int)]
+        if operator == "*" and sizes and factors and sizes[0] * abs(factors[0]) > MOST_CHARACTERS:
+            raise EndlessTemplateError(f"a text of more than {MOST_CHARACTERS} characters")
+        if len(factors) == 2:
+            bits = [abs(item).bit_length() for item in factors]
+            if (sum(bits) if operator == "*" else bits[0] * abs(factors[1])) > MOST_BITS:
+                raise EndlessTemplateError(f"a number of more than {MOST_BITS} bits")
+        return super().call_binop(context, operator, left, right)
+
+
 def _environment(folders: Sequence[Path]) -> ImmutableSandboxedEnvironment:
-    environment = ImmutableSandboxedEnvironment(
+    environment = _Bounded(
         loader=ChoiceLoader([FileSystemLoader(folder) for folder in folders]),
         undefined=StrictUndefined,
         autoescape=False,
@@ -206,11 +242,48 @@ def render(card: Format, template: str, context: Mapping[str, Any], folder: Path
     folders = template_folders(card.name, folder)
     try:
         page = _environment(folders).get_template(f"{card.name}/{template}")
-        return page.render({**{key: _inert(value) for key, value in context.items()}, "format": card})
+        with _ended_after(LONGEST_S):
+            return _joined(page.generate({**{key: _inert(value) for key, value in context.items()}, "format": card}))
     except _TEMPLATE_FAULTS as error:
         file, line = _place(error, folders)
         message = f"the template cannot be rendered: {one_line(error)}"
         raise InputError(message, file=file or f"templates/{card.name}/{template}", line=line) from error
+
+
+def _joined(parts: Iterable[str]) -> str:
+    """Return the text of a page; EndlessTemplateError as soon as it is too long."""
+    kept, size = [], 0
+    for part in parts:
+        kept.append(part)
+        size += len(part)
+        if size > MOST_CHARACTERS:
+            raise EndlessTemplateError(f"it writes more than {MOST_CHARACTERS} characters: does a loop end?")
+    return "".join(kept)
+
+
+@contextmanager
+def _ended_after(seconds: float) -> Iterator[None]:
+    """Raise EndlessTemplateError in this thread, wherever it is, if the block takes longer.
+
+    A loop that writes nothing cannot be asked to stop; the interpreter can be, from another thread.
+    """
+    thread, lock, over = ctypes.c_ulong(threading.get_ident()), threading.Lock(), False
+
+    def strike() -> None:
+        with lock:
+            if not over:
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(EndlessTemplateError))
+
+    timer = threading.Timer(seconds, strike)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        with lock:
+            over = True
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
+        timer.cancel()
 
 
 def _place(error: Exception, folders: Sequence[Path]) -> tuple[str | None, int | None]:

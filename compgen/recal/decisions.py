@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
+from compgen.core.text import visible
 from compgen.errors import InputError
 from compgen.recal import schema
 from compgen.recal.records import DecisionKind, DecisionRecord, MachineRecord, TableRecord
-from compgen.recal.states import OPEN, WAS_ACTIVE, active_id, before_active, state_of
+from compgen.recal.states import AUTOMATIC, OPEN, WAS_ACTIVE, active_id, before_active, state_of
 from compgen.recal.store import Store, files_of
 
 
@@ -55,6 +56,7 @@ def approve(
     StoreError
         if the contents of its files are missing or damaged in the store.
     """
+    check_person(actor)
 
     def action(connection: sa.Connection) -> DecisionRecord:
         decisions, table_id, accepted = _open(connection, machine, version)
@@ -85,6 +87,7 @@ def reject(
 
     ``seen`` as for :func:`approve`.
     """
+    check_person(actor)
 
     def action(connection: sa.Connection) -> DecisionRecord:
         decisions, table_id, _ = _open(connection, machine, version)
@@ -113,6 +116,7 @@ def rollback(
     StoreError
         if the contents of its files are missing or damaged in the store.
     """
+    check_person(actor)
 
     def action(connection: sa.Connection) -> DecisionRecord:
         decisions = locked_decisions(connection, machine)
@@ -127,6 +131,16 @@ def rollback(
         return add_decision(store, connection, machine, "rollback", table_id, actor, reason)
 
     return store.write(action)
+
+
+def check_person(actor: str) -> None:
+    """Raise DecisionError unless this can be the name of a person: one line that shows all of itself, not "automatic"."""
+    if not actor.strip():
+        raise DecisionError("a decision needs the name of who makes it")
+    if visible(actor, flat=True) != actor:
+        raise DecisionError(f"the name of who decides holds control characters: {visible(actor, flat=True)}")
+    if actor.strip().casefold() == AUTOMATIC:
+        raise DecisionError(f"{AUTOMATIC!r} is what decisions without a person are signed with; give your own name")
 
 
 def _earlier(
@@ -173,8 +187,6 @@ def add_decision(
     reason: str,
 ) -> DecisionRecord:
     """Add one decision; its time is never before that of the one before it, whatever the clock says."""
-    if not actor.strip():
-        raise DecisionError("a decision needs the name of who makes it")
     table = schema.decisions
     own = table.c.machine_id == machine.id
     last = connection.execute(sa.select(table).where(own).order_by(table.c.sequence.desc()).limit(1)).first()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 
 from compgen.errors import InputError
+from compgen.recal.decisions import check_person
 from compgen.recal.job import Job
 from compgen.recal.records import EventRecord, MachineRecord, TableRecord
 from compgen.recal.store import Clock, Store, open_store
@@ -26,7 +27,8 @@ def exclude(
     InputError
         for an unknown version, the active one (roll it back first), or without name or reason.
     """
-    if not actor.strip() or ": " in actor or not reason.strip():
+    check_person(actor)
+    if ": " in actor or not reason.strip():
         raise InputError("an exclusion needs who says it (a name without ': ') and a reason")
     job.machine(name)
     store = open_store(job.store, clock=clock)

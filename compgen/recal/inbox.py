@@ -14,6 +14,7 @@ from pathlib import Path
 
 from compgen.core.csvio import MOST_COLUMNS
 from compgen.core.files import sha256_of
+from compgen.core.text import visible
 from compgen.errors import InputError
 from compgen.recal.job import MachineJob
 from compgen.recal.records import NewMeasurement
@@ -94,7 +95,7 @@ def load(job: MachineJob, group: tuple[Path, ...]) -> NewMeasurement:
         contents[path.name], left = content, left - len(content)
         times.append(state.st_mtime)
     name = group[0].name if len(group) == 1 else group[0].parent.name
-    return measurement_of(name, contents, datetime.fromtimestamp(max(times), UTC))
+    return measurement_of(visible(name, flat=True), contents, datetime.fromtimestamp(max(times), UTC))
 
 
 def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes, os.stat_result]:

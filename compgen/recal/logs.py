@@ -7,6 +7,8 @@ from typing import Any, Literal
 
 import structlog
 
+from compgen.core.text import visible
+
 Format = Literal["auto", "json", "text"]
 _FORM: list[Format] = []
 
@@ -32,11 +34,17 @@ def configure(kind: Format = "auto") -> None:
         processors=[
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
+            *([_visible] if words else []),
             last,
         ],
         logger_factory=lambda *_: _Stderr(),
         cache_logger_on_first_use=False,
     )
+
+
+def _visible(_logger: object, _name: str, fields: Any) -> Any:
+    """Show control characters as escapes; JSON does so itself."""
+    return {key: visible(value, flat=True) if isinstance(value, str) else value for key, value in fields.items()}
 
 
 def form() -> Format:

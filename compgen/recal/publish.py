@@ -21,6 +21,7 @@ from pathlib import Path
 
 from compgen.core.files import OutputFolder, write_file
 from compgen.errors import InputError
+from compgen.recal import logs
 from compgen.recal.records import MachineRecord, TableRecord, TableState
 from compgen.recal.store import Store
 
@@ -73,7 +74,11 @@ def _locked(folder: Path) -> Iterator[None]:
         except ImportError:  # a system without such locks
             yield
             return
-        fcntl.flock(stream, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            logs.warning("waiting for another process that works in this folder", folder=str(folder))
+            fcntl.flock(stream, fcntl.LOCK_EX)
         yield
 
 

@@ -14,6 +14,7 @@ from compgen.core.threads import one_thread
 from compgen.errors import CompgenError, InputError
 from compgen.recal import claims, logs
 from compgen.recal.actions import NotPublishedError
+from compgen.recal.decisions import check_person
 from compgen.recal.job import Job, MachineJob
 from compgen.recal.notify import notify
 from compgen.recal.process import process, without_folder
@@ -64,6 +65,7 @@ def reprocess(job: Job, name: str, wish: Wish, *, clock: Clock | None = None) ->
     machine_job = job.machine(name)
     if not wish.reason.strip() or not wish.actor.strip():
         raise InputError("to process a measurement again a reason and a name are due", field="--reason")
+    check_person(wish.actor)
     store = open_store(job.store, clock=clock)
     try:
         machine = store.machine(name)

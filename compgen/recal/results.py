@@ -14,11 +14,8 @@ from compgen.recal.blobs import put_blobs
 from compgen.recal.claims import Claim
 from compgen.recal.decisions import add_decision, locked_decisions
 from compgen.recal.records import MachineRecord, NewResult, TableRecord
-from compgen.recal.states import OPEN, active_id, state_of
+from compgen.recal.states import AUTOMATIC, OPEN, active_id, state_of
 from compgen.recal.store import Store
-
-#: Who decides where no person does.
-AUTOMATIC = "automatic"
 
 
 class ChangedMeanwhileError(claims.ClaimLostError):

@@ -15,6 +15,7 @@ import sqlalchemy as sa
 
 from compgen.core.parallel import limited
 from compgen.core.steady import steady
+from compgen.core.text import visible
 from compgen.errors import CompgenError
 from compgen.recal import claims, inbox, logs
 from compgen.recal.claims import Claim, ClaimLostError
@@ -169,7 +170,7 @@ class _Pass:
         """Report something; it is kept in the store if it is news there."""
         self.failed = self.failed or fail
         self.again = self.again or fail
-        subject, message = plain(subject), plain(message)
+        subject, message = visible(plain(subject), flat=True), plain(message)
         self.messages.append(f"{subject}: {message}" if kind == "inbox" else message)
         if self.store.add_event(kind, subject, message, self.machine):
             logs.warning(kind, machine=self.job.name, subject=subject, message=message)

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 
 from compgen.recal.records import DecisionKind, DecisionRecord, TableState
 
+#: Who decides where no person does.
+AUTOMATIC = "automatic"
 #: State right after a decision about a set of tables.
 AFTER: dict[DecisionKind, TableState] = {
     "propose": "pending",

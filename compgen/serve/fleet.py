@@ -12,8 +12,7 @@ import sqlalchemy as sa
 
 from compgen.recal import schema
 from compgen.recal.records import DecisionRecord, MachineRecord, TableState
-from compgen.recal.results import AUTOMATIC
-from compgen.recal.states import AFTER, OPEN
+from compgen.recal.states import AFTER, AUTOMATIC, OPEN
 from compgen.recal.store import Store
 
 #: Machines on one page.

@@ -22,10 +22,9 @@ from argon2.exceptions import Argon2Error, InvalidHashError
 
 from compgen.core.files import sha256_of
 from compgen.errors import InputError
+from compgen.recal.states import AUTOMATIC
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
-#: Names that the program itself signs decisions with.
-RESERVED = ("automatic",)
 SHORTEST, LONGEST = 12, 256
 #: Hashes that are worked out at the same time; each takes 64 MiB.
 AT_ONCE = 2
@@ -138,7 +137,7 @@ def check_name(name: str) -> None:
     """Raise InputError unless ``name`` can be that of a user."""
     if not NAME.fullmatch(name):
         raise InputError(f"{name!r} is not a name: letters, digits and . _ @ -, at most 64, are allowed")
-    if name.lower() in RESERVED:
+    if name.lower() == AUTOMATIC:
         raise InputError(f"{name!r} is what decisions without a person are signed with; choose another name")
 
 
