@@ -351,3 +351,133 @@ def test_the_active_tables_of_an_archive_are_said_once(tmp_path):
         active = read_active(machine_with(tmp_path), [tmp_path / "control.arc"], "siemens-cec")
     assert sum("kept apart: table 7" in str(warning.message) for warning in said) == 1
     assert active.paths == (tmp_path / "control.arc",)
+
+
+# --- PMAC ------------------------------------------------------------------------------------------------------------
+
+PMAC_FILE = """\
+; \u30d4\u30c3\u30c1\u88dc\u6b63 table
+CLOSE
+DELETE GATHER
+#1->1000X
+I100=1 ; motor on
+P1=0
+OPEN PLC 1 CLEAR
+IF (P1=1) CMD"I51=0"
+CLOSE
+#4 DEFINE COMP 8 #20,#20,8000000
+-16000,0,0,0,0,0,0,0
+#1 DEFINE COMP 8 #1,#1,8000000 // pitch
+-16000,-8000 , 0,0
+0,0,0,0
+"""
+PMAC = "[controllers.pmac]\ncounts_per_mm = 8000.0\n"
+
+
+def test_a_pmac_backup_is_read_and_other_motors_are_kept_apart(tmp_path):
+    tables = read(tmp_path, PMAC_FILE, "pmac", PMAC, "comp.pmc")
+    # 8 entries over 1000 mm: -16000 / 16 = -1000 counts at 125 mm, which are -125 um; half of it at 250 mm
+    moved = added(machine_with(tmp_path, PMAC), tables, [[125, 0, 0], [62.5, 0, 0], [250, 0, 0]])[:, 0]
+    np.testing.assert_allclose(moved, [-125.0, -62.5, -62.5], atol=1e-9)
+    said = " ".join(tables.remarks)
+    assert "motor 4 (uses #20)" in said and "(8 lines)" in said and "no file sets I51" in said
+    off = read(tmp_path, PMAC_FILE + "I51=0\n", "pmac", PMAC, "comp.pmc")
+    assert not np.any(added(machine_with(tmp_path, PMAC), off, [[125, 0, 0]]))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ("-8000 , 0", "-8000.5 , 0", 13, "not a whole number"),
+        (" 0,0\n0,0,0,0\n", " 0,0\n0,0,0\n", None, "the file was cut"),
+        ("P1=0", "I51=P1", 6, "not understood"),
+        ("P1=0", "DEFINE COMP ALL", 6, "not understood"),
+        ("P1=0", "I51..53=0", 6, "not understood"),
+        ("#1 DEFINE", "#2 DEFINE", None, None),
+    ],
+)
+def test_what_could_change_a_pmac_table_is_refused(tmp_path, old, new, line, words):
+    text = PMAC_FILE.replace(old, new)
+    if words is None:  # the table of motor 2 acts on motor 1
+        assert added(machine_with(tmp_path, PMAC), read(tmp_path, text, "pmac", PMAC, "c.pmc"), [[125, 0, 0]])[0, 0] < 0
+        return
+    with pytest.raises(InputError, match=words) as caught:
+        read(tmp_path, text, "pmac", PMAC, "comp.pmc")
+    assert line is None or caught.value.line == line
+
+
+# --- TwinCAT ---------------------------------------------------------------------------------------------------------
+
+AXIS_LIST = """\
+# Achskompensationsdaten gepr\u00fcft
+kopf.achs_nr            1
+kopf.log_achs_name      X
+lr_param.ssfk           1
+kw.ssfk.unit            0      /* Inkremente f\u00fcr die Werte */
+kw.ssfk.interval        4750000
+kw.ssfk.kw_startpos     0
+kw.ssfk.kw_nr_max       3
+kw.ssfk.bilateral       0
+kw.ssfk.res1            0
+kw.ssfk.table[0].pos    0
+kw.ssfk.table[1].pos    40
+kw.ssfk.table[2].pos    -20
+"""
+
+
+def test_a_list_in_encoder_increments_needs_their_length(tmp_path):
+    with pytest.raises(InputError, match=r"unit: 0 means .*increment_um = \{ X = 0.1 \}") as caught:
+        read(tmp_path, AXIS_LIST.encode("latin-1"), "twincat-lists", name="achskw1.lis")
+    assert caught.value.line == 5
+    own = "[controllers.twincat-lists]\nincrement_um = { X = 0.25 }\n"
+    tables = read(tmp_path, AXIS_LIST.encode("latin-1"), "twincat-lists", own, "achskw1.lis")
+    moved = added(machine_with(tmp_path, own), tables, [[475, 0, 0], [950, 0, 0], [237.5, 0, 0]])[:, 0]
+    np.testing.assert_allclose(moved, [-10.0, 5.0, -5.0], atol=1e-9)  # actual minus nominal: taken off
+    said = " ".join(tables.remarks)
+    assert "reserved entries of kw.ssfk (1)" in said and "entries of lr_param (1)" in said
+
+
+def test_axis_lists_of_other_axes_are_kept_apart_and_unknown_entries_refused(tmp_path):
+    own = "[controllers.twincat-lists]\nincrement_um = { X = 0.25 }\n"
+    machine = machine_with(tmp_path, own)
+    first, other = tmp_path / "a1.lis", tmp_path / "a5.lis"
+    first.write_text(AXIS_LIST, encoding="utf-8")
+    other.write_text(AXIS_LIST.replace("achs_nr            1", "achs_nr            5"), encoding="utf-8")
+    tables = read_tables(machine, [first, other], "twincat-lists", foreign=True)
+    assert any("the list of axis 5 (a5.lis)" in remark for remark in tables.remarks)
+    with pytest.raises(InputError, match="holds no table of an axis of the machine file"):
+        read_tables(machine, other, "twincat-lists", foreign=True)
+    first.write_text(AXIS_LIST.replace("kw.ssfk.res1 ", "kw.ssfk.gain "), encoding="utf-8")
+    with pytest.raises(InputError, match="not a parameter of these lists") as caught:
+        read_tables(machine, first, "twincat-lists", foreign=True)
+    assert caught.value.line == 10
+
+
+# --- LinuxCNC --------------------------------------------------------------------------------------------------------
+
+POSITIONS = "0 -0.003 0.002\n500 499.998 500.004\n950 950.001 950\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "axis"), [("screwcompX.dat", 0), ("screwcompZ.dat", 2), ("comp_y.txt", 1), ("joint1.comp", 1)]
+)
+def test_a_comp_file_of_any_name_is_read(tmp_path, name, axis):
+    own = "[controllers.linuxcnc-comp]\ncomp_file_type = 0\n"
+    tables = read(tmp_path, POSITIONS, "linuxcnc-comp", own, name)
+    up = Points(np.full((1, 3), 500.0), approach=np.ones((1, 3)))
+    moved = tables.correction(machine_with(tmp_path, own), up)[0] * 1e3
+    assert moved[axis] == pytest.approx(2.0, abs=1e-4)  # nominal minus actual
+    assert not np.any(np.delete(moved, axis))
+
+
+def test_a_comp_file_without_a_letter_is_asked_about_and_a_wrong_type_is_refused(tmp_path):
+    own = "[controllers.linuxcnc-comp]\ncomp_file_type = 0\n"
+    with pytest.raises(InputError, match=r'comp_files = \{ X = "screw.dat" \}'):
+        read(tmp_path, POSITIONS, "linuxcnc-comp", own, "screw.dat")
+    stated = own + 'comp_files = { Y = "screw.dat" }\n'
+    tables = read(tmp_path, POSITIONS, "linuxcnc-comp", stated, "screw.dat")
+    assert list(tables.tables.tables) == [1]
+    with pytest.raises(InputError, match="nominal and actual positions .file type 0."):
+        read(tmp_path, POSITIONS, "linuxcnc-comp", "", "screwcompX.dat")
+    with pytest.raises(InputError, match="these are trims .file type 1."):
+        read(tmp_path, "0 0 0\n500 0.002 0.004\n950 0.001 0\n", "linuxcnc-comp", own, "screwcompX.dat")

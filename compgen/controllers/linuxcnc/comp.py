@@ -35,6 +35,10 @@ _RESOLUTION_MM = 1e-7
 _AXIS_OF_NAME = re.compile(r"joint_?([012])(?!\d)|(?<![a-z])([xyz])(?![a-z])", re.IGNORECASE)
 
 
+#: The letter of an axis at the end of a name, behind small letters (screwcompX) or a mark (screw_x).
+_LAST_LETTER = re.compile(r"((?<=[a-z0-9])[XYZ]|(?<=[_.-])[xyzXYZ])$")
+
+
 @dataclass(frozen=True)
 class CompSettings:
     """Settings ``[controllers.linuxcnc-comp]``.
@@ -46,6 +50,7 @@ class CompSettings:
     servo_period_us : [EMCMOT] SERVO_PERIOD, for the warning about small reversal steps.
     max_acceleration_mm_s2 : [JOINT_n] MAX_ACCELERATION of X, Y, Z, for the same, or None if not stated.
     machine_units : [TRAJ] LINEAR_UNITS, ``"mm"`` or ``"inch"``: what the numbers of the files mean to the control.
+    comp_files : COMP_FILE of X, Y, Z in the INI file, for reading tables of the control under any name.
     """
 
     comp_file_type: int
@@ -53,6 +58,7 @@ class CompSettings:
     servo_period_us: float
     max_acceleration_mm_s2: tuple[float, float, float] | None
     machine_units: str
+    comp_files: tuple[str | None, str | None, str | None] = (None, None, None)
 
     @property
     def mm_per_unit(self) -> float:
@@ -82,6 +88,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
             servo_period_us=section.take("servo_period_us", tomlio.positive, 1000.0),
             max_acceleration_mm_s2=section.take("max_acceleration_mm_s2", _positive3, None),
             machine_units=take_machine_units(section),
+            comp_files=_comp_files(section),
         )
         section.finish()
         return settings
@@ -162,6 +169,20 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
             raise InputError(f"no COMP_FILE was given; {', '.join(FILES)} are due")
         return CompTables(found)
 
+    def parse_foreign(
+        self, machine: Machine, settings: CompSettings, files: Sequence[SourceFile]
+    ) -> tuple[CompTables, list[str]]:
+        """Read COMP_FILEs under any name: ``comp_files`` says whose they are, else a letter at the end of the name."""
+        found: dict[int, CompTable] = {}
+        remarks = []
+        for source in files:
+            axis = _axis_of_foreign(source, settings.comp_files)
+            if axis in found:
+                raise source.fail(f"is a second file for {AXES[axis]}; give one per joint")
+            found[axis] = parse_comp(source, settings.comp_file_type, settings.mm_per_unit)
+            remarks.append(f"{source.path.name} was taken for {AXES[axis]}, type {settings.comp_file_type}")
+        return CompTables(found), remarks
+
     def emulate(self, machine: Machine, settings: CompSettings, tables: CompTables, points: Points) -> FloatArray:
         """Return the trims at the commanded positions in the direction of the last travel; its mean if unknown.
 
@@ -239,6 +260,31 @@ def _rows(settings: CompSettings, table: CompTable) -> list[list[float]]:
     if settings.comp_file_type == 0:
         forward, reverse = table.nominal - forward, table.nominal - reverse
     return [list(row) for row in zip(table.nominal.tolist(), forward.tolist(), reverse.tolist(), strict=True)]
+
+
+def _comp_files(section: tomlio.Section) -> tuple[str | None, str | None, str | None]:
+    """``comp_files = { X = "screw.dat" }``: file names, without a folder."""
+    part = section.section("comp_files", required=False)
+    x, y, z = (part.take(letter, tomlio.text, None) for letter in AXES)
+    part.finish()
+    return x, y, z
+
+
+def _axis_of_foreign(source: SourceFile, comp_files: tuple[str | None, ...]) -> int:
+    """The axis of a file: as the machine file states it, by our own rule, or by the last letter of its name."""
+    if source.path.name in comp_files:
+        return comp_files.index(source.path.name)
+    last = _LAST_LETTER.search(source.path.stem)
+    if last and not _AXIS_OF_NAME.search(source.path.name):
+        return AXES.index(last.group(1).upper())
+    try:
+        return _axis_of(source)
+    except InputError:
+        message = (
+            "the name does not say which joint it belongs to; state it in the machine file: [controllers.linuxcnc-comp] "
+            f'comp_files = {{ X = "{source.path.name}" }}'
+        )
+        raise source.fail(message) from None
 
 
 def _axis_of(source: SourceFile) -> int:

@@ -18,7 +18,7 @@ from compgen.controllers.pmac.basis import Ring, pmac_basis, ring_of, tables_fro
 from compgen.controllers.pmac.notes import pmac_notes, table_context
 from compgen.controllers.pmac.settings import PmacSettings, read_pmac_settings
 from compgen.controllers.pmac.tables import PER_COUNT, Backlash, IntArray, Line, PmacTables, Sheet
-from compgen.controllers.pmac.text import parse_pmac
+from compgen.controllers.pmac.text import parse_foreign_pmac, parse_pmac
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
@@ -110,6 +110,26 @@ class Pmac(Controller[PmacSettings, PmacTables]):
                     f"(motors {settings.motors})"
                 )
         return tables
+
+    def parse_foreign(
+        self, machine: Machine, settings: PmacSettings, files: Sequence[SourceFile]
+    ) -> tuple[PmacTables, list[str]]:
+        """Read a download file or backup of a real control; tables of other motors are kept apart and named."""
+        tables, remarks = parse_foreign_pmac(files)
+        known = set(settings.motors)
+        apart = [t for t in (*tables.tables, *tables.backlash) if not _motors(t) <= known]
+        kept = replace(
+            tables,
+            tables=tuple(t for t in tables.tables if _motors(t) <= known),
+            backlash=tuple(t for t in tables.backlash if _motors(t) <= known),
+            constants={motor: value for motor, value in tables.constants.items() if motor in known},
+        )
+        if apart:
+            named = "; ".join(f"motor {t.motor} (uses {_listed(_motors(t))})" for t in apart)
+            remarks.append(f"tables of motors that are no axis of the machine file, kept apart: {named}")
+        if not kept.tables and not kept.backlash:
+            raise files[0].fail(f"holds no table of the motors {_listed(known)}; {remarks[-1]}")
+        return kept, remarks
 
     def emulate(self, machine: Machine, settings: PmacSettings, tables: PmacTables, points: Points) -> FloatArray:
         """Return the sum of all tables of each target, and minus the backlash after negative travel of a motor.
@@ -218,6 +238,10 @@ def _motors(table: Line | Sheet | Backlash) -> set[int]:
         return {table.motor}
     sources = {table.source} if isinstance(table, Line) else {table.row, table.column}
     return sources | {table.target}
+
+
+def _listed(motors: set[int]) -> str:
+    return ", ".join(f"#{motor}" for motor in sorted(motors))
 
 
 def _entries(table: Line | Sheet) -> int:

@@ -21,6 +21,12 @@ _VARIABLE = re.compile(r"I ?([0-9]{1,4}) ?= ?([+-]?[0-9]{1,9})")
 _DELETE = re.compile(r"DELETE ?(?:BL|T)?(?:COMP|BUF)|DELETE ?(?:GATHER|ROTARY|LOOKAHEAD)|CLOSE", re.IGNORECASE)
 _DECLARED = re.compile(r";\s{0,9}tables:\s{0,9}([0-9]{1,4})\s*$")
 _LARGEST = 2**23 - 1
+#: Files of other programs: comments, programs, and what has to do with tables or their switches.
+_COMMENT = re.compile(r";|//")
+_OPEN = re.compile(r"OPEN\b", re.IGNORECASE)
+_CLOSE = re.compile(r"CLOSE", re.IGNORECASE)
+_OF_TABLES = re.compile(r"(?<!T)COMP\b|\bI ?(?:0?51|[0-9]{1,2}86)\b", re.IGNORECASE)
+_NO_COMMA = re.compile(r"(COMP ?[0-9]{1,6}(?:\.[0-9]{1,6})?) ?(?=#)", re.IGNORECASE)
 _MOST_MOTOR = 32
 _MOST_ENTRIES = 150_000
 
@@ -172,7 +178,11 @@ def _sheet(table: _Open, values: IntArray) -> Sheet:
 
 def parse_pmac(files: Sequence[SourceFile]) -> PmacTables:
     """Return the tables of all files; InputError with file and line for anything malformed or cut."""
-    readers = [_read(source) for source in files]
+    return _joined([_read(source) for source in files])
+
+
+def _joined(readers: Sequence[_Reader]) -> PmacTables:
+    """The tables of all files; a motor has one of each kind."""
     owners: dict[tuple[bool, int], SourceFile] = {}
     for reader in readers:
         for table in (*reader.tables, *reader.backlash):
@@ -188,20 +198,56 @@ def parse_pmac(files: Sequence[SourceFile]) -> PmacTables:
     )
 
 
+def parse_foreign_pmac(files: Sequence[SourceFile]) -> tuple[PmacTables, list[str]]:
+    """Return the tables of files that this program did not write, and what was passed over in one line.
+
+    A size may stand before the sources without a comma, entries may be separated by commas, comments hold any character.
+    Motion and PLC programs and commands that have nothing to do with tables are passed over; a line with a table or its
+    switch that is not understood is an InputError.
+    """
+    readers, passed = [], 0
+    for source in files:
+        reader, program = _Reader(source), False
+        text = source.text.replace("\r\n", "\n").replace("\r", "\n")
+        for line, raw in enumerate(text.split("\n"), start=1):
+            code = " ".join(_COMMENT.split(raw, maxsplit=1)[0].split())
+            program = (program or bool(_OPEN.match(code))) and not _CLOSE.fullmatch(code)
+            if reader.open is not None:
+                reader.take(line, code.replace(",", " "))
+            elif code and not program and _OF_TABLES.search(code):
+                reader.take(line, _NO_COMMA.sub(r"\1,", code))
+            elif code and not program and (address := _ADDRESS.fullmatch(code)):
+                reader.take(line, address.group())
+            elif code:
+                passed += 1
+        readers.append(_complete(reader, len(text.split("\n"))))
+    remarks = [f"passed over: commands and programs without a table ({passed} lines)"] if passed else []
+    tables = _joined(readers)
+    if tables.enabled is None:
+        remarks.append("no file sets I51: the tables are taken as switched on")
+    return tables, remarks
+
+
 def _read(source: SourceFile) -> _Reader:
     reader, line = _Reader(source), 0
     for line, text in content_lines(source, ";"):
         reader.take(line, text)
-    if reader.open is not None:
-        table = reader.open
-        have = f"{len(table.entries)} of {table.count} entries"
-        raise source.fail(f"the table in line {table.line} has {have}: the file was cut", line)
+    _complete(reader, line)
     count = len(reader.tables) + len(reader.backlash)
     declared = next((m for text in source.text.split("\n")[:50] if (m := _DECLARED.match(text[:200].strip()))), None)
     if declared and int(declared.group(1)) != count:
         raise source.fail(f"declares {declared.group(1)} tables but holds {count}: it was cut or edited by hand")
     if declared and (reader.enabled is None or not source.text.endswith("\n")):
         raise source.fail("has no I51 at its end: it was cut")
-    if not count:
-        raise source.fail("holds no compensation table")
+    return reader
+
+
+def _complete(reader: _Reader, line: int) -> _Reader:
+    """Return the reader if its file holds a table, and all of it."""
+    if reader.open is not None:
+        table = reader.open
+        have = f"{len(table.entries)} of {table.count} entries"
+        raise reader.source.fail(f"the table in line {table.line} has {have}: the file was cut", line)
+    if not reader.tables and not reader.backlash:
+        raise reader.source.fail("holds no compensation table")
     return reader

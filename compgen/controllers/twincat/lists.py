@@ -26,7 +26,7 @@ from compgen.controllers.twincat.tables import (
     spans_mm,
     stored_sums,
 )
-from compgen.controllers.twincat.text import parse_axis_list
+from compgen.controllers.twincat.text import Foreign, parse_axis_list
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
@@ -86,10 +86,28 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         """Read the lists of one or more axes, in any order."""
         if not files:
             raise InputError("no axis list was given; achskw1.lis is one")
+        return self._parsed(settings, files, None)
+
+    def parse_foreign(
+        self, machine: Machine, settings: TwincatSettings, files: Sequence[SourceFile]
+    ) -> tuple[TwincatTables, list[str]]:
+        """Read lists of a real control: reserved entries and other structures are passed over, other axes kept apart."""
+        foreign = Foreign()
+        tables = self._parsed(settings, files, foreign)
+        if not any(item != AxisList() for item in tables.lists.values()):
+            raise files[0].fail("; ".join(["holds no table of an axis of the machine file", *foreign.remarks()]))
+        return tables, foreign.remarks()
+
+    @staticmethod
+    def _parsed(settings: TwincatSettings, files: Sequence[SourceFile], foreign: Foreign | None) -> TwincatTables:
         lists: dict[int, AxisList] = {}
         seen: dict[int, SourceFile] = {}
         for source in files:
-            axis, item = parse_axis_list(source, settings.axis_names, settings.logical_axes)
+            axis, item = parse_axis_list(
+                source, settings.axis_names, settings.logical_axes, settings.increment_mm, foreign
+            )
+            if axis is None:
+                continue
             if axis in seen:
                 raise source.fail(f"is a second list of axis {AXES[axis]} beside {seen[axis].path.name}")
             lists[axis], seen[axis] = item, source

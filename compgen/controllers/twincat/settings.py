@@ -10,7 +10,7 @@ from compgen.controllers.grids import take_loss_mm
 from compgen.controllers.twincat.tables import Most
 from compgen.core import tomlio
 from compgen.core.machine import Machine
-from compgen.core.names import AXES
+from compgen.core.names import AXES, MM_PER_UM
 from compgen.errors import InputError
 
 #: Points that builds without the parameters P-COMP-00059 ... 61 take.
@@ -35,6 +35,7 @@ class TwincatSettings:
     n_cycles : cycles over which a switched cross or plane correction is smoothed.
     most : points that the control takes.
     loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
+    increment_mm : encoder increments of X, Y, Z, in which lists with ``unit 0`` hold their values; None: not stated.
     """
 
     cross_sign: str
@@ -48,6 +49,7 @@ class TwincatSettings:
     n_cycles: int
     most: Most
     loss_mm: float
+    increment_mm: tuple[float | None, float | None, float | None]
 
     @property
     def digits(self) -> int:
@@ -90,6 +92,7 @@ def read_twincat_settings(machine: Machine, name: str) -> TwincatSettings:
         n_cycles=section.take("n_cycles", tomlio.whole(0, 1000), 10),
         most=most,
         loss_mm=take_loss_mm(section),
+        increment_mm=_increments(section),
     )
     section.finish()
     return settings
@@ -102,6 +105,15 @@ def _per_axis(section: tomlio.Section, key: str, check: Any, defaults: Any) -> t
     if key != "planes" and len(set(found)) != 3:
         raise _doubled(section, key, found)
     return found
+
+
+def _increments(section: tomlio.Section) -> tuple[float | None, float | None, float | None]:
+    """``increment_um = { X = ..., ... }`` in mm."""
+    part = section.section("increment_um", required=False)
+    found = [part.take(letter, tomlio.positive, None) for letter in AXES]
+    part.finish()
+    x, y, z = (None if value is None else value * MM_PER_UM for value in found)
+    return x, y, z
 
 
 def _doubled(section: tomlio.Section, key: str, found: tuple[Any, ...]) -> InputError:

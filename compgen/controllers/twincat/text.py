@@ -16,8 +16,9 @@ import numpy as np
 
 from compgen.controllers.base import SourceFile
 from compgen.controllers.isg.parameters import check_complete, content_lines
-from compgen.controllers.twincat.tables import AxisList, Cross, Plane, Screw
+from compgen.controllers.twincat.tables import MM_PER_UNIT, AxisList, Cross, Plane, Screw
 from compgen.core.csvio import FloatArray
+from compgen.core.names import AXES
 from compgen.core.text import nearest, one_line
 from compgen.errors import InputError
 
@@ -40,6 +41,7 @@ _TABLES: dict[str, tuple[int, tuple[str, ...]]] = {
     "kw.crosscomp": (1, ("setpoint", "correction")),
     "kw.crosscomp2": (2, ("correction",)),
 }
+_RESERVED = re.compile(r"res(?:erve)?[0-9]{0,2}")
 _LARGEST = 2.0**53
 _MOST_POINTS = 150_000
 
@@ -51,12 +53,30 @@ class _Entry:
 
 
 @dataclass
+class Foreign:
+    """What is passed over in a list that this program did not write: numbers of lines, and tables kept apart."""
+
+    counts: dict[str, int] = field(default_factory=dict)
+    apart: list[str] = field(default_factory=list)
+
+    def remarks(self) -> list[str]:
+        """Return at most one line for each of both."""
+        passed = ", ".join(f"{what} ({number})" for what, number in self.counts.items())
+        found = [f"passed over: {passed}"] if passed else []
+        return found + (
+            [f"of axes that the machine file does not have, kept apart: {'; '.join(self.apart)}"] if self.apart else []
+        )
+
+
+@dataclass
 class _Body:
     """The entries of one file: parameters by structure and name, table entries by structure, name and index."""
 
     source: SourceFile
     axis_names: tuple[str, ...]
     logical_axes: tuple[int, ...]
+    increment_mm: tuple[float | None, ...] = (None, None, None)
+    foreign: Foreign | None = None
     scalars: dict[tuple[str, str], _Entry] = field(default_factory=dict)
     tables: dict[tuple[str, str], dict[tuple[int, ...], _Entry]] = field(default_factory=dict)
 
@@ -118,10 +138,21 @@ def _label(structure: str, name: str, index: Sequence[int]) -> str:
 
 
 def parse_axis_list(
-    source: SourceFile, axis_names: tuple[str, ...], logical_axes: tuple[int, ...]
-) -> tuple[int, AxisList]:
-    """Return the axis (0..2) of a list and its tables; InputError with file and line for anything malformed."""
-    body = _Body(source, axis_names, logical_axes)
+    source: SourceFile,
+    axis_names: tuple[str, ...],
+    logical_axes: tuple[int, ...],
+    increment_mm: tuple[float | None, ...],
+    foreign: Foreign | None = None,
+) -> tuple[int | None, AxisList]:
+    """Return the axis (0..2) of a list and its tables; InputError with file and line for anything malformed.
+
+    ``increment_mm`` are the encoder increments of the axes for lists with ``unit 0``. With ``foreign`` the list is that of
+    another program: comments hold any character, reserved entries and other structures are passed over, and the axis is
+    None where the machine file does not have it.
+    """
+    if foreign is not None:
+        source = SourceFile(source.path, source.text.encode("ascii", "replace").decode().replace("\0", "?"))
+    body = _Body(source, axis_names, logical_axes, increment_mm, foreign)
     count = 0
     for line, text in content_lines(source, "#"):
         if code := _without_comment(source, line, text):
@@ -131,13 +162,36 @@ def parse_axis_list(
         raise source.fail("holds no entry; is it the right file?")
     check_complete(source, count, "entries")
     older = ("kopf", "achs_nr") not in body.scalars and ("kopf", "log_achs_nr") in body.scalars
-    axis = body.axis("kopf", "log_achs_nr" if older else "achs_nr")
+    key = "log_achs_nr" if older else "achs_nr"
+    if foreign is not None and _is_apart(body, "kopf", key):
+        foreign.apart.append(f"the list of axis {body.whole('kopf', key, 0, 65535)} ({source.path.name})")
+        return None, AxisList()
+    axis = body.axis("kopf", key)
     present = {structure for structure, _ in (*body.scalars, *body.tables)}
+    if foreign is not None:
+        present -= {name for name in present if _kept_apart(body, name)}
     return axis, AxisList(
-        _screw(body) if "kw.ssfk" in present else None,
-        _cross(body) if "kw.crosscomp" in present else None,
-        _plane(body) if "kw.crosscomp2" in present else None,
+        _screw(body, axis) if "kw.ssfk" in present else None,
+        _cross(body, axis) if "kw.crosscomp" in present else None,
+        _plane(body, axis) if "kw.crosscomp2" in present else None,
     )
+
+
+_MASTERS = {"kw.crosscomp": ("master_ax_nr",), "kw.crosscomp2": ("master1_ax_nr", "master2_ax_nr")}
+
+
+def _is_apart(body: _Body, structure: str, name: str) -> bool:
+    """Whether a logical axis number is none of the machine file's."""
+    return body.whole(structure, name, 0, 65535) not in body.logical_axes
+
+
+def _kept_apart(body: _Body, structure: str) -> bool:
+    """Name a table whose master the machine file does not have, and say so."""
+    missing = [name for name in _MASTERS.get(structure, ()) if _is_apart(body, structure, name)]
+    if missing and body.foreign is not None:
+        number = body.whole(structure, missing[0], 0, 65535)
+        body.foreign.apart.append(f"{structure} of {body.source.path.name} (master {number})")
+    return bool(missing)
 
 
 def _without_comment(source: SourceFile, line: int, text: str) -> str:
@@ -159,6 +213,9 @@ def _take(body: _Body, line: int, code: str) -> None:
         raise body.source.fail(f"{key} has no value", line)
     entry = _Entry(words[1].strip(), line)
     head, _, name = f"{match.group(1)}.{match.group(2)}".rpartition(".")
+    if body.foreign is not None and (what := _idle(head, name)):
+        body.foreign.counts[what] = body.foreign.counts.get(what, 0) + 1
+        return
     if match.group(3):
         index = tuple(int(part) for part in match.group(3)[1:-1].split("]["))
         known = name == "table" and head in _TABLES and match.group(4) in _TABLES[head][1]
@@ -174,15 +231,32 @@ def _take(body: _Body, line: int, code: str) -> None:
         raise body.source.fail(f"{key} stands here a second time; the first is in line {first.line}", line)
 
 
+def _idle(head: str, name: str) -> str:
+    """What an entry of another program's list is that has no bearing on the three tables; empty if it has."""
+    if head in _TABLES:
+        return f"reserved entries of {head}" if _RESERVED.fullmatch(name) else ""
+    return "" if head == "kopf" and name in _KNOWN["kopf"] else f"entries of {head}"
+
+
 def _unknown(body: _Body, line: int, key: str) -> InputError:
     known = [f"{head}.{name}" for head, names in _KNOWN.items() for name in names]
     known += [_label(head, name, [0] * count) for head, (count, names) in _TABLES.items() for name in names]
     return body.source.fail(f"{key[:60]!r} is not a parameter of these lists; {nearest(key[:60], known)}", line)
 
 
-def _check_unit(body: _Body, structure: str) -> None:
-    if body.whole(structure, "unit", 0, 1) == 0:
-        raise body.fail(structure, "unit", "0 means encoder increments, which have no known length here; 1 is due")
+def _values(body: _Body, structure: str, axis: int, values: FloatArray) -> FloatArray:
+    """Values of a table in 0.1 um: ``unit`` 1 as they are, 0 in encoder increments of the axis; positions are not concerned."""
+    if body.whole(structure, "unit", 0, 1) == 1 or not np.any(values):
+        return values
+    length_mm = body.increment_mm[axis]
+    if length_mm is None:
+        raise body.fail(
+            structure,
+            "unit",
+            f"0 means that the values are encoder increments, whose length the list does not hold: state it in the machine "
+            f"file, e.g. increment_um = {{ {AXES[axis]} = 0.1 }}, or write unit 1 and values in 0.1 um",
+        )
+    return values * (length_mm / MM_PER_UNIT)
 
 
 def _ascending(body: _Body, structure: str, setpoints: FloatArray) -> FloatArray:
@@ -195,9 +269,8 @@ def _ascending(body: _Body, structure: str, setpoints: FloatArray) -> FloatArray
     return setpoints
 
 
-def _screw(body: _Body) -> Screw:
+def _screw(body: _Body, axis: int) -> Screw:
     name = "kw.ssfk"
-    _check_unit(body, name)
     if body.whole(name, "modulo", 0, 1, 0):
         raise body.fail(name, "modulo", "1 belongs to rotary axes; the model has three linear ones")
     count = body.whole(name, "kw_nr_max", 1, _MOST_POINTS)
@@ -213,7 +286,8 @@ def _screw(body: _Body) -> Screw:
     two_sided = body.whole(name, "bilateral", 0, 1, 0) == 1
     if two_sided or (name, "neg") in body.tables:
         neg = body.column(name, "neg", (count,))
-    return Screw(setpoints, pos, neg if two_sided else None, interval)
+    other = _values(body, name, axis, neg) if two_sided else None
+    return Screw(setpoints, _values(body, name, axis, pos), other, interval)
 
 
 def _refuse(body: _Body, structure: str, name: str, message: str) -> None:
@@ -221,17 +295,16 @@ def _refuse(body: _Body, structure: str, name: str, message: str) -> None:
         raise body.source.fail(f"{_label(structure, name, index)}: {message}", entry.line)
 
 
-def _cross(body: _Body) -> Cross:
+def _cross(body: _Body, axis: int) -> Cross:
     name = "kw.crosscomp"
-    _check_unit(body, name)
     count = body.whole(name, "last_index", 0, _MOST_POINTS - 1) + 1
     setpoints = _ascending(body, name, body.column(name, "setpoint", (count,)))
-    return Cross(body.axis(name, "master_ax_nr"), setpoints, body.column(name, "correction", (count,)))
+    values = _values(body, name, axis, body.column(name, "correction", (count,)))
+    return Cross(body.axis(name, "master_ax_nr"), setpoints, values)
 
 
-def _plane(body: _Body) -> Plane:
+def _plane(body: _Body, axis: int) -> Plane:
     name = "kw.crosscomp2"
-    _check_unit(body, name)
     first, second = (body.whole(name, f"last_index_master{k}", 0, _MOST_POINTS - 1) + 1 for k in (1, 2))
     if first * second > _MOST_POINTS:
         raise body.fail(name, "last_index_master2", f"gives {first} x {second} points; at most {_MOST_POINTS} are read")
@@ -242,4 +315,5 @@ def _plane(body: _Body) -> Plane:
     if masters[0] == masters[1]:
         raise body.fail(name, "master2_ax_nr", "is the first master too; a plane needs two axes")
     starts = (body.number(name, "start_position_master1"), body.number(name, "start_position_master2"))
-    return Plane(masters, starts, interval, body.column(name, "correction", (second, first)))
+    values = _values(body, name, axis, body.column(name, "correction", (second, first)))
+    return Plane(masters, starts, interval, values)
