@@ -62,6 +62,10 @@ METHOD_HELP = {
     "located with the machine taken as perfect.",
     "no_temperature": "Leave the scales at the temperature that they had; by default they are corrected to 20 degC where the "
     "file has temp_x_c, temp_y_c, temp_z_c and the machine file expansion_um_per_m_k.",
+    "part_scale": "Scale of a measured part (*.part.csv): known (default: 1, or by the temperatures in the file), or free: one "
+    "unknown scale for each set-up, which takes the mean of the scale errors of the axes with it.",
+    "travel": "machine (default): curves over the whole travel, nodes that no reading reaches tied by smoothness; from-data: "
+    "over the range that the readings cover. For parts, and deviations at one height or without a component.",
     "u_deviation_um": "Standard uncertainty of a measured deviation (*.deviations.csv), um; default: the file's, else 1 um "
     "scaled by the residuals.",
 }
@@ -107,10 +111,16 @@ def method_options(command: Command) -> Command:
     def wrapper(*args: Any, method: str, stations: str | None, no_temperature: bool, **options: Any) -> Any:
         known = read_stations(stations) if stations not in (None, "nominal") else stations
         choices = {"method": method, "stations": known, "temperature": not no_temperature}
-        choices["u_deviation_um"] = options.pop("u_deviation_um")
+        choices |= {name: options.pop(name) for name in ("u_deviation_um", "part_scale", "travel")}
         return command(*args, choices=choices, **options)
 
     decorated: Any = click.option("--u-deviation-um", type=float, help=METHOD_HELP["u_deviation_um"])(wrapper)
+    for option, name, values in (
+        ("--part-scale", "part_scale", ("known", "free")),
+        ("--range", "travel", ("machine", "from-data")),
+    ):
+        kind = click.Choice(values)
+        decorated = click.option(option, name, type=kind, default=values[0], help=METHOD_HELP[name])(decorated)
     decorated = click.option("--no-temperature", is_flag=True, help=METHOD_HELP["no_temperature"])(decorated)
     decorated = click.option("--stations", metavar="FILE", help=METHOD_HELP["stations"])(decorated)
     chosen = click.option("--method", type=click.Choice(METHODS), default="joint", help=METHOD_HELP["method"])

@@ -36,6 +36,15 @@ LARGEST_UM = 1e5
 
 
 @dataclass(frozen=True)
+class RoughPose:
+    """Where a frame lies in another: measured - ``measured_mm`` = ``rotation`` (nominal - ``nominal_mm``), (3,), (3, 3)."""
+
+    nominal_mm: FloatArray
+    measured_mm: FloatArray
+    rotation: FloatArray
+
+
+@dataclass(frozen=True)
 class Deviations:
     """Actual minus commanded position of the tool tip, at n positions.
 
@@ -50,6 +59,7 @@ class Deviations:
     covariates : further numbers by column name (time_s, temp_..., ...), each of shape (n,).
     metadata : comments ``key = value`` of the file.
     origin : (file, line) of each row, for messages.
+    poses : by set-up, the pose that was taken out of the coordinates of a part; empty for deviations as they were measured.
     """
 
     position_mm: FloatArray
@@ -61,6 +71,7 @@ class Deviations:
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
     metadata: Mapping[str, str] = field(default_factory=dict)
     origin: Sequence[tuple[str, int]] = ()
+    poses: Mapping[int, RoughPose] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of positions."""

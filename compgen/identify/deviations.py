@@ -19,6 +19,7 @@ from compgen.core.names import MM_PER_UM
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjustment import Adjustment
 from compgen.identify.effects import without_effects
+from compgen.identify.free_pose import identify_with_free_pose, needs_free_pose
 from compgen.identify.noise import IdentifyOptions
 from compgen.identify.outliers import Rejected, accepted_readings
 from compgen.identify.parameters import ErrorParameters, common_tool, parameters_for_tools
@@ -60,9 +61,11 @@ def identify_deviations(
         if no optimum is reached.
     """
     chosen = options or IdentifyOptions()
+    check_travel(machine, deviations.position_mm, deviations.origin)
     with one_thread():
         deviations, effects = without_effects(machine, deviations)
-        found = _identify(machine, deviations, chosen)
+        identified = identify_with_free_pose if needs_free_pose(deviations) else _identify
+        found = identified(machine, deviations, chosen)
         return replace(found, corrections={**found.corrections, "effects": effects}) if effects else found
 
 
@@ -76,7 +79,6 @@ class _Components:
 
 
 def _identify(machine: Machine, deviations: Deviations, options: IdentifyOptions) -> Identification:
-    check_travel(machine, deviations.position_mm, deviations.origin)
     tool_mm = common_tool(machine, deviations.tool_mm)
     layout = parameters_for_tools(machine, tool_mm)
     components = _components(deviations, options)

@@ -14,6 +14,7 @@ from compgen.core.error_table import ErrorTable
 from compgen.core.lengths import Lengths, read_lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
+from compgen.core.parts import PART, holds_parts, read_parts
 from compgen.errors import InputError
 from compgen.identify.axis_runs import identify_axis_runs
 from compgen.identify.deviations import identify_deviations
@@ -82,6 +83,12 @@ def _read_others(paths: Sequence[str | Path]) -> Lengths | Deviations | AxisRuns
         if holds_diagonals(path):
             text = "holds measured diagonals, from which no errors are identified; accuracy and compare evaluate them"
             raise InputError(text, file=path)
+    parts = [holds_parts(path) for path in paths]
+    if any(parts) and not all(parts):
+        message = "holds no features of a part, and another file does; identify them one after the other"
+        raise InputError(message, file=paths[parts.index(False)])
+    if any(parts):
+        return read_parts(paths)
     along = [holds_axis_runs(path) for path in paths]
     if any(along) and not all(along):
         message = "holds no axis runs, and another file does; identify them one after the other"
@@ -104,7 +111,8 @@ def describe(measurement: Measurement | ErrorTable) -> str:
     if isinstance(measurement, SixDofMeasurement):
         return f"{len(measurement)} six-DOF readings in {len(measurement.readings.runs())} runs"
     if isinstance(measurement, Deviations):
-        return f"{len(measurement)} measured positions"
+        what = "features of parts" if measurement.metadata.get("measured") == PART else "measured positions"
+        return f"{len(measurement)} {what}"
     if isinstance(measurement, AxisRuns):
         return f"{len(measurement)} readings along {', '.join(AXES[axis] for axis in measurement.axes)}"
     return f"{len(measurement)} lengths of {len(measurement.stations)} stations"

@@ -34,6 +34,10 @@ class IdentifyOptions:
     ``method`` is "joint" or "two-step" (:mod:`compgen.identify.two_step`). ``stations`` are known beforehand, or located
     with the machine taken as perfect ("nominal"). ``u_deviation_um`` is the standard uncertainty of a measured deviation;
     it belongs to deviations files only. ``temperature`` False leaves the scales at the temperature that they had.
+
+    ``part_scale`` "free" takes one scale out of each set-up of a part (its temperature is not known), and ``travel``
+    "from-data" lets the curves end where the readings do; both belong to positions in frames of unknown pose
+    (:mod:`compgen.identify.free_pose`).
     """
 
     u_length_um: float | None = None
@@ -44,6 +48,8 @@ class IdentifyOptions:
     stations: KnownStations | Literal["nominal"] | None = None
     u_deviation_um: float | None = None
     temperature: bool = True
+    part_scale: Literal["known", "free"] = "known"
+    travel: Literal["machine", "from-data"] = "machine"
 
 
 @dataclass(frozen=True)

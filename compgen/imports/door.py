@@ -17,6 +17,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.deviations import Deviations, read_deviations
 from compgen.core.error_table import ErrorTable, read_errors
 from compgen.core.lengths import Lengths, read_lengths
+from compgen.core.parts import read_parts
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify.axis_runs import positioning_errors
 from compgen.identify.measurement import Measurement, read_measurement
@@ -28,6 +29,7 @@ _OWN_READERS: dict[str | None, Callable[[Path], Plain]] = {
     "lengths": read_lengths,
     "deviations": read_deviations,
     "axis": read_axis_runs,
+    "part": read_parts,
 }
 
 
@@ -88,7 +90,7 @@ def _measured_or_errors(path: Path, axis: str | None) -> Plain | ErrorTable:
 
 def _is_unknown_csv(path: Path) -> bool:
     """Whether a file is meant to be one of the project's own, so that its own reader says best what is missing."""
-    own = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv")
+    own = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv", ".part.csv")
     return path.name.lower().endswith(own)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from compgen.controllers.isg.etalon_exchange import is_exchange_text
 from compgen.core.axis_runs import AxisRuns
 from compgen.core.deviations import Deviations
+from compgen.core.parts import MEASURED_COLUMNS
 from compgen.errors import CompgenError, InputError
 from compgen.imports.capture import MOST_BYTES as MOST_CAPTURE
 from compgen.imports.capture import is_capture
@@ -68,6 +69,8 @@ def own_kind(path: Path) -> str | None:
     names = {name.strip().strip('"') for name in header.split(",")}
     if "y_qd1_mm" in names or "y_psd1_mm" in names:
         return "sixdof"
+    if {"x_mm", "y_mm"} <= names and names & set(MEASURED_COLUMNS):
+        return "part"
     for kind, needed in OWN.items():
         if needed <= names and (kind != "deviations" or names & _DEVIATIONS):
             check_size(path, MOST_OWN_BYTES)

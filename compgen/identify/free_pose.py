@@ -1,0 +1,552 @@
+"""Errors from positions measured in frames of unknown pose, in any of their components: what they determine, no more.
+
+The positions are features of parts (``*.part.csv``) or measured deviations that lack a component, lie at one height, or
+come from several set-ups. Component i of position j, measured in set-up s, is to first order
+
+    d_ij = e_i . (shift_s + turn_s x p_j + scale_s p_j + C(p_j) P)
+
+P are the errors of the machine's model, C as in E = C P. The pose (shift, turn) of every set-up is unknown, its scale
+unknown or given by temperatures. Such data rarely determine the whole model: at one height nothing over Z is seen, without
+dz no straightness in Z. So directions of the unknowns that no reading shows are found (singular values) and stay zero;
+errors of which nothing is seen are left out and named. Where only nodes at the ends of a curve see no reading, they are
+tied to the others by smoothness, and their uncertainty grows as that of an extrapolation.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from compgen.core.csvio import FloatArray
+from compgen.core.deviations import DEVIATION_COLUMNS, Deviations
+from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.machine import Axis, Machine
+from compgen.core.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.core.parts import PART, aligned, setups_of
+from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.identify.noise import IdentifyOptions
+from compgen.identify.outliers import Rejected, accepted_readings
+from compgen.identify.parameters import ErrorParameters, error_parameters
+from compgen.identify.result import Identification, worst_uncertainty
+from compgen.identify.tables import metadata_of
+from compgen.model.basis import hat_matrix
+from compgen.model.observability import modelled_errors
+from compgen.model.volumetric import c_matrix, tool_of
+
+IntArray = NDArray[np.int64]
+#: Directions whose singular value is below this share of the largest are not determined; columns have unit length.
+SHOWS, RCOND = 1e-6, 1e-9
+#: Angles are counted in mm at this lever, so that they compare with translations.
+LEVER_MM = 1000.0
+#: An error counts as identified if readings determine this share of its unknowns, or one direction at least.
+SEEN = 1e-6
+#: Curvature of a curve between neighbouring nodes where too few of them are seen to measure it, um and urad.
+USUAL_BEND = 2.0
+ASSUMED_U_UM = 1.0
+MOST_REJECTED, MOST_ROUNDS = 0.3, 20
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where the frame of one set-up lies: measured = offset + rotation(scale x (nominal + error)).
+
+    ``offset_mm`` (3,) is that of the nominal origin, ``turn_rad`` (3,) the rotation vector; nan in components that the
+    readings do not show. ``scale`` is 1 where it was not free.
+    """
+
+    setup: int
+    offset_mm: FloatArray
+    turn_rad: FloatArray
+    scale: float
+    u_scale: float
+    readings: int
+
+    def summary(self) -> dict[str, Any]:
+        """Return the pose for ``identify.json``."""
+        return {
+            "setup": self.setup,
+            "offset_mm": [None if np.isnan(value) else float(value) for value in self.offset_mm],
+            "rotation_deg": [None if np.isnan(value) else float(np.degrees(value)) for value in self.turn_rad],
+            "scale": self.scale,
+            "u_scale": self.u_scale,
+            "readings": self.readings,
+        }
+
+
+@dataclass(frozen=True)
+class _Readings:
+    """The k measured components: position (k, 3), component 0..2, deviation in mm, its sigma, set-up number (k,).
+
+    ``arm_mm`` (k, 3) is the position from the centre of the set-up.
+    """
+
+    row: IntArray
+    component: IntArray
+    position_mm: FloatArray
+    arm_mm: FloatArray
+    tool_mm: FloatArray
+    deviation_mm: FloatArray
+    sigma_mm: FloatArray
+    setup: IntArray
+
+    def kept(self, mask: NDArray[np.bool_]) -> _Readings:
+        return _Readings(*(getattr(self, name)[mask] for name in self.__dataclass_fields__))
+
+
+def needs_free_pose(deviations: Deviations) -> bool:
+    """Whether readings are features of parts, lack a component or an axis, or come from several set-ups."""
+    measured = np.isfinite(deviations.deviation_mm).any(axis=0)
+    flat = bool((np.ptp(deviations.position_mm, axis=0) < 1e-6).any()) if len(deviations) else False
+    several = "setup" in deviations.labels and len(np.unique(deviations.labels["setup"])) > 1
+    return deviations.metadata.get("measured") == PART or not measured.all() or flat or several
+
+
+def identify_with_free_pose(machine: Machine, deviations: Deviations, options: IdentifyOptions) -> Identification:
+    """Identify what positions in frames of unknown pose determine.
+
+    Parameters
+    ----------
+    machine : chain, nodes, reference point and the errors that its model contains.
+    deviations : measured minus nominal coordinates, any components; the label ``setup`` tells the frames apart.
+    options : ``u_deviation_um``, ``reject``, ``part_scale`` ("free", or "known": 1, or what the temperatures say) and
+        ``travel`` ("machine", or "from-data": curves over the range that the readings cover).
+
+    Raises
+    ------
+    InputError
+        for temperatures without the coefficient of expansion of the part.
+    UndeterminedError
+        where no error at all is determined.
+    """
+    deviations = _at_20_degrees(deviations if deviations.poses else aligned(deviations))
+    if options.travel == "from-data":
+        machine = _within(machine, deviations.position_mm)
+    sigma, source = _sigma(deviations, options)
+    readings = _readings(machine, deviations, sigma)
+    solution, accepted = _robustly(machine, readings, options)
+    _say_what_is_not_reached(machine, solution)
+    return _result(machine, deviations, readings, solution, accepted, source)
+
+
+def _at_20_degrees(deviations: Deviations) -> Deviations:
+    """Measured coordinates brought to the size that the part has at 20 degC, and to that it had when it was machined.
+
+    ``temp_part_c`` is the temperature of the part while it was measured, ``temp_machined_c`` while it was machined.
+    """
+    names = ("temp_part_c", "temp_machined_c")
+    if not any(name in deviations.covariates for name in names):
+        return deviations
+    text = deviations.metadata.get("expansion_um_per_m_k", "")
+    try:
+        expansion = float(text) * 1e-6
+    except ValueError:
+        raise InputError(
+            f"has {' and '.join(n for n in names if n in deviations.covariates)}, but the comment expansion_um_per_m_k is "
+            f"{text!r}; give the part's coefficient of expansion, e.g. # expansion_um_per_m_k = 11.5",
+            file=deviations.origin[0][0] if deviations.origin else None,
+        ) from None
+    measured, machined = (np.nan_to_num(deviations.covariates.get(n, 20.0) - np.array(20.0)) for n in names)
+    # the part grew by the difference of the two temperatures between the machine and the measurement
+    growth = (expansion * (measured - machined))[..., None]
+    actual = deviations.position_mm + deviations.deviation_mm
+    return replace(deviations, deviation_mm=deviations.deviation_mm - growth * actual)
+
+
+def _within(machine: Machine, position_mm: FloatArray) -> Machine:
+    """The machine with the travel that the positions cover; nodes as far apart as before, the reference point inside."""
+    axes = []
+    for k, axis in enumerate(machine.axes):
+        low, high = float(position_mm[:, k].min()), float(position_mm[:, k].max())
+        if high - low < 1e-6:
+            axes.append(axis)
+            continue
+        share = (high - low) / (axis.range_mm[1] - axis.range_mm[0])
+        count = max(2, int(np.ceil(share * (len(axis.nodes_mm) - 1) - 1e-9)) + 1)
+        axes.append(Axis((low, high), np.linspace(low, high, count), axis.expansion_um_per_m_k, axis.screw_pitch_mm))
+    low_mm, high_mm = np.array([axis.range_mm for axis in axes]).T
+    x, y, z = np.clip(machine.reference_point_mm, low_mm, high_mm).tolist()
+    return replace(machine, axes=(axes[0], axes[1], axes[2]), reference_point_mm=(x, y, z))
+
+
+def _sigma(deviations: Deviations, options: IdentifyOptions) -> tuple[FloatArray, str]:
+    """Standard uncertainty of each component (n, 3), mm, and where it comes from."""
+    if options.u_deviation_um is None and deviations.u_mm is not None:
+        return deviations.u_mm, "stated"
+    text = deviations.metadata.get("u_deviation_um")
+    try:
+        stated = options.u_deviation_um if text is None or options.u_deviation_um is not None else float(text)
+    except ValueError:
+        raise InputError(f"the comment u_deviation_um = {text!r} is not a number") from None
+    if stated is not None and not 0 < stated < np.inf:
+        raise InputError(f"the uncertainty of a deviation is {stated:g} um; it must be above zero")
+    u_um = ASSUMED_U_UM if stated is None else stated
+    return np.full(deviations.deviation_mm.shape, u_um * MM_PER_UM), "assumed" if stated is None else "stated"
+
+
+def _readings(machine: Machine, deviations: Deviations, sigma_mm: FloatArray) -> _Readings:
+    row, component = np.nonzero(np.isfinite(deviations.deviation_mm))
+    tools = np.broadcast_to(tool_of(machine, deviations.tool_mm), deviations.position_mm.shape)
+    setups = setups_of(deviations)
+    centre = np.array([deviations.poses[setup].nominal_mm for setup in setups.tolist()])
+    # a coordinate that was not measured has no centre of its own
+    centre = np.where(np.isfinite(deviations.deviation_mm).any(axis=0), centre, deviations.position_mm.mean(axis=0))
+    return _Readings(
+        row.astype(np.int64),
+        component.astype(np.int64),
+        deviations.position_mm[row],
+        (deviations.position_mm - centre)[row],
+        tools[row],
+        deviations.deviation_mm[row, component],
+        sigma_mm[row, component],
+        setups[row],
+    )
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Optimum: unknown errors with a factor F of their covariance (F F^T), poses (set-ups, 7), residuals (all readings, k).
+
+    ``tied`` are nodes that no reading reaches, by error; ``left_out`` the errors of which nothing is seen; ``partly`` those
+    of which a part is not determined.
+    """
+
+    layout: ErrorParameters
+    unknowns: FloatArray
+    factor: FloatArray
+    poses: FloatArray
+    u_scale: FloatArray
+    residual_mm: FloatArray
+    rank: int
+    tied: Mapping[str, FloatArray]
+    left_out: tuple[str, ...]
+    partly: tuple[str, ...]
+
+
+def _robustly(machine: Machine, readings: _Readings, options: IdentifyOptions) -> tuple[_Solution, NDArray[np.bool_]]:
+    """Solve, reject what lies beyond the robust limit, and repeat until the same components are kept."""
+    accepted = np.ones(len(readings.row), dtype=bool)
+    solution = _solve(machine, readings, accepted, free_scale=options.part_scale == "free")
+    for _ in range(MOST_ROUNDS if options.reject else 0):
+        keep = accepted_readings(solution.residual_mm / readings.sigma_mm)
+        if np.count_nonzero(~keep) > MOST_REJECTED * len(keep):
+            raise ConvergenceError(
+                f"{np.count_nonzero(~keep)} of {len(keep)} coordinates do not fit the model; check the axis order, signs "
+                "and units, and which feature is which, before anything is rejected"
+            )
+        if np.array_equal(keep, accepted):
+            break
+        accepted = keep
+        solution = _solve(machine, readings, accepted, free_scale=options.part_scale == "free")
+    return solution, accepted
+
+
+def _solve(
+    machine: Machine,
+    readings: _Readings,
+    accepted: NDArray[np.bool_],
+    *,
+    free_scale: bool,
+    bend: Mapping[str, float] | None = None,
+) -> _Solution:
+    """Least squares in the directions that the readings show; angles only for what translations cannot explain.
+
+    At one height an angle about a horizontal axis is the same as a straightness. The translations and the squareness are
+    therefore taken first, and of the angles what is left of their columns. ``bend`` says how much each curve bends between
+    nodes; without it that is found out first.
+    """
+    names = modelled_errors(machine)
+    layout = error_parameters(machine, names)
+    pose = _pose_columns(readings, free_scale=free_scale)
+    errors = _error_columns(machine, layout, readings)
+    used = accepted / readings.sigma_mm
+    angular, _ = _kinds(layout)
+    shown, _ = _seen_directions(errors * used[:, None], pose * used[:, None], angular)
+    seen = np.einsum("ij,ij->i", shown, shown)  # how much of each unknown is determined, 0 to 1
+    kept = [name for name, columns in _columns_of(layout) if seen[columns].max(initial=0.0) > SEEN]
+    if not kept:
+        raise UndeterminedError("the readings determine none of the machine's errors", [])
+    layout = error_parameters(machine, kept)
+    errors = _error_columns(machine, layout, readings)
+    angular, unit = _kinds(layout)
+    bends, tied = _ties(layout, readings, used, bend)
+    design = np.vstack([errors * used[:, None], bends])
+    frames = np.vstack([pose * used[:, None], np.zeros((len(bends), pose.shape[1]))])
+    shown, rank = _seen_directions(design, frames, angular)
+    whole = np.hstack([design @ shown, frames])
+    target = np.concatenate([readings.deviation_mm * used, np.zeros(len(bends))])
+    scale = np.maximum(np.linalg.norm(whole, axis=0), 1e-300)
+    inverse = np.linalg.pinv(whole / scale, rcond=RCOND) / scale[:, None]
+    found = inverse @ target
+    unknowns = unit * (shown @ found[: shown.shape[1]])
+    poses = found[shown.shape[1] :]
+    residual = readings.deviation_mm - errors @ (unknowns / unit) - pose @ poses
+    spread = unit[:, None] * shown @ inverse[: shown.shape[1]]
+    size, direction = np.linalg.eigh(spread @ spread.T)
+    factor = direction * np.sqrt(np.maximum(size, 0.0))  # as wide as the unknowns, not as the readings
+    if bend is None and tied:
+        bend = _bends(layout, unknowns, tied)
+        return _solve(machine, readings, accepted, free_scale=free_scale, bend=bend)
+    share = np.einsum("ij,ij->i", shown, shown)
+    partly = tuple(name for name, columns in _columns_of(layout) if share[columns].min(initial=1.0) < 1.0 - 1e-4)
+    width = pose.shape[1] // len(np.unique(readings.setup))
+    u_poses = np.linalg.norm(inverse[shown.shape[1] :], axis=1).reshape(-1, width)
+    return _Solution(
+        layout, unknowns, factor, poses.reshape(-1, width), u_poses[:, 6] if free_scale else np.zeros(len(u_poses)),
+        residual, rank, tied, tuple(name for name in names if name not in kept), partly,
+    )  # fmt: skip
+
+
+def _columns_of(layout: ErrorParameters) -> list[tuple[str, slice]]:
+    first = layout.size - len(layout.squareness)
+    squareness = [(name, slice(first + k, first + k + 1)) for k, name in enumerate(layout.squareness)]
+    return [*((curve.error.name, curve.columns) for curve in layout.curves), *squareness]
+
+
+def _kinds(layout: ErrorParameters) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Which unknowns belong to angular curves, and the unit of each: mm, and for all angles mm at ``LEVER_MM``."""
+    angular, unit = np.zeros(layout.size, dtype=bool), np.ones(layout.size)
+    for name, columns in _columns_of(layout):
+        angular[columns] = error_named(name).kind == "angular"
+        unit[columns] = 1.0 if error_named(name).kind == "linear" else 1.0 / LEVER_MM
+    return angular, unit
+
+
+def _pose_columns(readings: _Readings, *, free_scale: bool) -> FloatArray:
+    """Derivative of the readings by shift, turn and scale of each set-up about its centre, (k, 6 or 7 times set-ups)."""
+    unit = np.eye(3)[readings.component]
+    arm = readings.arm_mm
+    turn = np.cross(arm, unit)  # e . (w x p) = w . (p x e)
+    own = [unit, turn, np.einsum("ij,ij->i", unit, arm)[:, None]][: 3 if free_scale else 2]
+    block = np.hstack(own)
+    setups = np.unique(readings.setup)
+    return np.hstack([block * (readings.setup == setup)[:, None] for setup in setups])
+
+
+def _error_columns(machine: Machine, layout: ErrorParameters, readings: _Readings) -> FloatArray:
+    """Derivative of the readings by the unknown errors in the units of :func:`_kinds`, (k, size): rows of C times bases."""
+    columns = c_matrix(machine, readings.position_mm, readings.tool_mm)
+    bases = [layout.basis(axis, readings.position_mm[:, axis]) for axis in range(3)]
+    design = layout.design(columns, bases)
+    return np.asarray(design[np.arange(len(design)), readings.component] * _kinds(layout)[1])
+
+
+def _seen_directions(errors: FloatArray, frames: FloatArray, angular: NDArray[np.bool_]) -> tuple[FloatArray, int]:
+    """Orthonormal directions (size, r) of the unknown errors that the readings tell apart from the poses, and r.
+
+    The angles get what neither poses nor translations explain. Directions without effect stay out: an unknown in them is
+    zero, the smallest value that agrees with the readings.
+    """
+    explained = _range(frames)
+    parts = []
+    for group in (~angular, angular):
+        own = errors[:, group]
+        size = float(np.linalg.norm(own, axis=0).max(initial=0.0))
+        if not size:
+            continue
+        lever = np.maximum(np.linalg.norm(own, axis=0), 1e-9 * size)
+        rest = own / lever
+        rest = rest - explained @ (explained.T @ rest)
+        left, values, right = np.linalg.svd(rest, full_matrices=False)
+        shows = values > SHOWS * max(1.0, float(values[0]))
+        good = right[shows]
+        raw = np.zeros((len(angular), len(good)))
+        raw[np.flatnonzero(group)] = good.T / lever[:, None]
+        parts.append(np.linalg.qr(raw)[0] if len(good) else raw)
+        explained = np.hstack([explained, left[:, shows]])
+    shown = np.hstack(parts) if parts else np.zeros((len(angular), 0))
+    return shown, shown.shape[1]
+
+
+def _range(matrix: FloatArray) -> FloatArray:
+    """Orthonormal basis of the columns, (rows, rank); columns of very different size count alike."""
+    size = np.linalg.norm(matrix, axis=0)
+    matrix = matrix[:, size > 0] / size[size > 0]
+    left, values, _ = np.linalg.svd(matrix, full_matrices=False)
+    return np.asarray(left[:, values > 1e-9 * max(1.0, float(values.max(initial=0.0)))])
+
+
+def _bends(layout: ErrorParameters, unknowns: FloatArray, tied: Mapping[str, FloatArray]) -> dict[str, float]:
+    """Second difference of the tied curves between nodes that readings show, rms, mm and rad; at least what is usual."""
+    found = {}
+    for curve in layout.curves:
+        if curve.error.name in tied:
+            unit = MM_PER_UM if curve.error.kind == "linear" else RAD_PER_URAD
+            bends = np.diff(curve.free @ unknowns[curve.columns], 2)
+            alone = set(tied[curve.error.name].tolist())
+            size = [
+                abs(bend)
+                for k, bend in enumerate(bends.tolist())
+                if not alone & set(curve.nodes_mm[k : k + 3].tolist())
+            ]
+            found[curve.error.name] = max(USUAL_BEND * unit, float(np.sqrt(np.mean(np.square(size)))) if size else 0.0)
+    return found
+
+
+def _ties(
+    layout: ErrorParameters, readings: _Readings, used: FloatArray, bend: Mapping[str, float] | None
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Rows that tie nodes without a reading to their neighbours by small second differences; and those nodes by error."""
+    rows, tied = [], {}
+    for curve in layout.curves:
+        along = readings.position_mm[used > 0, curve.error.axis]
+        shown: NDArray[np.bool_] = np.any(np.abs(layout.basis(curve.error.axis, along)) > 1e-6, axis=0)
+        if shown.all():
+            continue
+        near = (hat_matrix(curve.nodes_mm, along) > 1e-6).any(axis=0)
+        tied[curve.error.name] = curve.nodes_mm[~near]
+        unit = MM_PER_UM if curve.error.kind == "linear" else RAD_PER_URAD
+        for k in range(1, len(shown) - 1):
+            if not shown[k - 1 : k + 2].all():
+                second = np.zeros(len(shown))
+                second[k - 1 : k + 2] = [1.0, -2.0, 1.0]
+                row = np.zeros(layout.size)
+                allowed = (bend or {}).get(curve.error.name, USUAL_BEND * unit)
+                row[curve.columns] = second @ curve.free / allowed * _kinds(layout)[1][curve.columns]
+                rows.append(row)
+    return (np.array(rows) if rows else np.zeros((0, layout.size))), tied
+
+
+def _say_what_is_not_reached(machine: Machine, solution: _Solution) -> None:
+    if not solution.tied:
+        return
+    texts = [f"{name} at {', '.join(f'{value:g}' for value in nodes)} mm" for name, nodes in solution.tied.items()]
+    warnings.warn(
+        f"no reading reaches {'; '.join(texts[:6])}{' ...' if len(texts) > 6 else ''}: these nodes are tied to their "
+        "neighbours by smoothness, with the uncertainty of an extrapolation; --range from-data keeps to what was measured",
+        CompgenWarning,
+        stacklevel=4,
+    )
+
+
+def _result(
+    machine: Machine,
+    deviations: Deviations,
+    readings: _Readings,
+    solution: _Solution,
+    accepted: NDArray[np.bool_],
+    source: str,
+) -> Identification:
+    layout = solution.layout
+    freedom = int(np.count_nonzero(accepted)) - solution.rank - _pose_rank(readings, solution)
+    if freedom < 1:
+        raise UndeterminedError(
+            f"{np.count_nonzero(accepted)} coordinates for {solution.rank} unknowns and the poses", []
+        )
+    standard = (solution.residual_mm / readings.sigma_mm)[accepted]
+    chi_square = float(standard @ standard) / freedom
+    u_scale = float(np.sqrt(chi_square)) if source == "assumed" else max(1.0, float(np.sqrt(chi_square)))
+    errors, values_factor = _error_table(layout, solution.unknowns, solution.factor * u_scale)
+    errors = errors.replace(metadata=metadata_of(machine, deviations.metadata))
+    poses = _poses(deviations, readings, solution, u_scale)
+    return Identification(
+        errors=errors,
+        stations=(),
+        residual_mm=-solution.residual_mm,
+        accepted=accepted,
+        rms_um=float(np.sqrt(np.mean(solution.residual_mm[accepted] ** 2))) / MM_PER_UM,
+        degrees_of_freedom=freedom,
+        reduced_chi_square=chi_square,
+        u_source=source,
+        u_length_um=float(np.median(readings.sigma_mm)) / MM_PER_UM,
+        u_length_um_per_m=0.0,
+        u_scale=u_scale,
+        unobservable=tuple(
+            [f"{name}: no reading shows it" for name in ERROR_NAMES if name not in errors.names]
+            + [
+                f"{name}: a part of it is not told apart from the pose, the scale or other errors"
+                for name in solution.partly
+            ]
+        ),
+        rejected=_rejected(deviations, readings, solution.residual_mm, accepted),
+        rank=solution.rank,
+        unknowns=solution.rank,
+        condition=1.0 / RCOND,
+        iterations=1,
+        worst_u=worst_uncertainty(errors),
+        layout=layout,
+        method="deviations",
+        values_factor=values_factor,
+        details={
+            "poses": [pose.summary() for pose in poses],
+            "range_mm": {
+                letter: [float(column.min()), float(column.max())]
+                for letter, column in zip(AXES, deviations.position_mm.T, strict=True)
+            },
+            "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.tied.items()},
+        },
+    )
+
+
+def _pose_rank(readings: _Readings, solution: _Solution) -> int:
+    columns = _pose_columns(readings, free_scale=solution.poses.shape[1] == 7)
+    return int(_range(columns).shape[1])
+
+
+def _error_table(layout: ErrorParameters, unknowns: FloatArray, factor: FloatArray) -> tuple[ErrorTable, FloatArray]:
+    """Curves and squareness, and the factor of the covariance of their values in the order of the errors file."""
+    from compgen.identify.covariance import error_values
+
+    curves, squareness, rows = {}, {}, {}
+    for name, position_mm, columns, matrix in error_values(layout):
+        value, spread = matrix @ unknowns[columns], matrix @ factor[columns]
+        u = np.linalg.norm(spread, axis=1)
+        rows[name] = spread
+        if np.isnan(position_mm).all():
+            squareness[name] = (float(value[0]), float(u[0]))
+        else:
+            curves[name] = Curve(position_mm, value, u)
+    table = ErrorTable(curves, squareness)
+    return table, np.vstack([rows[name] for name in table.names])
+
+
+def _poses(
+    deviations: Deviations,
+    readings: _Readings,
+    solution: _Solution,
+    u_scale: float,
+) -> list[Pose]:
+    """The pose of each set-up: the rotation that was taken out first, and the small one that was adjusted."""
+    setups, found = setups_of(deviations), []
+    for k, setup in enumerate(np.unique(setups).tolist()):
+        own = setups == setup
+        components = np.isfinite(deviations.deviation_mm[own]).any(axis=0)
+        shift, small = solution.poses[k][:3], solution.poses[k][3:6]
+        scale = 1.0 + (solution.poses[k][6] if solution.poses.shape[1] == 7 else 0.0)
+        rough = deviations.poses[setup]
+        turn = Rotation.from_matrix(rough.rotation) * Rotation.from_rotvec(small)
+        offset = rough.measured_mm + rough.rotation @ shift - scale * turn.apply(rough.nominal_mm)
+        turning = np.array([components[[1, 2]].any(), components[[0, 2]].any(), components[[0, 1]].any()])
+        found.append(
+            Pose(
+                setup,
+                np.where(components, offset, np.nan),
+                np.where(turning, turn.as_rotvec(), np.nan),
+                float(scale),
+                float(solution.u_scale[k] * u_scale),
+                int(np.count_nonzero(readings.setup == setup)),
+            )
+        )
+    return found
+
+
+def _rejected(
+    deviations: Deviations, readings: _Readings, residual_mm: FloatArray, accepted: NDArray[np.bool_]
+) -> tuple[Rejected, ...]:
+    found = []
+    for k in np.flatnonzero(~accepted).tolist():
+        row = int(readings.row[k])
+        file, line = deviations.origin[row] if deviations.origin else ("", 0)
+        where = ", ".join(f"{value:g}" for value in deviations.position_mm[row])
+        size_um = float(residual_mm[k]) / MM_PER_UM
+        many = abs(residual_mm[k]) / readings.sigma_mm[k]
+        reason = f"differs from the model by {size_um:+.1f} um, {many:.0f} standard deviations; disturbed reading?"
+        found.append(
+            Rejected(row, DEVIATION_COLUMNS[readings.component[k]], f"({where}) mm", size_um, reason, str(file), line)
+        )
+    return tuple(found)
