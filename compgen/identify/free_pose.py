@@ -130,8 +130,9 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
     sigma, source = _sigma(deviations, options)
     readings = _readings(machine, deviations, sigma)
     solution, accepted = _robustly(machine, readings, options)
-    _say_what_is_not_reached(machine, solution)
-    return _result(machine, deviations, readings, solution, accepted, source)
+    result = _result(machine, deviations, readings, solution, accepted, source)
+    _say_what_is_not_reached(solution)
+    return result
 
 
 def _at_20_degrees(deviations: Deviations) -> Deviations:
@@ -280,7 +281,8 @@ def _solve(
     shown, rank = _seen_directions(design, frames, angular)
     whole = np.hstack([design @ shown, frames])
     target = np.concatenate([readings.deviation_mm * used, np.zeros(len(bends))])
-    scale = np.maximum(np.linalg.norm(whole, axis=0), 1e-300)
+    scale = np.linalg.norm(whole, axis=0)
+    scale = np.where(scale > 1e-9 * scale.max(), scale, scale.max())  # a column of rounding stays one
     inverse = np.linalg.pinv(whole / scale, rcond=RCOND) / scale[:, None]
     found = inverse @ target
     unknowns = unit * (shown @ found[: shown.shape[1]])
@@ -412,7 +414,7 @@ def _ties(
     return (np.array(rows) if rows else np.zeros((0, layout.size))), tied
 
 
-def _say_what_is_not_reached(machine: Machine, solution: _Solution) -> None:
+def _say_what_is_not_reached(solution: _Solution) -> None:
     if not solution.tied:
         return
     texts = [f"{name} at {', '.join(f'{value:g}' for value in nodes)} mm" for name, nodes in solution.tied.items()]
