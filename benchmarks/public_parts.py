@@ -124,12 +124,15 @@ def main() -> None:
         text = printed.read_text()
         plate = printed.with_name("D" + "_".join(printed.stem.split("_")[1:3]))
         ours = printed_way(*read_plate(plate))
-        theirs = {key: re.search(rf"{key}\s+(\S+)(?:\s+(\S+))?", text) for key in ("FitOffset", "FitScale", "FitRotAngle", "QPMagnitude", "QPAngle")}  # fmt: skip
-        words = {key: found.groups() for key, found in theirs.items() if found}
-        print(f"{plate.name}: printed offset {words['FitOffset'][0]} {words['FitOffset'][1]} mm, scale {words['FitScale'][0]}, "
-              f"rotation {words['FitRotAngle'][0]} deg, quadrupole {words['QPMagnitude'][0]} at {words['QPAngle'][0]} deg")  # fmt: skip
-        print(f"   repeated: offset {ours['x']:.3f} {ours['y']:.3f} mm, scale {ours['scale']:.6f}, rotation {ours['rotation']:.3f} "
-              f"deg, quadrupole {ours['quadrupole']:.8f} at {ours['angle']:.2f} deg, rms {1e3 * ours['rms']:.1f} um")  # fmt: skip
+        shown = " ".join(
+            line for line in text.splitlines() if re.match(r"Fit(Offset|Scale|RotAngle)|QP(Magnitude|Angle)", line)
+        )
+        print(f"{plate.name}: printed  {' '.join(shown.split())}")
+        print(
+            f"   repeated: offset {ours['x']:.3f} {ours['y']:.3f} mm, scale {ours['scale']:.6f}, rotation "
+            f"{ours['rotation']:.3f} deg, quadrupole {ours['quadrupole']:.8f} at {ours['angle']:.2f} deg, "
+            f"rms {1e3 * ours['rms']:.1f} um"
+        )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "mill.toml").write_text(MACHINE)
@@ -139,8 +142,10 @@ def main() -> None:
             print(f"{path.name}: {len(nominal)} holes")
             (value, difference), u = identified(nominal, measured, machine, folder)
             q, angle = 0.5 * np.hypot(value, difference), 0.5 * np.degrees(np.arctan2(-value, difference))
-            print(f"   EC0Y {value:.1f} +- {2 * u[0]:.1f} urad, scale of X minus Y {difference:.1f} +- {2 * u[1]:.1f} um/m (k = 2): "
-                  f"quadrupole {q:.1f}e-6 at {angle:.1f} deg")  # fmt: skip
+            print(
+                f"   EC0Y {value:.1f} +- {2 * u[0]:.1f} urad, scale of X minus Y {difference:.1f} +- {2 * u[1]:.1f} um/m "
+                f"(k = 2): quadrupole {q:.1f}e-6 at {angle:.1f} deg"
+            )
     for when, (q, angle) in ADOPTED.items():
         a = np.radians(2 * angle)
         print(
