@@ -22,11 +22,24 @@ if TYPE_CHECKING:
     metavar="ID",
     help="Its number in `history --json`, or the beginning of its SHA-256; default: the newest.",
 )
+@click.option(
+    "--active-table",
+    default=None,
+    metavar="VERSION|none",
+    help="The tables that were on while the machine was measured, for a measurement that is held back because that is "
+    "not certain; default: what file, job and history say.",
+)
 @job_option
 @who_option(reason=True)
 @json_option
 def reprocess_command(
-    machine: str, measurement: str | None, job: Job, actor: str | None, reason: str, as_json: bool
+    machine: str,
+    measurement: str | None,
+    active_table: str | None,
+    job: Job,
+    actor: str | None,
+    reason: str,
+    as_json: bool,
 ) -> int:
     """Identify and export again from a stored measurement of MACHINE, as job, machine and instrument files say now.
 
@@ -35,10 +48,11 @@ def reprocess_command(
     \b
     Example:
       compgen recal reprocess mill-1 --reason "pitch of X corrected in the machine file"
+      compgen recal reprocess mill-1 --active-table v2 --reason "v2 was on, says the log of the control"
     """
     from compgen.recal.reprocess import Wish, reprocess
 
-    done = reprocess(job, machine, Wish(measurement, actor_of(actor), reason))
+    done = reprocess(job, machine, Wish(measurement, actor_of(actor), reason, active_table))
     table = done.table
     if as_json:
         facts = {"id": done.measurement.id, "name": done.measurement.name, "sha256": done.measurement.sha256}

@@ -9,6 +9,7 @@ that covariance as weights; its distribution is taken as that of a scaled chi-sq
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -23,6 +24,10 @@ from compgen.model.volumetric import volumetric_error
 
 #: Points along each axis of the grid on which the change is looked at.
 POINTS = 6
+#: A change equals a field if what the two differ by, beyond the noise, is at most this share of the field (rms).
+ALIKE = 0.5
+#: Probabilities below this are said as that: the number of independent directions is hardly known.
+LEAST_P = 1e-9
 
 
 @dataclass(frozen=True)
@@ -49,10 +54,124 @@ class Change:
         return {**asdict(self), "significant": self.significant}
 
 
+@dataclass(frozen=True)
+class Likeness:
+    """A change that equals plus or minus a known field, both over the volume without rigid motion.
+
+    ``field`` is the key of that field, ``sign`` +1 or -1, ``correlation`` that of the two, ``size`` the factor by which
+    the field fits the change best. ``p_value``: the probability that a change drawn evenly from all those of at most
+    twice the size of the field comes as close to plus or minus any of the fields that were looked at.
+    """
+
+    field: str
+    sign: int
+    correlation: float
+    size: float
+    p_value: float
+
+    def words(self) -> str:
+        """Say the figures, e.g. ``correlation +0.990, size 1.02; an arbitrary change comes as close with probability 1e-07``."""
+        by_chance = f"{self.p_value:.1g}" if self.p_value >= LEAST_P else f"below {LEAST_P:g}"
+        return (
+            f"correlation {self.correlation:+.3f}, size {abs(self.size):.2f}; an arbitrary change comes as close with "
+            f"probability {by_chance}"
+        )
+
+    def summary(self) -> dict[str, object]:
+        """Return the figures by name."""
+        return asdict(self)
+
+
+def likeness(
+    machine: Machine,
+    new: tuple[ErrorTable, Covariance | None],
+    old: tuple[ErrorTable, Covariance | None],
+    fields: Mapping[str, FloatArray],
+    one_way: Mapping[str, FloatArray],
+) -> Likeness | None:
+    """Return the field that the change equals, with its sign; None if it equals none.
+
+    Readings of a machine whose tables were on, but are not taken out, change by what the tables add; readings of the
+    bare machine from which tables are taken out change by the opposite. That looks like a drift, and tables made of it
+    undo the compensation.
+
+    Parameters
+    ----------
+    new, old : identified errors and, where it is known, their covariance.
+    fields : what may have acted or been missing, at the points of :func:`volume_points`, (n, 3), mm.
+    one_way : further fields that can only have acted.
+    """
+    position_mm = _grid(machine)
+    keep = _without_rigid(machine, position_mm)
+    difference = volumetric_error(machine, new[0], position_mm) - volumetric_error(machine, old[0], position_mm)
+    moved = keep @ difference.ravel()
+    factors = [_spread(machine, spread, position_mm) for _, spread in (new, old) if spread is not None]
+    noise = sum(float(np.sum((keep @ factor) ** 2)) for factor in factors)
+    free = _directions(machine, new[0], position_mm, keep)
+    best: Likeness | None = None
+    nearest = ALIKE
+    count = 2 * len(fields) + len(one_way)
+    for name, field in [*fields.items(), *one_way.items()]:
+        known = keep @ field.ravel()
+        square, product = float(known @ known), float(known @ moved)
+        if square <= noise or product == 0.0:
+            continue  # too small to be told from nothing
+        sign = 1 if product > 0.0 else -1
+        if sign < 0 and name in one_way:
+            continue
+        apart = float(np.sum((moved - sign * known) ** 2))
+        share = float(np.sqrt(max(apart - noise, 0.0) / square))
+        if share <= nearest:
+            nearest = share
+            correlation = product / float(np.sqrt(square * (moved @ moved)))
+            p_value = min(1.0, count * (0.5 * min(float(np.sqrt(apart / square)), 2.0)) ** free)
+            best = Likeness(name, sign, correlation, product / square, p_value)
+    return best
+
+
+def volume_points(machine: Machine) -> FloatArray:
+    """Return the points at which changes are looked at, (n, 3), mm."""
+    return _grid(machine)
+
+
+def _directions(machine: Machine, errors: ErrorTable, position_mm: FloatArray, keep: FloatArray) -> float:
+    """Number of independent directions that low-order changes of the errors span over the volume.
+
+    Each error may change by its value (squareness), or by a line and a bow; fields that nearly coincide count once: n^2
+    over the sum of squares of the eigenvalues of their correlation matrix (participation ratio), at least 1.
+    """
+    layout = _layout(errors)
+    design = error_design(machine, layout, position_mm).reshape(3 * len(position_mm), -1)
+    names = np.array(layout.error)
+    columns = []
+    for name in errors.names:
+        own = np.flatnonzero(names == name)
+        at = layout.position_mm[own]
+        if len(own) < 2:
+            shapes = np.ones((1, len(own)))
+        else:
+            share = np.interp(at, (at.min(), at.max()), (-1.0, 1.0))
+            shapes = np.array([share, share**2 - 1.0 / 3.0])
+        columns += [keep @ (design[:, own] @ shape) for shape in shapes]
+    fields = np.column_stack(columns)
+    length = np.linalg.norm(fields, axis=0)
+    fields = fields[:, length > 1e-6 * length.max()] / length[length > 1e-6 * length.max()]
+    if fields.shape[1] == 0:
+        return 1.0
+    gram = fields.T @ fields
+    return float(max(1.0, fields.shape[1] ** 2 / np.sum(gram**2)))
+
+
 def spread_of(errors: ErrorTable, covariance: Covariance | None) -> Covariance | None:
     """Return the covariance; without one that of the standard uncertainties as independent; None if those are unknown."""
     if covariance is not None:
         return covariance
+    found = _layout(errors)
+    return found if found.error and np.isfinite(found.errors_factor).all() else None
+
+
+def _layout(errors: ErrorTable) -> Covariance:
+    """Return the values of a table of errors with their standard uncertainties as independent; nan where unknown."""
     names: list[str] = []
     positions, u = [], []
     for name in errors.names:
@@ -63,9 +182,8 @@ def spread_of(errors: ErrorTable, covariance: Covariance | None) -> Covariance |
         names += [name] * len(at)
         positions.append(at)
         u.append(spread)
-    if not names or not np.isfinite(np.concatenate(u)).all():
-        return None
-    factor = np.diag(np.concatenate(u))
+    factor = np.diag(np.concatenate(u)) if u else np.zeros((0, 0))
+    positions = positions or [np.zeros(0)]
     return Covariance(tuple(names), np.concatenate(positions), (), np.zeros(0, dtype=np.int64), factor)
 
 

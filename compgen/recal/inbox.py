@@ -6,7 +6,7 @@ import contextlib
 import csv
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
@@ -16,7 +16,7 @@ from compgen.core.csvio import MOST_COLUMNS
 from compgen.core.files import sha256_of
 from compgen.core.text import visible
 from compgen.errors import InputError
-from compgen.recal.job import MachineJob
+from compgen.recal.job import MachineJob, OtherInbox
 from compgen.recal.records import NewMeasurement
 
 #: Comments of a measurement file that say when it was made, and with which tables (a version, or "none").
@@ -135,6 +135,29 @@ def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes
     return content, after
 
 
+def holds_one_of(other: OtherInbox, contents: Iterable[bytes]) -> bool:
+    """Whether a file that fits, in another machine's inbox or a sub-folder, holds one of these contents.
+
+    Empty ones do not count; only files of the same size are read. What cannot be read is reported by the pass over that
+    machine.
+    """
+    wanted = {(len(content), sha256_of(content)) for content in contents if content}
+    sizes = {size for size, _ in wanted}
+    try:
+        entries = sorted(other.inbox.iterdir())
+        folders = [entry for entry in entries if entry.is_dir() and not entry.is_symlink()]
+        for path in [*entries, *(path for folder in folders for path in sorted(folder.iterdir()))]:
+            size = path.lstat().st_size
+            if size in sizes and any(fnmatchcase(path.name, pattern) for pattern in other.patterns):
+                with contextlib.suppress(InputError):
+                    content, _ = _read_regular(path, size, folder_is_real=path.parent != other.inbox)
+                    if (len(content), sha256_of(content)) in wanted:
+                        return True
+    except OSError:
+        return False
+    return False
+
+
 @contextlib.contextmanager
 def _opened_folder(folder: Path, *, real: bool) -> Iterator[int | None]:
     """Open a folder, so that nobody can put another one in its place; None on a system that cannot."""
@@ -155,15 +178,15 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
     comments: dict[str, str] = {}
     for content in contents.values():
         comments = {**_comments(content), **comments}
-    times = [time for key in TIME_KEYS if (time := _time(comments.get(key, ""))) is not None]
+    times = [found for key in TIME_KEYS if (found := _time(comments.get(key, ""))) is not None]
     temperatures: dict[str, dict[str, float]] = {}
     for content in contents.values():
         temperatures |= _temperatures(content)
     return NewMeasurement(
         sha256=digest,
         name=name,
-        measured_at=times[0] if times else file_time,
-        measured_at_source="file" if times else "file time",
+        measured_at=times[0][0] if times else file_time,
+        measured_at_source=times[0][1] if times else "file time",
         contents=contents,
         active_table=comments.get(ACTIVE_KEY) or None,
         temperatures_c=temperatures,
@@ -181,10 +204,11 @@ def _comments(content: bytes) -> dict[str, str]:
     return found
 
 
-def _time(text: str) -> datetime | None:
-    """Read an ISO time; without a zone it is local time."""
+def _time(text: str) -> tuple[datetime, str] | None:
+    """Read an ISO time and say how sure it is: "file", or "file, no zone" for one that is taken as local time."""
     try:
-        return datetime.fromisoformat(text.strip()).astimezone(UTC)
+        found = datetime.fromisoformat(text.strip())
+        return found.astimezone(UTC), "file" if found.tzinfo is not None else "file, no zone"
     except (ValueError, OverflowError, OSError):
         return None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 from collections.abc import Callable, Mapping
@@ -39,6 +40,8 @@ class Policy:
     max_change_um : largest change of the correction anywhere, against the active tables.
     max_reference_um : largest change of the correction at the reference point; for a first table against none.
     max_step_um : largest step of the correction between neighbouring table nodes.
+    clock_minutes : how near to a decision that changed the active tables a measurement may be made without saying itself
+        which tables were on; for clocks that differ.
     """
 
     max_age_days: float | None = 30.0
@@ -48,6 +51,16 @@ class Policy:
     max_change_um: float | None = None
     max_reference_um: float | None = None
     max_step_um: float | None = None
+    clock_minutes: float = 30.0
+
+
+@dataclass(frozen=True)
+class OtherInbox:
+    """The inbox of another machine of the job file, for files that came for both."""
+
+    name: str
+    inbox: Path
+    patterns: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -56,7 +69,7 @@ class MachineJob:
 
     ``measured_with`` says what was active while the machine was measured: the tables that were active then ("active")
     or none ("bare"); a measurement file may say otherwise for itself. ``tolerances`` are those of the drift, mm or rad,
-    by error or "volume".
+    by error or "volume". ``others`` are the inboxes of the other machines.
     """
 
     name: str
@@ -78,6 +91,7 @@ class MachineJob:
     policy: Policy = Policy()
     identify: Mapping[str, Any] = field(default_factory=dict)
     tolerances: Mapping[str, float] = field(default_factory=dict)
+    others: tuple[OtherInbox, ...] = field(default=(), compare=False, repr=False)
 
     def settings_sha256(self) -> str:
         """Return the SHA-256 of everything but the measurement that a result depends on."""
@@ -162,12 +176,29 @@ def _job_of(root: Section, path: Path) -> Job:
     if not machines:
         _options(_Keys(Section({}, path=path), defaults), folder, "")
     root.finish()
-    folders: dict[Path, str] = {}
-    for name, machine in machines.items():
-        other = folders.setdefault(machine.out, name)
-        if other != name:
-            raise every.fail(name, f"has the same folder out as {other}; give each machine its own")
+    _check_folders(every, machines)
+    inboxes = [OtherInbox(name, machine.inbox, machine.patterns) for name, machine in machines.items()]
+    machines = {
+        name: replace(machine, others=tuple(item for item in inboxes if item.name != name))
+        for name, machine in machines.items()
+    }
     return Job(path, store if "://" in store else f"sqlite:///{folder / store}", machines)
+
+
+def _check_folders(every: Section, machines: Mapping[str, MachineJob]) -> None:
+    """Refuse folders ``out`` that are the same or lie in each other, whatever links and ``..`` lead there."""
+    real = {name: Path(os.path.realpath(machine.out)) for name, machine in machines.items()}
+    known = {path: name for name, path in reversed(real.items())}
+    for name, path in real.items():
+        if known[path] != name:
+            raise every.fail(name, f"has the same folder out as {known[path]} ({path}); give each machine its own")
+        around = next((parent for parent in path.parents if parent in known), None)
+        if around is not None:
+            raise every.fail(
+                name,
+                f"has its folder out ({path}) inside that of {known[around]} ({around}); give each machine its own, beside "
+                "each other",
+            )
 
 
 def _machine(name: str, keys: _Keys, folder: Path) -> MachineJob:
@@ -243,6 +274,7 @@ def _policy(keys: _Keys) -> Policy:
         max_change_um=keys.take("max_change_um", tomlio.positive, None),
         max_reference_um=keys.take("max_reference_um", tomlio.positive, None),
         max_step_um=keys.take("max_step_um", tomlio.positive, None),
+        clock_minutes=keys.take("clock_minutes", tomlio.not_negative, default.clock_minutes),
     )
     keys.finish()
     return policy

@@ -4,25 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 
+from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, MM_PER_UM
 from compgen.core.points import Points
 from compgen.identify import joint_covariance
 from compgen.pipeline import RunResult, identified_reversal
-from compgen.recal.change import Change, change_between, spread_of
-from compgen.recal.job import Policy
-from compgen.recal.records import IdentificationRecord, MeasurementRecord, TableRecord
+from compgen.recal.change import Change, change_between, likeness, spread_of, volume_points
+from compgen.recal.inbox import holds_one_of
+from compgen.recal.job import MachineJob, Policy
+from compgen.recal.records import (
+    DecisionRecord,
+    EventRecord,
+    IdentificationRecord,
+    MachineRecord,
+    MeasurementRecord,
+    TableRecord,
+)
+from compgen.recal.states import AFTER
 from compgen.recal.store import Store
 from compgen.verify import ReadTables, verify
 from compgen.verify.diff import difference
 
 #: A measurement from further in the future than this has a wrong time.
 FUTURE = timedelta(days=1)
+#: Kinds of events: the clock of the store went back; the folder of a machine was given to this store.
+CLOCK, ADOPTED = "clock", "adopted"
+#: Key of the figures of a version: which tables a file or a person says were on.
+STATED = "active_table_stated"
 
 
 @dataclass
@@ -70,6 +84,177 @@ def judge_order(
                 judgement.hold.append(
                     f"version {table.version}, which waits, comes from a newer measurement ({_day(made)})"
                 )
+
+
+# --- which tables were on while the machine was measured --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Past:
+    """What the store knows about a machine: decisions, tables with figures, measurements, events; all of them."""
+
+    decisions: Sequence[DecisionRecord]
+    tables: Sequence[TableRecord]
+    measurements: Sequence[MeasurementRecord]
+    events: Sequence[EventRecord]
+
+    @property
+    def swaps(self) -> list[DecisionRecord]:
+        """Decisions that changed the active tables, since the folder was given to this store."""
+        return [item for item in self.decisions if AFTER[item.kind] == "active" and item.at >= self._since]
+
+    @property
+    def stated(self) -> bool:
+        """Whether a file or a person said which tables were on, since the folder was given to this store."""
+        by_file = any(item.active_table is not None and item.received_at >= self._since for item in self.measurements)
+        return by_file or any(STATED in item.summary and item.at >= self._since for item in self.tables)
+
+    @property
+    def _since(self) -> datetime:
+        adopted = [item.at for item in self.events if item.kind == ADOPTED]
+        return max(adopted, default=datetime.min.replace(tzinfo=UTC))
+
+
+def judge_assumption(
+    judgement: Judgement, job: MachineJob, measurement: MeasurementRecord, past: Past, now: datetime, taken: str
+) -> None:
+    """Hold where the time of the measurement does not say which tables were on; ``taken`` says which were taken out.
+
+    Only for a measurement that does not say it itself, of a machine that is measured with its tables on. A wrong
+    assumption goes into the errors in full: the new tables then undo the compensation, or apply it twice.
+    """
+    swaps, margin = past.swaps, timedelta(minutes=job.policy.clock_minutes)
+    if not swaps:
+        if not past.stated:
+            judgement.hold.append(
+                "the store does not know which tables were on while the machine was measured: it never made any active. "
+                + how_to_state(job.name, measurement, "none")
+            )
+        return
+    doubts = []
+    if measurement.measured_at_source == "file time":
+        doubts.append("the file does not say when it was measured, and the time of a file changes when it is copied")
+    elif measurement.measured_at_source == "file, no zone":
+        doubts.append("the time of the measurement has no zone")
+    for before, swap in zip([None, *swaps], swaps, strict=False):
+        since = None if before is None else before.at
+        near = abs(measurement.measured_at - swap.at) < margin
+        inside = (
+            since is None or since - margin < measurement.measured_at
+        ) and measurement.measured_at < swap.at + margin
+        if near:
+            away = abs(measurement.measured_at - swap.at).total_seconds() / 60.0
+            doubts.append(
+                f"it was measured {away:.0f} min from the decision of {_day(swap.at)} that changed the active tables; "
+                f"{job.policy.clock_minutes:g} min are wanted, as clocks differ"
+            )
+        elif inside and _doubtful(swap, past, now):
+            doubts.append(f"the clock went back, so the time of the decision of {_day(swap.at)} is not certain")
+    if doubts:
+        judgement.hold.append(
+            f"it is not certain which tables were on while the machine was measured, and {taken} was taken out: "
+            f"{'; '.join(dict.fromkeys(doubts))}. {how_to_state(job.name, measurement, 'VERSION|none')}"
+        )
+
+
+def how_to_state(name: str, measurement: MeasurementRecord, tables: str) -> str:
+    """Say how a person states which tables were on; ``tables`` is a version, "none" or how to write either."""
+    return (
+        f"State it: `compgen recal reprocess {name} --measurement {measurement.id} --active-table {tables} --reason TEXT`, "
+        f"or `# active_table = {tables}` in the next file"
+    )
+
+
+def _doubtful(decision: DecisionRecord, past: Past, now: datetime) -> bool:
+    """Whether the clock stood ahead when this was decided: something that came later has an earlier time."""
+    if decision.at > now:
+        return True
+    if any(item.at < decision.at <= _seen(item) for item in past.events if item.kind == CLOCK):
+        return True
+    known = {item.table_id for item in past.decisions if item.sequence <= decision.sequence}
+    return any(table.at < decision.at for table in past.tables if table.id not in known)
+
+
+def _seen(event: EventRecord) -> datetime:
+    """Time of the newest entry when the clock was found to have gone back, from the end of the message."""
+    try:
+        return datetime.fromisoformat(event.message.rsplit(" ", 1)[-1]) + timedelta(seconds=1)
+    except ValueError:
+        return event.at
+
+
+def judge_likeness(
+    judgement: Judgement,
+    store: Store,
+    job: MachineJob,
+    machine: Machine,
+    measurement: MeasurementRecord,
+    result: RunResult,
+    old: IdentificationRecord,
+    were_active: Mapping[int, ReadTables],
+    taken: int | None,
+) -> None:
+    """Hold where the machine seems to have changed by what some tables add, or by the opposite.
+
+    Parameters
+    ----------
+    old : the errors behind the active tables, or behind the last ones that were.
+    were_active : the tables that are or were active, by version, in the order in which they became active.
+    taken : version that was taken out of the readings; None for none.
+    """
+    identified = result.identification
+    old_errors = store.errors_of(old)
+    if not set(old_errors.names) <= set(identified.errors.names):
+        return  # held for that; a part of the errors has no field to compare
+    points = Points(volume_points(machine))
+    adds = {version: _added(machine, tables, points) for version, tables in were_active.items()}
+    fields = {f"version {version}": field for version, field in adds.items()}
+    swapped = {}
+    if taken in adds:  # the clock may be late: a later version was on already
+        order = list(adds)
+        later = order[order.index(taken) + 1 :]
+        swapped = {f"version {version} in place of version {taken}": adds[version] - adds[taken] for version in later}
+    new = (identified.errors, joint_covariance(identified) if identified.has_covariance else None)
+    found = likeness(machine, new, (old_errors, store.covariance_of(old)), fields, swapped)
+    if found is None:
+        return
+    judgement.figures["likeness"] = found.summary()
+    was = "nothing was" if taken is None else f"version {taken} was"
+    seems = "was on" if found.sign > 0 else "was off"
+    what = "what" if found.sign > 0 else "the opposite of what"
+    version = f"v{found.field.split()[1]}" if found.sign > 0 else "none"
+    judgement.hold.append(
+        f"the machine seems to have changed by {what} {found.field} adds ({found.words()}): as if {found.field} {seems} "
+        f"while the machine was measured, but {was} taken out. "
+        f"{how_to_state(job.name, measurement, version)}; if the machine has really changed, approve with --override"
+    )
+
+
+def _added(machine: Machine, tables: ReadTables, points: Points) -> FloatArray:
+    """What tables add to the commands, mean of both directions of travel, (n, 3), mm."""
+    sides = [np.full_like(points.position_mm, side) for side in (1.0, -1.0)]
+    return np.asarray(
+        0.5 * sum(tables.correction(machine, Points(points.position_mm, approach=side)) for side in sides)
+    )
+
+
+def judge_twins(
+    judgement: Judgement, store: Store, job: MachineJob, machine: MachineRecord, measurement: MeasurementRecord
+) -> None:
+    """Hold what came for another machine as well: readings belong to one machine."""
+    found = [f"{name} ({what})" for name, what in store.same_files_of_others(machine, measurement)]
+    contents = store.contents_of(measurement)
+    for other in job.others:
+        if not any(text.startswith(f"{other.name} (") for text in found) and holds_one_of(other, contents.values()):
+            where = "the same inbox" if other.inbox.resolve() == job.inbox.resolve() else "its inbox"
+            found.append(f"{other.name} ({where})")
+    if found:
+        judgement.figures["also_came_for"] = found
+        judgement.hold.append(
+            f"the same file also came for {', '.join(found)}; readings belong to one machine. Give each machine an inbox of "
+            "its own and remove the file from the wrong one; then reject the version of the wrong machine with `compgen "
+            "recal reject` and approve that of the right one with --override"
+        )
 
 
 def _temperature(window_c: tuple[float, float], channels: Mapping[str, Mapping[str, float]]) -> list[str]:

@@ -21,17 +21,22 @@ from compgen.identify.covariance import FILE_NAME as COVARIANCE
 from compgen.pipeline import Checks, RunResult, run
 from compgen.recal.job import MachineJob
 from compgen.recal.judge import (
+    STATED,
     ActiveState,
     Judgement,
+    Past,
     apply_limits,
+    judge_assumption,
     judge_change,
+    judge_likeness,
     judge_measurement,
     judge_order,
     judge_tables,
+    judge_twins,
     shows_all,
 )
 from compgen.recal.records import MachineRecord, MeasurementRecord, NewResult, TableFile, TableRecord
-from compgen.recal.states import active_id
+from compgen.recal.states import AFTER, active_id
 from compgen.recal.store import Store
 from compgen.verify import ReadTables, read_tables
 from compgen.verify.active import ActiveTables
@@ -48,6 +53,8 @@ NOT_OF_A_CONTROL = (
     "fitted.errors.csv",
     "fit.json",
 )
+#: The newest of the versions that were active with which a change is compared.
+LOOKED_BACK = 20
 #: How temporary folders begin; their names say nothing to a reader.
 FOLDER = "compgen-recal-"
 _TEMPORARY = re.compile(rf"\S*{FOLDER}[^/\\]+[/\\]measurement[/\\]")
@@ -61,14 +68,22 @@ class Processed:
     judged_against: int | None
 
 
-def process(store: Store, job: MachineJob, record: MachineRecord, measurement: MeasurementRecord) -> Processed:
+def process(
+    store: Store, job: MachineJob, record: MachineRecord, measurement: MeasurementRecord, stated: str | None = None
+) -> Processed:
     """Run the chain for one measurement and judge the outcome; nothing outside a temporary folder is written.
+
+    Parameters
+    ----------
+    stated : the tables that were on while the machine was measured, by a person: a version or "none". It counts before
+        what the file says; None if nobody says so.
 
     Raises
     ------
     CompgenError
         for a measurement that cannot be used, or does not determine the errors.
     """
+    said = measurement.active_table if stated is None else stated
     started = time.monotonic()
     settings = job.settings_sha256()
     machine = load_machine(job.machine)
@@ -78,7 +93,8 @@ def process(store: Store, job: MachineJob, record: MachineRecord, measurement: M
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
         paths = write_files(Path(folder) / "measurement", store.contents_of(measurement))
-        measured = _active_then(store, job, record, measurement, tables)
+        past = Past(store.decisions(record), tables, store.measurements(record), store.events(record))
+        measured = _active_then(job, measurement, past, said)
         checks: Checks = {"instrument": job.instrument, "limits": SafetyLimits(job.policy.max_step_um)}
         if measured is not None:
             checks["active"] = _parsed(store, machine, measured, job.controllers[0], Path(folder) / "then")
@@ -95,6 +111,16 @@ def process(store: Store, job: MachineJob, record: MachineRecord, measurement: M
         active = _active_now(store, machine, tables, Path(folder) / "now")
         judgement = _judged(store, job, machine, measurement, (outcome, active, now))
         judge_order(judgement, store, measurement, tables)
+        taken = None if measured is None else measured.version
+        if said is not None:
+            judgement.figures[STATED] = said
+        elif job.measured_with == "active":
+            taken_out = "no table" if taken is None else f"version {taken}"
+            judge_assumption(judgement, job, measurement, past, now, taken_out)
+        if outcome.accepted:
+            about = (job, machine, measurement)
+            _judge_likeness(judgement, store, about, past, outcome, taken, Path(folder) / "earlier")
+        judge_twins(judgement, store, job, record, measurement)
         judgement.figures["warnings"] = [without_folder(str(item.message)) for item in caught if _ours(item)]
         files = _tables_of(outcome, Path(folder) / "out")
         result = _result(Path(folder) / "out", machine, outcome, files, judgement)
@@ -131,26 +157,25 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
 # --- active tables -------------------------------------------------------------------------------------------------
 
 
-def _active_then(
-    store: Store, job: MachineJob, record: MachineRecord, measurement: MeasurementRecord, tables: Sequence[TableRecord]
-) -> TableRecord | None:
-    """Return the tables that were active while the machine was measured: what the file says, else what the job says."""
-    said = measurement.active_table
+def _active_then(job: MachineJob, measurement: MeasurementRecord, past: Past, said: str | None) -> TableRecord | None:
+    """Return the tables that were active while the machine was measured: what is said, else what the job says."""
+    tables = past.tables
     if said is not None and said.lower() in ("none", "bare"):
         return None
     if said is not None:
         version = said.lower().removeprefix("v")
         found = next((table for table in tables if version.isdigit() and table.version == int(version)), None)
         if found is None or not found.accepted:
+            of_file = said == measurement.active_table
             raise InputError(
                 f"says active_table = {said}, but {job.name} has no such tables; a version or none is expected",
-                file=measurement.name,
+                file=measurement.name if of_file else None,
+                field=None if of_file else "--active-table",
             )
         return found
     if job.measured_with == "bare":
         return None
-    before = [decision for decision in store.decisions(record) if decision.at <= measurement.measured_at]
-    wanted = active_id(before)
+    wanted = active_id([decision for decision in past.decisions if decision.at <= measurement.measured_at])
     return next((table for table in tables if table.id == wanted), None)
 
 
@@ -159,6 +184,31 @@ def _parsed(store: Store, machine: Machine, table: TableRecord, control: str, fo
     if not paths:
         raise InputError(f"version {table.version} was active, but holds no tables of {control}; is the control right?")
     return ActiveTables(read_tables(machine, paths, control), tuple(paths))
+
+
+def _judge_likeness(
+    judgement: Judgement,
+    store: Store,
+    about: tuple[MachineJob, Machine, MeasurementRecord],
+    past: Past,
+    outcome: RunResult,
+    taken: int | None,
+    folder: Path,
+) -> None:
+    """Compare the change with what each version that is or was active adds."""
+    job, machine, measurement = about
+    by_id = {table.id: table for table in past.tables}
+    order = [item.table_id for item in past.decisions if AFTER[item.kind] == "active" and item.table_id is not None]
+    known = [by_id[key] for key in dict.fromkeys(order[::-1])][:LOOKED_BACK][::-1]
+    were_active: dict[int, ReadTables] = {}
+    for table in known:
+        control = next((name for name in job.controllers if name in table.controllers), table.controllers[0])
+        paths = _written(store, table, control, folder / str(table.version))
+        if paths:
+            were_active[table.version] = read_tables(machine, paths, control)
+    if were_active:
+        old = store.identification(known[-1].identification_id)
+        judge_likeness(judgement, store, job, machine, measurement, outcome, old, were_active, taken)
 
 
 def _written(store: Store, table: TableRecord, control: str, folder: Path) -> list[Path]:

@@ -25,8 +25,9 @@ class MachineRecord:
 class MeasurementRecord:
     """One measurement, known by the SHA-256 of its files.
 
-    ``measured_at`` comes from the file's comment ``measured_at`` (``measured_at_source`` = "file") or from the time of
-    the file itself ("file time"); ``active_table`` is the comment ``active_table``: a version or "none"; None if the
+    ``measured_at`` comes from the file's comment ``measured_at`` (``measured_at_source`` = "file"; "file, no zone" if it
+    names no zone and is taken as local time) or from the time of the file itself ("file time"). ``active_table`` is the
+    comment ``active_table``: a version or "none"; None if the
     file says nothing. ``temperatures_c`` holds lowest, mean and highest value of each channel. ``files`` are name and
     SHA-256.
     """

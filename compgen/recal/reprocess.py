@@ -45,11 +45,15 @@ class Reprocessed:
 
 @dataclass(frozen=True)
 class Wish:
-    """Which measurement (None: the newest), who wants it and why."""
+    """Which measurement (None: the newest), who wants it and why.
+
+    ``active_table`` states which tables were on while it was made, a version or "none"; None: what the file says.
+    """
 
     measurement: str | None
     actor: str
     reason: str
+    active_table: str | None = None
 
 
 def reprocess(job: Job, name: str, wish: Wish, *, clock: Clock | None = None) -> Reprocessed:
@@ -63,6 +67,8 @@ def reprocess(job: Job, name: str, wish: Wish, *, clock: Clock | None = None) ->
         if the measurement cannot be used now, which is kept as an event, or another runner works on it.
     """
     machine_job = job.machine(name)
+    if wish.active_table is not None and not re.fullmatch(r"(?i)none|v?[0-9]{1,9}", wish.active_table):
+        raise InputError(f"{wish.active_table!r} names no tables; give a version (v3) or none", field="--active-table")
     if not wish.reason.strip() or not wish.actor.strip():
         raise InputError("to process a measurement again a reason and a name are due", field="--reason")
     check_person(wish.actor)
@@ -130,8 +136,9 @@ def _kept(
     measurement, claim = work
     started = time.monotonic()
     with claims.Renewal(store, claim):
-        done = process(store, job, machine, measurement)
-    why = f"{measurement.name} processed again: {wish.reason}"
+        done = process(store, job, machine, measurement, wish.active_table)
+    stated = "" if wish.active_table is None else f" with active_table = {wish.active_table}"
+    why = f"{measurement.name} processed again{stated}: {wish.reason}"
     who = {"revision": revision, "actor": wish.actor, "reason": why}
     result = replace(done.result, seconds=time.monotonic() - started, **who)  # type: ignore[arg-type]
     return keep_result(store, machine, claim, result, done.judged_against)

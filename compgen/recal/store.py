@@ -222,6 +222,33 @@ class Store:
         (row,) = self._rows(query.where(found.c.id == table.identification_id))
         return MeasurementRecord(**row._mapping, files=())
 
+    def same_files_of_others(self, machine: MachineRecord, measurement: MeasurementRecord) -> list[tuple[str, str]]:
+        """Return (machine, measurement in words) of other machines to which one of the measurement's files came too.
+
+        What a person rejected there does not count: that is how the wrong machine lets go of it.
+        """
+        files, measured, found = schema.measurement_files, schema.measurements, schema.identifications
+        own = {digest for _, digest in measurement.files}
+        query = sa.select(
+            measured.c.id, measured.c.machine_id, measured.c.name, schema.machines.c.name.label("machine")
+        )
+        query = query.join(files, files.c.measurement_id == measured.c.id)
+        query = query.join(schema.machines, schema.machines.c.id == measured.c.machine_id)
+        query = query.where(files.c.sha256.in_(own), measured.c.machine_id != machine.id)
+        others: list[tuple[str, str]] = []
+        for row in self._rows(query.distinct().order_by(measured.c.id)):
+            made = sa.select(schema.tables.c.version, schema.tables.c.id).join(
+                found, found.c.id == schema.tables.c.identification_id
+            )
+            versions = {key: version for version, key in self._rows(made.where(found.c.measurement_id == row.id))}
+            decided = self.decisions(self.machine(row.machine)) if versions else []
+            states = {version: state_of(key, decided) for key, version in versions.items()}
+            if states and all(state in ("rejected", "refused") for state in states.values()):
+                continue
+            said = ", ".join(f"version {version} is {state}" for version, state in states.items())
+            others.append((row.machine, said or f"measurement {row.id}, {row.name}"))
+        return others
+
     def identified(self, machine: MachineRecord) -> set[int]:
         """Return the ids of the machine's measurements that have a result."""
         table = schema.identifications

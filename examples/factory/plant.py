@@ -210,6 +210,7 @@ class Factory:
     def measure(self, job: Job, name: str, at: datetime, *, bare: bool = False, part: str = "") -> Path:
         """Measure a machine as it is then, with the tables that stand in its control; return the file in the inbox."""
         machine, tables = self.machine(name), None if bare else active_tables(job, name, self.machine(name))
+        bare = tables is None  # which the file says: before the first tables the store cannot know it
         effects = () if tables is None else (Compensated(tables, self.truth(name, at)),)
         lengths = compgen.simulate(machine, self.scenario(name, at, part), effects=effects).lengths
         notes = {**lengths.metadata, "measured_at": at.isoformat(), **({"active_table": "none"} if bare else {})}
