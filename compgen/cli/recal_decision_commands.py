@@ -1,4 +1,4 @@
-"""``compgen recal approve``, ``reject`` and ``rollback``."""
+"""``compgen recal approve``, ``reject``, ``rollback`` and ``adopt``."""
 
 from __future__ import annotations
 
@@ -120,6 +120,32 @@ def rollback_command(machine: str, job: Job, to: int | None, actor: str | None, 
     from compgen.recal.actions import rollback
 
     return _decided(job, machine, rollback(job, machine, actor_of(actor), reason, to=to), as_json)
+
+
+@recal.command("adopt")
+@click.argument("machine")
+@job_option
+@who_option(reason=True)
+@json_option
+def adopt_command(machine: str, job: Job, actor: str | None, reason: str, as_json: bool) -> int:
+    """Give the output folder of MACHINE to this store, after the store was lost, emptied or replaced by an older backup.
+
+    What the folder holds is moved to SET-ASIDE-1 (2, ...) inside it, and the store publishes its own versions. From then
+    on it does not know which tables are on: the next measurement has to say it, or a version has to be approved.
+
+    \b
+    Example:
+      compgen recal adopt mill-1 --reason "store restored from the backup of Sunday"
+    """
+    from compgen.recal.actions import adopt
+
+    moved = adopt(job, machine, actor_of(actor), reason)
+    if as_json:
+        print_json({"accepted": True, "machine": machine, "set_aside": None if moved is None else str(moved)})
+    else:
+        what = "there was nothing to set aside" if moved is None else f"what it held is in {moved}"
+        stdout.print(f"{machine}: the folder belongs to this store now; {what}", soft_wrap=True, markup=False)
+    return 0
 
 
 def _decided(job: Job, machine: str, decision: Any, as_json: bool) -> int:

@@ -6,13 +6,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
-from compgen.errors import CompgenError
+from compgen.errors import CompgenError, InputError
 from compgen.recal import decisions
 from compgen.recal.decisions import DecisionError
 from compgen.recal.job import Job, MachineJob
+from compgen.recal.judge import ADOPTED
 from compgen.recal.notify import notify
-from compgen.recal.publish import publish
+from compgen.recal.publish import check_folder, publish, set_aside
 from compgen.recal.records import DecisionRecord, MachineRecord
 from compgen.recal.states import AUTOMATIC
 from compgen.recal.store import Clock, Store, open_store
@@ -107,6 +109,38 @@ def waiting_version(store: Store, machine: MachineRecord) -> int:
     return version
 
 
+def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None = None) -> Path | None:
+    """Give the folder of a machine to this store: what it holds is set aside, and the store publishes its own.
+
+    From now on the store does not know which tables are on until one is approved or a measurement says it.
+
+    Returns
+    -------
+    The folder into which what was there was moved, None if there was nothing.
+
+    Raises
+    ------
+    InputError
+        without a name or a reason, or if the folder cannot be written.
+    """
+    if not actor.strip() or not reason.strip():
+        raise InputError("to give a folder to this store, a name and a reason are needed", field="--reason")
+    machine_job = job.machine(name)
+    store = open_store(job.store, clock=clock)
+    try:
+        machine = store.add_machine(name)
+        try:
+            moved = set_aside(machine_job.out)
+        except OSError as error:
+            raise InputError(f"cannot be set aside: {error.strerror or error}", file=machine_job.out) from error
+        said = "nothing was there" if moved is None else f"what was there is in {moved.name}"
+        store.add_event(ADOPTED, "folder", f"given to this store by {actor}, {said}: {reason}", machine)
+        publish(store, machine, machine_job.out)
+        return moved
+    finally:
+        store.close()
+
+
 def _chosen(store: Store, machine: MachineRecord, version: int | None) -> int:
     if version is not None:
         return version
@@ -128,6 +162,7 @@ def _done(
     store = open_store(url, clock=clock)
     try:
         machine = store.machine(machine_job.name)
+        check_folder(store, machine, machine_job.out)
         decision = decide(store, machine)
         try:
             publish(store, machine, machine_job.out)

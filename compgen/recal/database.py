@@ -54,7 +54,25 @@ def engine_of(url: str) -> sa.Engine:
     folder = Path(parsed.database).absolute().parent
     if not folder.is_dir():  # not made here: on a drive that is not mounted a new, empty store would begin
         raise StoreError(f"the store {shown(url)} cannot be used: there is no folder {folder}; mount or make it first")
-    return _sqlite(parsed.set(database=str(folder / Path(parsed.database).name)), os.getpid())
+    path = folder / Path(parsed.database).name
+    _refuse_empty(path, url)
+    return _sqlite(parsed.set(database=str(path)), os.getpid())
+
+
+def _refuse_empty(path: Path, url: str) -> None:
+    """Raise StoreError for a file without contents: a store lost them; one that is being made has some in a moment."""
+    for pause in (*WAITS_S, None):
+        try:
+            if path.stat().st_size > 0:
+                return
+        except OSError:
+            return  # not there yet, or the database says what is wrong
+        if pause is not None:
+            time.sleep(pause)
+    raise StoreError(
+        f"the store {shown(url)} is damaged: the file is empty (0 bytes); restore a backup, or remove the file if there "
+        "never was anything in it"
+    )
 
 
 @lru_cache(maxsize=8)

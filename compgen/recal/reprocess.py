@@ -18,7 +18,7 @@ from compgen.recal.decisions import check_person
 from compgen.recal.job import Job, MachineJob
 from compgen.recal.notify import notify
 from compgen.recal.process import process, without_folder
-from compgen.recal.publish import publish
+from compgen.recal.publish import check_folder, publish
 from compgen.recal.records import MachineRecord, MeasurementRecord, TableRecord
 from compgen.recal.results import ChangedMeanwhileError, keep_result
 from compgen.recal.store import Clock, Store, open_store
@@ -75,6 +75,7 @@ def reprocess(job: Job, name: str, wish: Wish, *, clock: Clock | None = None) ->
     store = open_store(job.store, clock=clock)
     try:
         machine = store.machine(name)
+        check_folder(store, machine, machine_job.out)
         measurement = _chosen(store, machine, wish.measurement)
         with one_thread():  # the same bytes however many processors there are
             table, revision = _again(store, machine_job, machine, measurement, wish)

@@ -24,7 +24,7 @@ from compgen.recal.job import Job, MachineJob
 from compgen.recal.notify import notify
 from compgen.recal.passing import passes
 from compgen.recal.process import process, without_folder
-from compgen.recal.publish import publish
+from compgen.recal.publish import check_folder, publish
 from compgen.recal.records import MachineRecord, MeasurementRecord, TableRecord
 from compgen.recal.results import ChangedMeanwhileError, keep_failure, keep_result
 from compgen.recal.schema import plain
@@ -147,6 +147,7 @@ class _Pass:
 
     def run(self) -> MachineOutcome:
         """Take, process, publish, notify."""
+        check_folder(self.store, self.machine, self.job.out)
         self._check_clock()
         self._take()
         settings = self.job.settings_sha256()  # a machine file that is missing ends here; what came in is kept

@@ -329,6 +329,16 @@ class Store:
         """Return the files of a set of tables, byte for byte; StoreError if any is missing or damaged."""
         return self.read(lambda connection: files_of(connection, table.id))
 
+    def file_hashes(self, machine: MachineRecord) -> dict[int, list[tuple[str, str, str]]]:
+        """Return control, name and SHA-256 of the files of every set of tables of a machine, by its id, in a fixed order."""
+        files, tables = schema.table_files, schema.tables
+        query = sa.select(files.c.table_id, files.c.controller, files.c.name, files.c.sha256)
+        query = query.join(tables, tables.c.id == files.c.table_id).where(tables.c.machine_id == machine.id)
+        found: dict[int, list[tuple[str, str, str]]] = {}
+        for table_id, *file in self._rows(query):
+            found.setdefault(table_id, []).append((file[0], file[1], file[2]))
+        return {table_id: sorted(listed) for table_id, listed in found.items()}
+
     def decisions(self, machine: MachineRecord | None = None) -> list[DecisionRecord]:
         """Return all decisions in their order: who, what, when, why."""
         table = schema.decisions
