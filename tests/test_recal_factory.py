@@ -4,10 +4,13 @@ The example in ``examples/factory`` runs once; every test looks at another side 
 """
 
 import re
+import shutil
 import sys
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from compgen.cli import cli
@@ -20,10 +23,13 @@ from compgen.recal.drift_data import calibrations_of
 from compgen.recal.job import read_job
 from compgen.recal.overview import history
 from compgen.recal.store import open_store
+from compgen.serve.drift_view import drift_charts, trend_rows
+from compgen.serve.history import ErrorCache
+from compgen.serve.history import history as machine_history
 from compgen.simulate import read_scenario, simulate_axis_runs
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "factory"
-MODULES = ("factory", "plant", "people", "checks")
+MODULES = ("factory", "plant", "people", "checks", "clocks")
 #: Rms of the true error over the volume that is left right after new tables, um; readings are good to some 0.3 um.
 LEFT_UM = 0.5
 
@@ -288,6 +294,76 @@ def test_the_commands_work_on_the_factory(year, capsys, tmp_path):
 
 
 # --- a measurement of one axis ---------------------------------------------------------------------------------------
+
+
+# --- the dashboard ---------------------------------------------------------------------------------------------------
+
+
+def test_the_dashboard_draws_the_steps_that_it_names(year, store):
+    found = drift_of_store(store, store.machine("mill-b"), DriftSettings(year.job.machine("mill-b").tolerances))
+    rows = trend_rows(found)
+    assert {row.name for row in rows[:2]} == {"EYY line", "EC0Y"}
+    assert (
+        {row.name for row in rows if row.significant} == {row.name for row in rows if row.steps} == {"EYY line", "EC0Y"}
+    )
+    drawn = {item.title.partition(",")[0]: item for item in drift_charts(found)}
+    assert set(drawn) == {"Change in the volume", "EYY line", "EC0Y"}
+    for name in ("EYY line", "EC0Y"):
+        label, points, marks = drawn[name].lines[1]
+        assert label == "trend with steps" and marks == []
+        places = [tuple(map(float, point.split(","))) for point in points.split()]
+        jumps = [(x, new - old) for (x, old), (same, new) in zip(places, places[1:], strict=False) if x == same]
+        ((_, jump),) = jumps
+        seen = [mark.y for mark in drawn[name].lines[0][2]]
+        assert jump == pytest.approx(np.mean(seen[6:]) - np.mean(seen[:6]), abs=0.25 * abs(jump))
+
+
+def test_a_machine_at_which_nothing_moves_draws_no_figures(year, store):
+    found = drift_of_store(store, store.machine("mill-b"), DriftSettings())
+    quiet = replace(found, figures=tuple(item for item in found.figures if item.p_value > 0.05))
+    assert [item.title.partition(",")[0] for item in drift_charts(quiet)] == ["Change in the volume"]
+
+
+def test_the_measurement_that_ada_excluded_is_grey_on_the_page_of_the_machine(store):
+    shown = machine_history(store, ErrorCache(store), store.machine("mill-b"))
+    grey = {trend.name: trend.chart.left_out for trend in shown.trends}
+    assert {len(marks) for marks in grey.values()} == {1}
+
+
+@pytest.fixture(scope="module")
+def prepared(example, tmp_path_factory):
+    return example["clocks"].prepared(tmp_path_factory.mktemp("clocks") / "base")
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "said", "would_lose"),
+    [
+        ("the instrument's clock is 10 minutes behind", "held", "5 min from the decision", True),
+        ("the time has no zone", "held", "has no zone", False),
+        ("the file has no time and was copied", "held", "changes when it is copied", True),
+        ("the server's clock ran ahead", "held", "the clock went back, so the time", True),
+        ("the machine has another name in the job file", "held", "never made any of mill-x active", True),
+        ("the store was deleted", "failed", "never active by this store", False),
+        ("the store has 0 bytes", "stopped", r"0 bytes", False),
+        ("the store is an older one", "failed", "never active by this store", False),
+    ],
+)
+def test_wrong_times_and_lost_histories_never_undo_the_compensation(
+    example, prepared, tmp_path, name, state, said, would_lose
+):
+    """Truth: the exact machine with the tables that are really on; the new tables would lose what the old ones hold."""
+    folder = tmp_path / "factory"
+    shutil.copytree(prepared, folder)
+    case = example["clocks"].carried_out(name, folder)
+    assert case.state == state and said in case.said
+    assert case.same_files and case.left_um < LEFT_UM
+    assert (case.would_leave_um is not None and case.would_leave_um > 9.0) == would_lose
+
+
+def test_every_case_of_the_example_is_tested(example):
+    tested = test_wrong_times_and_lost_histories_never_undo_the_compensation.pytestmark[0].args[1]
+    assert [case[0] for case in tested] == list(example["clocks"].CASES)
+
 
 AXIS_LASER = """\
 name = "laser"

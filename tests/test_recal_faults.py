@@ -702,14 +702,15 @@ def test_publishing_needs_no_pointer_that_it_may_not_move(site):
 
 
 def two_machines(site):
-    """The job gains a machine after the first, with an inbox of its own; each has one measurement."""
+    """The job gains a machine after the first, with an inbox of its own; each has one measurement, not the same."""
     path = site.folder / "recal.toml"
     own = path.read_text()
     more = own[own.index("[machines.mill]") :].replace("[machines.mill]", "[machines.next]")
     path.write_text(own + more.replace('"inbox"', '"inbox2"').replace('"out"', '"out2"'))
     site.measure()
     (site.folder / "inbox2").mkdir()
-    shutil.copy(site.inbox / "0001.deviations.csv", site.folder / "inbox2")
+    text = (site.inbox / "0001.deviations.csv").read_text()
+    (site.folder / "inbox2" / "0001.deviations.csv").write_text(f"# of = next\n{text}")
     return site.inbox / "0001.deviations.csv"
 
 

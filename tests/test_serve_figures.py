@@ -356,3 +356,123 @@ def test_a_longer_history_needs_no_more_queries(tracked_site):
     for path in ("/machines/{}", "/machines/{}/tables/8", "/machines/{}/drift"):
         (_, first, _), (_, second, _) = (cost_of(site, path.format(item.id)) for item in (machine, year))
         assert first == second, path
+
+
+# --- fleet, steps, what is left out -----------------------------------------------------------------------------------
+
+
+def test_the_fleet_shows_trend_and_tolerance(tracked_site, monkeypatch):
+    """3 urad a month; 21 of the 50 urad are used up since the active tables, so 9.7 months are left."""
+    monkeypatch.setattr(background, "REST_S", 0.05)
+    site, machine, _ = tracked_site
+    until = time.monotonic() + 60.0
+    while "EC0Y leaves tolerance" not in (text := site.get("/").text):
+        assert time.monotonic() < until
+        time.sleep(0.2)
+    row = re.search(rf'href="/machines/{machine.id}">mill-9</a></th>(.*?)</tr>', text, re.S)[1]
+    rate = float(re.search(r"EC0Y \+(\d\.\d\d) µrad a month", row)[1])
+    assert abs(rate - 3.0) < 0.3
+    told = re.search(r"EC0Y leaves tolerance in about (\d+) months, 95 % (\d+)-(\d+)", row)
+    assert int(told[2]) <= 9.7 <= int(told[3])
+    mill = re.search(r'href="/machines/1">mill-1</a></th>(.*?)</tr>', text, re.S)[1]
+    assert "nothing beyond the uncertainty" in mill or "being worked out" in mill
+
+
+def test_the_fleet_is_worked_out_only_when_nobody_asks_for_anything(monkeypatch):
+    monkeypatch.setattr(background, "REST_S", 0.1)
+    beside, done, go_on = Background(), [], threading.Event()
+    beside.began()  # a request is under way
+    for key in (1, 2, 2):
+        beside.later(key, lambda key=key: done.append(key))
+    time.sleep(0.5)
+    assert done == []
+    with pytest.raises(NotReadyError):
+        beside.get("page", lambda: go_on.wait(30.0), 0.01)
+    beside.ended()
+    time.sleep(0.4)
+    assert done == []  # somebody still waits for figures
+    go_on.set()
+    until = time.monotonic() + 20.0
+    while done != [1, 2]:
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    monkeypatch.setattr(background, "AT_LATEST_S", 0.3)
+    beside.began()  # a server that never rests
+    beside.later(3, lambda: done.append(3))
+    while done != [1, 2, 3]:
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def test_what_fails_in_an_idle_moment_stops_nothing(monkeypatch):
+    monkeypatch.setattr(background, "REST_S", 0.01)
+    beside, done = Background(), threading.Event()
+    beside.later("fault", lambda: 1 / 0)
+    beside.later("next", done.set)
+    assert done.wait(20.0)
+
+
+def test_an_excluded_measurement_is_grey_and_out_of_the_scale(tracked_site):
+    """A measurement of 10 mrad: with it in the scale, the drift of 3 urad a month would be a flat line."""
+    site, machine, address = tracked_site
+    wild = factory.errors_text(10_000.0, 1.0)
+    new = NewMeasurement("e" * 64, "wild.lengths.csv", factory.BEGIN + timedelta(days=300), "file", {"a": b"wild"})
+    claim = claims.take(site.store, site.store.add_measurement(machine, new), claims.owner_name())
+    active = decisions.active_table(site.store, machine)
+    files = [TableFile("isg-csv", "table.csv", b"wild")]
+    common = {"machine_text": factory.MACHINE_TOML, "covariance": None, "fitted_text": None, "summary": {}}
+    rest = {"program": "test", "accepted": True, "hold": [], "judgement": {}, "approve": False, "seconds": 1.0}
+    result = NewResult(errors_text=wild, active_table_id=active.id, files=files, settings_sha256="0", **common, **rest)
+    table = results.keep_result(site.store, machine, claim, result, active.id)
+
+    def chart_of(text):
+        return re.search(r"<figcaption>EC0Y, value.*?</figure>", text, re.S)[0]
+
+    def labels(text):
+        return [float(found) for found in re.findall(r'text-anchor="end">([0-9.]+)</text>', chart_of(text))]
+
+    assert max(labels(site.get(address).text)) >= 8000.0
+    site.store.add_event("exclusion", f"version {table.version}", "excluded by ada: wrong probe", machine)
+    text = site.get(address).text
+    assert max(labels(text)) < 60.0
+    out = re.search(r'<g class="out">(.*?)</g>', chart_of(text), re.S)[1]
+    (place,) = re.findall(r'cy="([0-9.]+)"', out)
+    assert float(place) == 12.0  # the upper edge
+    assert "left out (excluded)" in chart_of(text)
+    newest = re.search(r'<th scope="row">EC0Y</th><td>value</td><td class="number">([^<]+)<', text)[1]
+    assert newest == "31.00"
+
+
+def test_a_change_that_equals_the_tables_asks_whether_they_were_on_or_off(tmp_path):
+    site = helper.Site(tmp_path)
+    machine = site.store.machine("mill-1")
+    for number, (sign, word) in enumerate([(-1, "off"), (1, "on")], start=20):
+        new = NewMeasurement(
+            f"{number:064d}", "x", factory.BEGIN + timedelta(days=900 + number), "file", {"a": b"%d" % number}
+        )
+        claim = claims.take(site.store, site.store.add_measurement(machine, new), claims.owner_name())
+        active = decisions.active_table(site.store, machine)
+        like = {"field": "version 2", "sign": sign, "correlation": 0.98 * sign, "size": 1.03 * sign, "p_value": 1e-7}
+        common = {"machine_text": factory.MACHINE_TOML, "covariance": None, "fitted_text": None, "summary": {}}
+        rest = {
+            "program": "test",
+            "accepted": True,
+            "hold": ["seems to have changed"],
+            "approve": False,
+            "seconds": 1.0,
+        }
+        result = NewResult(
+            errors_text=factory.errors_text(1.0, 1.0),
+            active_table_id=active.id,
+            files=[TableFile("isg-csv", "table.csv", b"%d" % number)],
+            settings_sha256="0",
+            judgement={"likeness": like},
+            **common,
+            **rest,
+        )
+        table = results.keep_result(site.store, machine, claim, result, active.id)
+        text = site.get(f"/machines/{machine.id}/tables/{table.version}").text
+        assert f"Were the tables {word} while it was measured?" in text
+        assert "size 1.03" in text
+    assert "Were the tables" not in site.get(f"/machines/{machine.id}/tables/3").text
+    site.store.close()

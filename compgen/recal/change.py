@@ -25,7 +25,7 @@ from compgen.model.volumetric import volumetric_error
 #: Points along each axis of the grid on which the change is looked at.
 POINTS = 6
 #: A change equals a field if what the two differ by, beyond the noise, is at most this share of the field (rms).
-ALIKE = 0.5
+ALIKE = 0.25
 #: Probabilities below this are said as that: the number of independent directions is hardly known.
 LEAST_P = 1e-9
 
@@ -60,7 +60,7 @@ class Likeness:
 
     ``field`` is the key of that field, ``sign`` +1 or -1, ``correlation`` that of the two, ``size`` the factor by which
     the field fits the change best. ``p_value``: the probability that a change drawn evenly from all those of at most
-    twice the size of the field comes as close to plus or minus any of the fields that were looked at.
+    twice the size of the field comes as close to any of the fields that were looked at, each with its sign.
     """
 
     field: str
@@ -86,8 +86,8 @@ def likeness(
     machine: Machine,
     new: tuple[ErrorTable, Covariance | None],
     old: tuple[ErrorTable, Covariance | None],
-    fields: Mapping[str, FloatArray],
-    one_way: Mapping[str, FloatArray],
+    added: Mapping[str, FloatArray],
+    missing: Mapping[str, FloatArray],
 ) -> Likeness | None:
     """Return the field that the change equals, with its sign; None if it equals none.
 
@@ -98,8 +98,8 @@ def likeness(
     Parameters
     ----------
     new, old : identified errors and, where it is known, their covariance.
-    fields : what may have acted or been missing, at the points of :func:`volume_points`, (n, 3), mm.
-    one_way : further fields that can only have acted.
+    added : fields that may have acted without being counted, at the points of :func:`volume_points`, (n, 3), mm.
+    missing : fields that may have been counted without acting.
     """
     position_mm = _grid(machine)
     keep = _without_rigid(machine, position_mm)
@@ -110,21 +110,21 @@ def likeness(
     free = _directions(machine, new[0], position_mm, keep)
     best: Likeness | None = None
     nearest = ALIKE
-    count = 2 * len(fields) + len(one_way)
-    for name, field in [*fields.items(), *one_way.items()]:
+    signed = [
+        *((name, 1, field) for name, field in added.items()),
+        *((name, -1, field) for name, field in missing.items()),
+    ]
+    for name, sign, field in signed:
         known = keep @ field.ravel()
         square, product = float(known @ known), float(known @ moved)
-        if square <= noise or product == 0.0:
-            continue  # too small to be told from nothing
-        sign = 1 if product > 0.0 else -1
-        if sign < 0 and name in one_way:
-            continue
+        if square <= 4.0 * noise or sign * product <= 0.0:
+            continue  # too small to be told from nothing, or the other way round
         apart = float(np.sum((moved - sign * known) ** 2))
         share = float(np.sqrt(max(apart - noise, 0.0) / square))
         if share <= nearest:
             nearest = share
             correlation = product / float(np.sqrt(square * (moved @ moved)))
-            p_value = min(1.0, count * (0.5 * min(float(np.sqrt(apart / square)), 2.0)) ** free)
+            p_value = min(1.0, len(signed) * (0.5 * min(float(np.sqrt(apart / square)), 2.0)) ** free)
             best = Likeness(name, sign, correlation, product / square, p_value)
     return best
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import error_named
 from compgen.errors import InputError
@@ -17,7 +18,7 @@ from compgen.recal.drift_data import Aligned, Calibration, Figure, aligned, cali
 from compgen.recal.drift_forecast import Forecast, forecast
 from compgen.recal.drift_trend import Series, Step, Trend, fit_trend, usable_temperature
 from compgen.recal.drift_volume import volume_forecast
-from compgen.recal.drift_words import interval_of, sentences
+from compgen.recal.drift_words import interval_of, outlook, sentences
 from compgen.recal.exclude import excluded
 from compgen.recal.records import MachineRecord, TableRecord
 from compgen.recal.store import Store
@@ -45,7 +46,10 @@ class DriftSettings:
 
 @dataclass(frozen=True)
 class FigureDrift:
-    """Trend of one figure; None for too few calibrations. ``reference`` is what the active tables take out."""
+    """Trend of one figure; None for too few calibrations. ``reference`` is what the active tables take out.
+
+    ``adjusted`` is the error probability of the slope, all figures counted.
+    """
 
     figure: Figure
     series: Series
@@ -54,6 +58,27 @@ class FigureDrift:
     adjusted: float
     tolerance: float | None = None
     forecast: Forecast | None = None
+
+    @property
+    def p_value(self) -> float:
+        """Error probability of what is most certain about it, its slope or one of its steps; all figures counted."""
+        steps = () if self.trend is None else self.trend.steps
+        return min([self.adjusted, *(step.p_value for step in steps)])
+
+    def line(self) -> tuple[FloatArray, FloatArray]:
+        """Days and values of the line with its steps, each in the middle of its gap, at the mean temperature."""
+        assert self.trend is not None
+        days, slope = self.series.days, self.trend.slope[0]
+        now = sum(part.share * part.state[0] for part in self.trend.components)
+        corners = [(float(k), day) for k, day in enumerate(days)]
+        for step in self.trend.steps:  # between readings after - 1 and after, just before and just behind the step
+            middle = 0.5 * (days[step.after - 1] + days[step.after])
+            corners += [(step.after - 0.6, middle), (step.after - 0.4, middle)]
+        order, places = (np.array(part) for part in zip(*sorted(corners), strict=True))
+        values = now + slope * (places - days[-1])
+        for step in self.trend.steps:
+            values -= np.where(order < step.after - 0.5, step.size, 0.0)
+        return places, values
 
 
 @dataclass(frozen=True)
@@ -85,6 +110,10 @@ class Drift:
     def sentences(self) -> list[str]:
         """Say what matters in words."""
         return sentences(self)
+
+    def outlook(self) -> tuple[str, str]:
+        """Say what moves and when the first tolerance is left, each in a few words; empty for nothing and no tolerance."""
+        return outlook(self)
 
     def summary(self) -> dict[str, Any]:
         """Return all figures for JSON, in um, urad, days."""

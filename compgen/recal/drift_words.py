@@ -48,6 +48,30 @@ def sentences(drift: Drift) -> list[str]:
     return told + list(drift.notes)
 
 
+def outlook(drift: Drift) -> tuple[str, str]:
+    """Say what moves most certainly, and what leaves its tolerance first; each empty if there is nothing to say."""
+    level = 1.0 - drift.settings.confidence
+    moving = sorted((item for item in drift.figures if item.p_value < level), key=lambda item: item.p_value)
+    told = ""
+    if moving:
+        item = moving[0]
+        assert item.trend is not None
+        scale = 1.0 / error_named(item.figure.error).si_per_unit
+        if item.adjusted < level:
+            told = f"{item.figure.name} {item.trend.slope[0] * DAYS_A_MONTH * scale:+.2f} {item.figure.unit} a month"
+        else:
+            step = min(item.trend.steps, key=lambda step: step.p_value)
+            told = f"{item.figure.name} step of {step.size * scale:+.2f} {item.figure.unit} before {drift.times[step.after][:10]}"
+        told += f", and {len(moving) - 1} more" if len(moving) > 1 else ""
+    known = [(item.figure.name, item.forecast) for item in drift.figures if item.forecast is not None]
+    if drift.volume_forecast is not None:
+        known.append(("the volume", drift.volume_forecast))
+    if not known:
+        return told, ""
+    name, first = min(known, key=lambda each: (-(each[1].outside_now > 0.5), each[1].median_days, each[1].low_days))
+    return told, first.words(name)
+
+
 def following_temperature(drift: Drift) -> set[str]:
     """Return the figures that follow the temperature significantly, all that were looked at counted."""
     found = {}

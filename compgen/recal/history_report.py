@@ -69,7 +69,7 @@ def draw_history(drift: Drift) -> list[Picture]:
 
 
 def _importance(item: FigureDrift) -> tuple[bool, float]:
-    return item.tolerance is None, item.adjusted
+    return item.tolerance is None, item.p_value
 
 
 def _days(drift: Drift) -> FloatArray:
@@ -137,12 +137,11 @@ def _line(axes: Axes, item: FigureDrift, scale: float) -> None:
     assert item.trend is not None
     days, (slope, _) = item.series.days, item.trend.slope
     state = sum(part.share * part.state[0] for part in item.trend.components)
-    level = state + slope * (days - days[-1])
     for step in item.trend.steps:
-        level = level - np.where(np.arange(len(days)) < step.after, step.size, 0.0)
         middle = 0.5 * (days[step.after - 1] + days[step.after])
         axes.axvline(middle, color=colour("before"), linewidth=0.9, linestyle=(0, (1, 2)))
-    axes.plot(days, level * scale, color=colour("fit"), linestyle=(0, (4, 2)))
+    at, level = item.line()
+    axes.plot(at, level * scale, color=colour("fit"), linestyle=(0, (4, 2)))
     if item.forecast is not None:
         reach = _exit(axes, item, days)
         if reach > 0.0:

@@ -127,8 +127,9 @@ def judge_assumption(
     if not swaps:
         if not past.stated:
             judgement.hold.append(
-                "the store does not know which tables were on while the machine was measured: it never made any active. "
-                + how_to_state(job.name, measurement, "none")
+                "the store does not know which tables were on while the machine was measured: it never made any of "
+                f"{job.name} active. If none were on: {how_to_state(job.name, measurement, 'none')}; if tables were on, "
+                "switch them off and measure again"
             )
         return
     doubts = []
@@ -153,14 +154,14 @@ def judge_assumption(
     if doubts:
         judgement.hold.append(
             f"it is not certain which tables were on while the machine was measured, and {taken} was taken out: "
-            f"{'; '.join(dict.fromkeys(doubts))}. {how_to_state(job.name, measurement, 'VERSION|none')}"
+            f"{'; '.join(dict.fromkeys(doubts))}; {how_to_state(job.name, measurement, 'VERSION|none')}"
         )
 
 
 def how_to_state(name: str, measurement: MeasurementRecord, tables: str) -> str:
     """Say how a person states which tables were on; ``tables`` is a version, "none" or how to write either."""
     return (
-        f"State it: `compgen recal reprocess {name} --measurement {measurement.id} --active-table {tables} --reason TEXT`, "
+        f"state it: `compgen recal reprocess {name} --measurement {measurement.id} --active-table {tables} --reason TEXT`, "
         f"or `# active_table = {tables}` in the next file"
     )
 
@@ -183,6 +184,18 @@ def _seen(event: EventRecord) -> datetime:
         return event.at
 
 
+@dataclass(frozen=True)
+class Earlier:
+    """Tables that are or were active, by version, in the order in which they became active.
+
+    ``taken`` is the version that was taken out of the readings, ``active`` the one that is active now; None for none.
+    """
+
+    tables: Mapping[int, ReadTables]
+    taken: int | None
+    active: int | None
+
+
 def judge_likeness(
     judgement: Judgement,
     store: Store,
@@ -191,31 +204,26 @@ def judge_likeness(
     measurement: MeasurementRecord,
     result: RunResult,
     old: IdentificationRecord,
-    were_active: Mapping[int, ReadTables],
-    taken: int | None,
+    earlier: Earlier,
 ) -> None:
     """Hold where the machine seems to have changed by what some tables add, or by the opposite.
 
-    Parameters
-    ----------
-    old : the errors behind the active tables, or behind the last ones that were.
-    were_active : the tables that are or were active, by version, in the order in which they became active.
-    taken : version that was taken out of the readings; None for none.
+    ``old`` are the errors behind the active tables, or behind the last ones that were.
     """
     identified = result.identification
     old_errors = store.errors_of(old)
     if not set(old_errors.names) <= set(identified.errors.names):
         return  # held for that; a part of the errors has no field to compare
     points = Points(volume_points(machine))
-    adds = {version: _added(machine, tables, points) for version, tables in were_active.items()}
-    fields = {f"version {version}": field for version, field in adds.items()}
-    swapped = {}
+    adds = {version: _added(machine, tables, points) for version, tables in earlier.tables.items()}
+    added = {f"version {version}": field for version, field in adds.items()}
+    order, taken = list(adds), earlier.taken
     if taken in adds:  # the clock may be late: a later version was on already
-        order = list(adds)
         later = order[order.index(taken) + 1 :]
-        swapped = {f"version {version} in place of version {taken}": adds[version] - adds[taken] for version in later}
+        added |= {f"version {version} in place of version {taken}": adds[version] - adds[taken] for version in later}
+    missing = {f"version {version}": adds[version] for version in order if version in (taken, earlier.active)}
     new = (identified.errors, joint_covariance(identified) if identified.has_covariance else None)
-    found = likeness(machine, new, (old_errors, store.covariance_of(old)), fields, swapped)
+    found = likeness(machine, new, (old_errors, store.covariance_of(old)), added, missing)
     if found is None:
         return
     judgement.figures["likeness"] = found.summary()
@@ -225,7 +233,7 @@ def judge_likeness(
     version = f"v{found.field.split()[1]}" if found.sign > 0 else "none"
     judgement.hold.append(
         f"the machine seems to have changed by {what} {found.field} adds ({found.words()}): as if {found.field} {seems} "
-        f"while the machine was measured, but {was} taken out. "
+        f"while the machine was measured, but {was} taken out; "
         f"{how_to_state(job.name, measurement, version)}; if the machine has really changed, approve with --override"
     )
 

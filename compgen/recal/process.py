@@ -23,6 +23,7 @@ from compgen.recal.job import MachineJob
 from compgen.recal.judge import (
     STATED,
     ActiveState,
+    Earlier,
     Judgement,
     Past,
     apply_limits,
@@ -208,7 +209,8 @@ def _judge_likeness(
             were_active[table.version] = read_tables(machine, paths, control)
     if were_active:
         old = store.identification(known[-1].identification_id)
-        judge_likeness(judgement, store, job, machine, measurement, outcome, old, were_active, taken)
+        active = next((table.version for table in past.tables if table.state == "active"), None)
+        judge_likeness(judgement, store, job, machine, measurement, outcome, old, Earlier(were_active, taken, active))
 
 
 def _written(store: Store, table: TableRecord, control: str, folder: Path) -> list[Path]:

@@ -84,6 +84,7 @@ def _begin() -> BaseResponse | None:
     """Check host, method, login and, for what may change something, origin and token; in this order, before any page."""
     g.began, g.session = time.perf_counter(), None
     own = service()
+    own.background.began()
     check_host(request, own.settings)
     check_method(request)
     g.session = _session(own)
@@ -133,6 +134,7 @@ def _context() -> dict[str, Any]:
 def _finish(response: Response) -> Response:
     """Headers, counters, one line of log; nothing of a form or a cookie goes there."""
     own = service()
+    own.background.ended()
     seconds = time.perf_counter() - g.get("began", time.perf_counter())
     endpoint = (request.endpoint or "none").rpartition(".")[2]
     method = request.method if request.method in (*SAFE, "POST") else "other"

@@ -6,6 +6,7 @@ Whoever asks waits a little and is told to come again.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import OrderedDict
@@ -16,9 +17,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from compgen.errors import InputError
+from compgen.recal import logs
 
 #: Results that stay in memory, and questions that may wait for their turn.
 MOST, WAITING = 300, 20
+#: Pieces of work that may wait for an idle moment.
+MOST_LATER = 2000
+#: After so long without a request they begin, and after so long in any case, s.
+REST_S, AT_LATEST_S = 2.0, 30.0
 #: How long a request waits for a result, s.
 PATIENCE_S = 0.7
 #: Pages that are kept; how long one is shown that says how long ago something was, and one that waits for figures, s.
@@ -36,6 +42,9 @@ class Background:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="figures")
         self._lock = threading.Lock()
         self._known: OrderedDict[Hashable, Future[Any]] = OrderedDict()
+        self._idle: OrderedDict[Hashable, Callable[[], None]] = OrderedDict()
+        self._idling = False
+        self._requests, self._last, self._since = 0, time.monotonic(), 0.0
 
     def get(self, key: Hashable, work: Callable[[], Any], patience_s: float | None = None) -> Any:
         """Return what ``work`` gives, or raise what it raises.
@@ -63,6 +72,57 @@ class Background:
             with self._lock:  # what may pass by itself is tried again by the next question
                 self._known.pop(key, None)
             raise
+
+    def later(self, key: Hashable, work: Callable[[], None]) -> None:
+        """Do ``work``, which keeps its result itself, when nobody asks for anything; once while it is still to be done.
+
+        It begins :data:`REST_S` after the last request, or after :data:`AT_LATEST_S` on a server that never rests.
+        """
+        with self._lock:
+            if len(self._idle) < MOST_LATER:
+                self._idle.setdefault(key, work)
+            if not self._idling:
+                self._idling, self._since = True, time.monotonic()
+                self._wait()
+
+    def began(self) -> None:
+        """Say that a request came."""
+        with self._lock:
+            self._requests += 1
+
+    def ended(self) -> None:
+        """Say that a request was answered."""
+        with self._lock:
+            self._requests, self._last = max(0, self._requests - 1), time.monotonic()
+
+    def _wait(self) -> None:
+        timer = threading.Timer(REST_S, self._when_at_rest)
+        timer.daemon = True
+        timer.start()
+
+    def _when_at_rest(self) -> None:
+        with self._lock:
+            now = time.monotonic()
+            rests = self._requests == 0 and now - self._last >= REST_S and all(f.done() for f in self._known.values())
+            if not rests and now - self._since < AT_LATEST_S:
+                self._wait()
+                return
+            _, work = self._idle.popitem(last=False)
+        with contextlib.suppress(RuntimeError):  # the server stops
+            self._pool.submit(self._do, work)
+
+    def _do(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception as error:  # it is asked for again; the page of that machine says what is wrong
+            logs.warning("figures not worked out", problem=f"{type(error).__name__}: {error}")
+        with self._lock:
+            self._since, self._idling = time.monotonic(), bool(self._idle)
+            at_rest = self._requests == 0 and self._since - self._last >= REST_S
+        if self._idling and at_rest:
+            self._when_at_rest()
+        elif self._idling:
+            self._wait()
 
     def _forget(self) -> None:
         """Drop what was not asked for longest; what is being worked out stays."""

@@ -15,12 +15,16 @@ UNITS = {"um": "\N{MICRO SIGN}m", "urad": "\N{MICRO SIGN}rad"}
 
 @dataclass(frozen=True)
 class Series:
-    """One line: x, y and, where known, the half width of the interval around y (nan where it is not known)."""
+    """One line: x, y and, where known, the half width of the interval around y (nan where it is not known).
+
+    ``marked``: whether its points are drawn.
+    """
 
     label: str
     x: Sequence[float]
     y: Sequence[float]
     u: Sequence[float] = ()
+    marked: bool = True
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,10 @@ class Mark:
 
 @dataclass(frozen=True)
 class Chart:
-    """Everything in px: ticks as (place, text), lines as the text of ``points``, marks with their intervals."""
+    """Everything in px: ticks as (place, text), lines as the text of ``points``, marks with their intervals.
+
+    ``left_out`` are points that do not count, at the edge if they lie outside the scale.
+    """
 
     title: str
     x_ticks: Sequence[tuple[float, str]]
@@ -47,17 +54,26 @@ class Chart:
     right: float = WIDTH - MARGINS[1]
     top: float = MARGINS[2]
     bottom: float = HEIGHT - MARGINS[3]
+    left_out: Sequence[Mark] = ()
 
 
-def chart(title: str, series: Sequence[Series], x_ticks: Sequence[tuple[float, str]] | None = None) -> Chart | None:
+def chart(
+    title: str,
+    series: Sequence[Series],
+    x_ticks: Sequence[tuple[float, str]] | None = None,
+    left_out: Series | None = None,
+) -> Chart | None:
     """Return the chart of some lines; None if there is no point to draw.
 
-    ``x_ticks`` are places and texts below the axis; without them round numbers are chosen.
+    ``x_ticks`` are places and texts below the axis; without them round numbers are chosen. The scale of y does not reach
+    for points that are ``left_out``.
     """
     kept = [_finite(item) for item in series]
     xs = [x for item in kept for x in item.x]
     if not xs:
         return None
+    grey = None if left_out is None else _finite(left_out)
+    xs += [] if grey is None else grey.x
     ys = [y + side * u for item in kept for y, u in zip(item.y, item.u, strict=True) for side in (-1.0, 1.0)]
     y_marks = ticks(min(ys), max(ys))
     low, high = min(*ys, y_marks[0]), max(*ys, y_marks[-1])
@@ -69,7 +85,14 @@ def chart(title: str, series: Sequence[Series], x_ticks: Sequence[tuple[float, s
         [(across(x), text) for x, text in x_marks if min(xs) <= x <= max(xs)],
         [(up(y), number(y)) for y in y_marks],
         [_line(item, across, up) for item in kept],
+        left_out=[] if grey is None else [_at_edge(mark) for mark in _line(grey, across, up)[2]],
     )
+
+
+def _at_edge(mark: Mark) -> Mark:
+    """Return a point that lies outside the scale at its edge, without its interval."""
+    y = min(max(mark.y, MARGINS[2]), HEIGHT - MARGINS[3])
+    return mark if y == mark.y else Mark(mark.x, y, None, None)
 
 
 class _Scale:
@@ -87,7 +110,7 @@ def _finite(item: Series) -> Series:
     u = item.u or [0.0] * len(item.x)
     rows = [row for row in zip(item.x, item.y, u, strict=True) if math.isfinite(row[0]) and math.isfinite(row[1])]
     spread = [row[2] if math.isfinite(row[2]) else 0.0 for row in rows]
-    return Series(item.label, [row[0] for row in rows], [row[1] for row in rows], spread)
+    return Series(item.label, [row[0] for row in rows], [row[1] for row in rows], spread, item.marked)
 
 
 def _line(item: Series, across: _Scale, up: _Scale) -> tuple[str, str, list[Mark]]:
@@ -95,7 +118,7 @@ def _line(item: Series, across: _Scale, up: _Scale) -> tuple[str, str, list[Mark
     for x, y, u in zip(item.x, item.y, item.u, strict=True):
         low, high = (up(y - u), up(y + u)) if u > 0.0 else (None, None)
         marks.append(Mark(across(x), up(y), low, high))
-    return item.label, " ".join(f"{mark.x},{mark.y}" for mark in marks), marks
+    return item.label, " ".join(f"{mark.x},{mark.y}" for mark in marks), marks if item.marked else []
 
 
 def ticks(low: float, high: float, wanted: int = 5) -> list[float]:

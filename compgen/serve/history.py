@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
@@ -13,6 +13,7 @@ import numpy as np
 from compgen.core.error_table import ErrorTable
 from compgen.core.names import error_named
 from compgen.recal.counting import counting
+from compgen.recal.exclude import excluded
 from compgen.recal.records import (
     AttemptRecord,
     DecisionRecord,
@@ -99,29 +100,40 @@ def _history(store: Store, errors_of: ErrorCache, machine: MachineRecord) -> His
         store.decisions(machine)[::-1][:LISTED],
         failures[::-1][:20],
         store.events(machine)[::-1][:20],
-        trends(errors_of, counting(store, machine)[-CHARTED:]),
+        trends(errors_of, counting(store, machine)[-CHARTED:], set(excluded(store, machine))),
         _temperatures(measurements[-CHARTED:]),
         {table.id: table.version for table in tables},
     )
 
 
-def trends(errors_of: ErrorCache, identifications: Sequence[IdentificationRecord]) -> list[Trend]:
-    """Return the squareness errors and the span of every curve over time, as far as they were identified."""
-    if not identifications:
+def trends(
+    errors_of: ErrorCache, identifications: Sequence[IdentificationRecord], left_out: Collection[int] = ()
+) -> list[Trend]:
+    """Return the squareness errors and the span of every curve over time, as far as they were identified.
+
+    Measurements whose ids are ``left_out`` are drawn, but do not count.
+    """
+    found = [(item.measured_at, errors_of(item), item.measurement_id in left_out) for item in identifications]
+    counted = [(at, table) for at, table, out in found if not out]
+    if not counted:
         return []
-    found = [(item.measured_at, errors_of(item)) for item in identifications]
-    names = sorted(found[-1][1].names, key=lambda name: error_named(name).kind != "squareness")
-    return [_trend(name, found) for name in names]
+    others = [(at, table) for at, table, out in found if out]
+    names = sorted(counted[-1][1].names, key=lambda name: error_named(name).kind != "squareness")
+    return [_trend(name, counted, others) for name in names]
 
 
-def _trend(name: str, found: Sequence[tuple[datetime, ErrorTable]]) -> Trend:
+def _trend(
+    name: str, found: Sequence[tuple[datetime, ErrorTable]], left_out: Sequence[tuple[datetime, ErrorTable]]
+) -> Trend:
     error = error_named(name)
     rows = [(at, *_figure(table, name)) for at, table in found if name in table.names]
+    grey = [(at, _figure(table, name)[0] / error.si_per_unit) for at, table in left_out if name in table.names]
     values = [row[1] / error.si_per_unit for row in rows]
     spread = [row[2] / error.si_per_unit * COVERAGE for row in rows]
     what = "value" if error.kind == "squareness" else "largest minus smallest"
     times = [row[0] for row in rows]
     series = Series(name, [time.timestamp() for time in times], values, spread)
+    outside = Series("left out", [at.timestamp() for at, _ in grey], [value for _, value in grey])
     return Trend(
         name,
         what,
@@ -130,7 +142,7 @@ def _trend(name: str, found: Sequence[tuple[datetime, ErrorTable]]) -> Trend:
         spread[-1],
         values[-1] - values[-2] if len(values) > 1 else None,
         values[-1] - values[0] if len(values) > 1 else None,
-        chart(f"{name}, {what}, {UNITS[error.unit]}", [series], time_ticks(times)),
+        chart(f"{name}, {what}, {UNITS[error.unit]}", [series], time_ticks([*times, *(at for at, _ in grey)]), outside),
     )
 
 

@@ -99,6 +99,7 @@ class Proposal:
     active: TableRecord | None
     measurement: MeasurementRecord | None
     change: Mapping[str, Any]
+    likeness: Mapping[str, Any]
     comparisons: Sequence[Comparison]
     squareness: Sequence[ErrorChange]
     curves: Sequence[Chart]
@@ -128,6 +129,7 @@ def _proposal(store: Store, errors_of: ErrorCache, machine: MachineRecord, table
         active,
         measured[0] if measured else None,
         _mapping(table.summary.get("change")),
+        _mapping(table.summary.get("likeness")),
         comparisons(table),
         _squareness(now, before),
         _curves(now, before),

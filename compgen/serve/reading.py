@@ -96,7 +96,10 @@ def overview() -> str:
     words, status = request.args.get("q", "")[:100], request.args.get("status", "")
     status = status if status in STATUSES else ""
     page = fleet_page(fleet(own().store).rows, words, status, _page_number())
-    return render_template("fleet.html", page=page, words=words, status=status)
+    measured = [row.machine for row in page.rows if row.measurements]
+    outlooks = own().drift_of.outlooks(measured)
+    g.complete = len(outlooks) == len(measured)
+    return render_template("fleet.html", page=page, words=words, status=status, outlooks=outlooks)
 
 
 @pages.get(f"/machines/<{NUMBER}:machine_id>")

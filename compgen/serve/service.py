@@ -41,6 +41,7 @@ class Service:
     drift_of: DriftCache
     recheck_of: RecheckCache
     job: JobFile
+    background: Background
     pages: Pages
 
     def may_decide(self, user: str) -> bool:
@@ -66,6 +67,7 @@ def make_service(settings: Settings, store: Store, clock: Callable[[], float] = 
         DriftCache(store, background, job),
         RecheckCache(store, background),
         job,
+        background,
         Pages(lambda: (store.version(), job.state())),
     )
 

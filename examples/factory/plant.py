@@ -207,13 +207,19 @@ class Factory:
         path.write_text(text)
         return compgen.read_scenario(path)
 
-    def measure(self, job: Job, name: str, at: datetime, *, bare: bool = False, part: str = "") -> Path:
-        """Measure a machine as it is then, with the tables that stand in its control; return the file in the inbox."""
+    def measure(
+        self, job: Job, name: str, at: datetime, *, bare: bool = False, part: str = "", says: dict | None = None
+    ) -> Path:
+        """Measure a machine as it is then, with the tables that are in its control; return the file in the inbox.
+
+        ``says`` replaces what the file says about time and tables.
+        """
         machine, tables = self.machine(name), None if bare else active_tables(job, name, self.machine(name))
         bare = tables is None  # which the file says: before the first tables the store cannot know it
         effects = () if tables is None else (Compensated(tables, self.truth(name, at)),)
         lengths = compgen.simulate(machine, self.scenario(name, at, part), effects=effects).lengths
-        notes = {**lengths.metadata, "measured_at": at.isoformat(), **({"active_table": "none"} if bare else {})}
+        true = {"measured_at": at.isoformat(), **({"active_table": "none"} if bare else {})}
+        notes = {**lengths.metadata, **(true if says is None else says)}
         path = job.machine(name).inbox / f"{at:%Y-%m-%d}{part}.lengths.csv"
         path.write_text(format_lengths(replace(lengths, metadata=notes)))
         return path
