@@ -11,6 +11,8 @@ from datetime import timedelta
 import pytest
 from test_recal_active import drifted, running, site  # noqa: F401  (fixtures)
 
+from compgen.cli import cli
+from compgen.cli.common import run_command
 from compgen.errors import InputError
 from compgen.recal import actions
 from compgen.recal.backup import backup, restore
@@ -349,3 +351,26 @@ def test_different_files_in_two_inboxes_are_not_held(site, small_errors):  # noq
     path = site.measure("b", drifted(small_errors, 30.0), seed=2, active_table="none")
     path.rename(site.folder / "inbox-b/b.deviations.csv")
     assert {name: item.state for name, item in run_both().items()} == {"mill": "ok", "twin": "ok"}
+
+
+def test_adopt_from_the_command_line(second, capsys):
+    lose(second)
+    restore(second.folder / "old.sqlite", second.job.store)
+    path = str(second.folder / "recal.toml")
+
+    def call(*words):
+        code = run_command(cli, ["recal", *words, "--job", path])
+        return code, capsys.readouterr()
+
+    code, said = call("approve", "mill", "1")
+    assert code == 2 and "never active by this store" in said.err
+    assert call("adopt", "mill")[0] == 2  # without a reason
+    code, said = call("adopt", "mill", "--reason", "Sunday counts", "--actor", "ada", "--json")
+    assert code == 0
+    assert json.loads(said.out) == {
+        "accepted": True,
+        "machine": "mill",
+        "set_aside": str(second.out / "SET-ASIDE-1"),
+    }
+    code, said = call("history", "mill", "--json")
+    assert "given to this store by ada, what was there is in SET-ASIDE-1: Sunday counts" in said.out
