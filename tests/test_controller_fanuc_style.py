@@ -239,6 +239,7 @@ def test_points_that_meet_those_of_another_axis_are_refused(controls_files, make
     [
         ("N03605Q1A1P00000010", "N03605Q1A1P00000011", "a table for each direction of travel"),
         ("N01001Q1L1P00000000", "N01001Q1L1P00000001", "an inch machine"),
+        ("N03605Q1A1", "N03602Q1P00000001\nN03605Q1A1", "this control takes total values"),
         ("A4P301A5P0\n", "A4P242A5P0\n", "axis A4 uses the compensation points 242 to 312"),
         ("N03620Q1A1P40", "N03620Q1A1P55", "cannot be kept"),
     ],
@@ -265,6 +266,24 @@ def test_without_files_of_the_control_preflight_says_that_other_axes_are_not_kno
     first = made.preflight.split("## What the files overwrite")[1].strip().split("\n")[0]
     assert first.startswith("- Of other axes: NOT KNOWN") and "PITCHPRM.TXT" not in made.files
     assert "metric only: on an inch machine" in made.preflight
+
+
+def test_points_alone_do_not_say_which_axis_has_them(controls_files, make_errors):
+    machine = controls_machine(controls_files[1:])
+    made = export(machine, make_errors(machine), "fanuc-pitch")
+    assert "Of other axes: NOT KNOWN, the sample has no parameters 3620 to 3622" in made.preflight
+    with pytest.raises(InputError, match="second time; give each file once"):
+        CONTROL.read_settings(controls_machine([*controls_files, controls_files[1]]))
+
+
+def test_total_values_are_read_only_where_they_are_stated(controls_files):
+    Path(controls_files[0]).write_text(PARAMETERS.replace("N03605Q1A1", "N03602Q1P00000001\nN03605Q1A1", 1))
+    machine = controls_machine(controls_files, value_type="total")
+    machine.controllers["fanuc-pitch"].data.pop("style_from")
+    assert read_tables(machine, controls_files, "fanuc-pitch").tables.blocks[0].total
+    machine.controllers["fanuc-pitch"].data["value_type"] = "incremental"
+    with pytest.raises(InputError, match="total values; state value_type"):
+        read_tables(machine, controls_files, "fanuc-pitch")
 
 
 def test_blanks_that_fill_up_a_record_are_followed(tmp_path):

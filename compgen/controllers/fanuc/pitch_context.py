@@ -56,7 +56,7 @@ def pitch_context(machine: Machine, settings: PitchSettings, tables: PitchTables
         "container": "separate" if settings.sample.points_style is not None else "one file",
         "separate": settings.sample.points_style is not None,
         "overwrites": _overwrites(settings, present),
-        "has_sample": bool(settings.style_notes),
+        "has_sample": settings.sample.shows_points,
         "style_notes": list(settings.style_notes),
         "bidirectional": settings.bidirectional,
         "points": [{"number": settings.number_base + number, "value": value} for number, value in points.items()],
@@ -125,14 +125,16 @@ def _overwrites(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) 
         if number not in written
         for low, high in axis.spans
     ]
-    if settings.style_notes:
-        found = [
-            f"Of other axes: nothing. The sample has {'; '.join(others) or 'no other axis with points'}; they stay."
-        ]
+    if sample.shows_points:
+        told = "; ".join(others) or "no other axis with points"
+        found = [f"Of other axes: nothing. The sample has {told}; they stay."]
     else:
+        given = (
+            "the sample has no parameters 3620 to 3622" if settings.style_notes else "no file of this control was given"
+        )
         found = [
-            "Of other axes: NOT KNOWN, no file of this control was given (`--style-from`). An axis whose 3621 to 3622 meet "
-            "the points below loses its table."
+            f"Of other axes: NOT KNOWN, {given} (`--style-from`). An axis whose 3621 to 3622 meet the points below loses its "
+            "table."
         ]
     for axis, block in present:
         number, name = settings.axis_numbers[axis], f"{AXES[axis]} (A{settings.axis_numbers[axis]})"

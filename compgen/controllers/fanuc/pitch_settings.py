@@ -211,6 +211,12 @@ def _check_together(section: tomlio.Section, settings: PitchSettings) -> None:
     if settings.last_number < settings.first_number:
         raise section.fail("last_number", f"lies below first_number = {settings.first_number}")
     _check_bidirectional(section, settings)
+    totals = settings.sample.common.get(3602)
+    if totals is not None and totals[0].endswith("1") and not settings.total:
+        raise totals[1].fail(
+            'bit 0 (APE) is 1: this control takes total values; state value_type = "total" in [controllers.fanuc-pitch], or '
+            "set the bit to 0 and punch the files again"
+        )
     if settings.number_base < 10000 and not settings.style.q_word:
         raise section.fail(
             "number_base",

@@ -19,6 +19,7 @@ from compgen.controllers.fanuc.pitch_settings import PitchSettings
 from compgen.controllers.fanuc.sample import (
     AXIS_PARAMETERS,
     MOST_NUMBER,
+    TOTAL_PARAMETER,
     UNIT_PARAMETER,
     Parameters,
     PunchedRecords,
@@ -152,6 +153,8 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
         for record in read_records(file):
             _sort_in(record, settings.number_base, found, points)
     found.check_metric()
+    if not settings.total:
+        found.check_increments()
     parameters = found.axes
     _check_directions(settings, parameters)
     blocks = [_block(settings, texts[0], axis, parameters, points) for axis in range(3)]
@@ -167,7 +170,7 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
 
 def _sort_in(record: Record, base: int, found: PunchedRecords, points: Points) -> None:
     """Put a record where it belongs: among the points (a parameter of the same number is told later), or parameters."""
-    point, parameter = record.number - base, record.number in (*AXIS_PARAMETERS, UNIT_PARAMETER)
+    point, parameter = record.number - base, record.number in (*AXIS_PARAMETERS, UNIT_PARAMETER, TOTAL_PARAMETER)
     kind = type_word(record, record.words())[0]
     if 0 <= point <= MOST_NUMBER and kind != 1:
         points.setdefault(point, []).append(record)

@@ -21,8 +21,10 @@ from compgen.core.files import read_bytes
 
 #: Parameters whose values are whole numbers, and the one that is a length.
 WHOLE_PARAMETERS, LENGTH_PARAMETER = (3620, 3621, 3622, 3623, 3626, 3627), 3624
-#: What the sample may say of an axis: how its table works, its points. Of a path: unit of the machine, straightness.
-AXIS_PARAMETERS, UNIT_PARAMETER, STRAIGHTNESS_PARAMETERS = (3605, *range(3620, 3628)), 1001, range(5700, 5800)
+#: What the sample may say of an axis: how its table works, its points. Of a path: unit of the machine, total values,
+#: straightness.
+AXIS_PARAMETERS = (3605, *range(3620, 3628))
+UNIT_PARAMETER, TOTAL_PARAMETER, STRAIGHTNESS_PARAMETERS = 1001, 3602, range(5700, 5800)
 #: Largest compensation point number, and value of a point, that is read at all.
 MOST_NUMBER, MOST_VALUE = 9999, 10_000_000
 #: Line ends of controls; LF CR CR is the end of block in ISO code.
@@ -85,7 +87,7 @@ class Sample:
     axes : compensation points by controlled axis number, of all axes that have some, also those that are switched off.
     parameters : (number, axis number) -> (value as text, record) of the parameters that compensation needs.
     values : compensation point number -> value.
-    common : parameters of the path from 5700 to 5799, number -> (value as text, record).
+    common : parameters of the path, 1001, 3602 and from 5700 to 5799, number -> (value as text, record).
     """
 
     style: FanucStyle = FanucStyle()
@@ -96,6 +98,11 @@ class Sample:
     parameters: Parameters = field(default_factory=dict)
     values: Mapping[int, int] = field(default_factory=dict)
     common: Mapping[int, tuple[str, Record]] = field(default_factory=dict)
+
+    @property
+    def shows_points(self) -> bool:
+        """Whether the sample says which points the axes have: some parameter 3621."""
+        return any(number == 3621 for number, _ in self.parameters)
 
     def others(self, number: int) -> list[tuple[AxisPoints, Span]]:
         """Return the blocks of every axis but ``number``."""
@@ -176,11 +183,16 @@ def sample_of(files: Sequence[SourceFile], path: int = 1) -> Sample:
             *(n for n in point_notes if "compensation point" in n),
             "parameters and points in files of their own",
         )
-    if any("L" in dict(record.words()) for _, record in sorted_in.common.values()):
+    straightness = [record for number, (_, record) in sorted_in.common.items() if number in STRAIGHTNESS_PARAMETERS]
+    if any("L" in dict(record.words()) for record in straightness):
         style = replace(style, path=path)
         notes = (*notes, f"parameters of a path with a word L; those of path {path} are written")
     base = (points_style or style).number_base
-    values = {record.number - base: record.whole(text, -MOST_VALUE, MOST_VALUE) for text, record in sorted_in.points}
+    values: dict[int, int] = {}
+    for text, record in sorted_in.points:
+        if record.number - base in values:
+            raise record.fail("the compensation point is given a second time; give each file once")
+        values[record.number - base] = record.whole(text, -MOST_VALUE, MOST_VALUE)
     return Sample(style, points_style, notes, 1.0, {}, sorted_in.axes, values, sorted_in.common)
 
 
@@ -205,7 +217,7 @@ class PunchedRecords:
                 raise record.fail(f"the type word Q{kind} is given for a parameter; use Q1")
             for axis, text in axis_values(record, words):
                 self._once(self.axes, (record.number, axis), text, record, f"axis A{axis}")
-        elif record.number == UNIT_PARAMETER or record.number in STRAIGHTNESS_PARAMETERS:
+        elif record.number in (UNIT_PARAMETER, TOTAL_PARAMETER, *STRAIGHTNESS_PARAMETERS):
             value = path_value(record, self.path)
             if value is not None:
                 self._once(self.common, record.number, value, record, "the parameter")
@@ -231,6 +243,15 @@ class PunchedRecords:
         """Count the records that were passed over."""
         records = "1 record" if self.passed_over == 1 else f"{self.passed_over} records"
         return f"passed over: {records} that cannot change a {kind} table"
+
+    def check_increments(self) -> None:
+        """Refuse pitch data in total values (3602#0, APE) where increments are read or written."""
+        found = self.common.get(TOTAL_PARAMETER)
+        if found is not None and found[0][-1:] == "1":
+            raise found[1].fail(
+                'bit 0 (APE) is 1: the pitch data of this control are total values; state value_type = "total" in the machine '
+                "file, or set the bit to 0 and punch the files again"
+            )
 
     def check_metric(self) -> None:
         """Refuse a machine whose least command increment is in inch (1001#0, INM)."""

@@ -70,13 +70,19 @@ def _overwrites(
         for k in ENTRIES
         if k not in free_entries(settings)[0] and COMPENSATED + k in sample.common
     ]
-    if sample.notes:
+    if any(MOVING + k in sample.common for k in ENTRIES):
         found = [f"Of other axes: nothing{'; ' + ', '.join(kept) + ' stays' if kept else ''}."]
     else:
-        found = ["Of other axes: NOT KNOWN, no file of this control was given (`--style-from`): look at 5711 to 5723."]
+        given = "the sample has no parameters 5711 to 5713" if sample.notes else "no file of this control was given"
+        found = [f"Of other axes: NOT KNOWN, {given} (`--style-from`): look at 5711 to 5723."]
     for number, values in grids.items():
         texts = [f"{names[axis]} (A{axis}) = {text}" for axis, text in values]
-        where = ", as in the sample" if sample.notes else ""
+        assumed = [names[axis] for axis, _ in values if not settings.stated[settings.axis_numbers.index(axis)]]
+        where = (
+            f"; ASSUMED for {', '.join(assumed)}: another value than the control's shifts its pitch table"
+            if assumed
+            else ""
+        )
         found.append(f"{number}, which pitch error compensation uses as well: {', '.join(texts)}{where}")
     old = {number: sample.common[number][0] for number in common if number in sample.common}
     changed = [
