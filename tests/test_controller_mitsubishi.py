@@ -21,6 +21,7 @@ from compgen.core.machine import read_machine
 from compgen.core.points import Points
 from compgen.errors import CompgenWarning, InputError
 from compgen.export import export
+from compgen.verify.capability import _variants
 
 GOLDEN = Path(__file__).parent / "golden" / "mitsubishi" / "SETSHEET.CSV"
 SAMPLE = GOLDEN.read_text()
@@ -400,6 +401,15 @@ def test_an_export_asks_for_the_mode_and_writes_nothing(tmp_path, make_errors):
         export(machine, make_errors(machine), "mitsubishi")
     assert parse(machine, SAMPLE).sets[0].absolute is False
     assert parse(machine, SAMPLE.replace("#4000,1", "#4000,0")).sets[0].absolute is True
+
+
+def test_options_assume_a_mode_and_say_so(tmp_path, make_errors):
+    machine = machine_of(tmp_path)
+    machine.controllers["mitsubishi"].data.pop("mode")
+    (variant,) = _variants(machine, "mitsubishi")
+    assert variant.notes == ("mode is not stated in the machine file; 'incremental' is taken here",)
+    assert export(variant.machine, make_errors(machine), "mitsubishi").violations == []
+    assert _variants(machine_of(tmp_path), "mitsubishi")[0].notes == ()
 
 
 def test_a_sum_out_of_range_names_the_scale_that_holds_it(tmp_path):

@@ -142,6 +142,10 @@ class Controller(ABC, Generic[Settings, Tables]):
     def read_settings(self, machine: Machine) -> Settings:
         """Check ``[controllers.<name>]`` of the machine file; InputError for what is missing, unknown or wrong."""
 
+    def missing(self, machine: Machine, settings: Settings) -> InputError | None:
+        """Return the error of a setting that an export needs and reading does not; ``build`` raises it. None: complete."""
+        return None
+
     @abstractmethod
     def basis(self, machine: Machine, settings: Settings, errors: ErrorTable) -> list[Term]:
         """Return the tables that the control would get for these errors, in correction space (mm added per unit)."""

@@ -38,8 +38,8 @@ VARIANTS: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]] = {
     "siemens-cec": (("without products", {"products": False}), ("with products", {"products": True}))
 }
 #: Settings that the machine file must state for an export, and what a comparison may take instead: in every mode the
-#: products leave the same residual.
-ASSUMED: Mapping[str, Mapping[str, Any]] = {"siemens-cec": {"mult_mode": "S1"}}
+#: products leave the same residual; of two systems of values the one that leaves less.
+ASSUMED: Mapping[str, Mapping[str, Any]] = {"siemens-cec": {"mult_mode": "S1"}, "mitsubishi": {"mode": "incremental"}}
 
 
 @dataclass(frozen=True)
@@ -261,11 +261,13 @@ class _Variant:
 
 
 def _settings(machine: Machine, name: str) -> Any:
-    """Settings of a control, or None if the machine file does not say all that it must know."""
+    """Settings of a control, or None if the machine file does not say all that an export must know."""
+    control = controller_named(name)
     try:
-        return controller_named(name).read_settings(machine)
+        settings = control.read_settings(machine)
     except CompgenError:
         return None
+    return settings if control.missing(machine, settings) is None else None
 
 
 def _variants(machine: Machine, name: str) -> list[_Variant]:

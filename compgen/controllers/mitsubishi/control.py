@@ -37,6 +37,7 @@ from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.core.points import Points
+from compgen.errors import InputError
 
 #: The final curve may be steeper than the estimate by this factor: angular errors are spread over the volume.
 STEEPER = 1.1
@@ -53,6 +54,17 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         """Check ``[controllers.mitsubishi]``."""
         return read_mitsubishi_settings(machine)
 
+    def missing(self, machine: Machine, settings: MitsubishiSettings) -> InputError | None:
+        """Return the error of a mode that neither the machine file nor the control's own file states."""
+        if settings.absolute is not None:
+            return None
+        return machine.controller_settings(self.name).fail(
+            "mode",
+            "is missing: #4000 holds for the tables of ALL axes, and values of the wrong system are summed up. Give the "
+            "control's own parameter file (--style-from ALL.PRM), or look at #4000 and state mode = 'incremental' (1) or "
+            "'absolute' (0)",
+        )
+
     def basis(self, machine: Machine, settings: MitsubishiSettings, errors: ErrorTable) -> list[Term]:
         """Return one term per set, its nodes the division points, the reference point one of them."""
         chosen = [_grid(machine, settings, errors, axis).nodes_mm for axis in range(3)]
@@ -67,13 +79,10 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         self, machine: Machine, settings: MitsubishiSettings, basis: Sequence[Term], values: Mapping[str, FloatArray]
     ) -> MitsubishiTables:
         """Find the best whole curves within the range of the values, and give the sets consecutive numbers."""
-        if settings.absolute is None:
-            raise machine.controller_settings("mitsubishi").fail(
-                "mode",
-                "is missing: #4000 holds for the tables of ALL axes, and values of the wrong system are summed up. Give the "
-                "control's own parameter file (--style-from ALL.PRM), or look at #4000 and state mode = 'incremental' (1) or "
-                "'absolute' (0)",
-            )
+        incomplete = self.missing(machine, settings)
+        if incomplete is not None:
+            raise incomplete
+        assert settings.absolute is not None
         terms = {term.name: term for term in basis}
         sets: list[SetTable] = []
         shortfalls: list[Shortfall] = []
