@@ -12,6 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from compgen.cli import cli
+from compgen.cli.common import run_command
 from compgen.controllers import SourceFile, controller_named
 from compgen.controllers.fanuc.pitch_tables import PitchTables
 from compgen.controllers.fanuc.sample import style_of
@@ -239,7 +241,7 @@ def test_points_that_meet_those_of_another_axis_are_refused(controls_files, make
     [
         ("N03605Q1A1P00000010", "N03605Q1A1P00000011", "a table for each direction of travel"),
         ("N01001Q1L1P00000000", "N01001Q1L1P00000001", "an inch machine"),
-        ("N03605Q1A1", "N03602Q1P00000001\nN03605Q1A1", "this control takes total values"),
+        ("N03605Q1A1", "N03602Q1P00000001\nN03605Q1A1", "of this control are total values"),
         ("A4P301A5P0\n", "A4P242A5P0\n", "axis A4 uses the compensation points 242 to 312"),
         ("N03620Q1A1P40", "N03620Q1A1P55", "cannot be kept"),
     ],
@@ -266,6 +268,36 @@ def test_without_files_of_the_control_preflight_says_that_other_axes_are_not_kno
     first = made.preflight.split("## What the files overwrite")[1].strip().split("\n")[0]
     assert first.startswith("- Of other axes: NOT KNOWN") and "PITCHPRM.TXT" not in made.files
     assert "metric only: on an inch machine" in made.preflight
+
+
+def test_what_is_active_comes_back_where_nothing_is_left_to_correct(tmp_path):
+    """Backup -> active tables -> merged with errors of zero: the same points, parameters and values."""
+    shape = [2, 1, -1, 0, 3, -2, 0, 1]  # ends where it began, so that nothing is lost with the frame
+    tables = {start + k: value for start in (32, 131, 231) for k, value in enumerate(shape)}
+    rows = [f"N{10000 + k}Q0P{tables.get(k, 0)}" for k in range(400)]
+    (tmp_path / "PITCH.TXT").write_text("\n".join(["%", *rows, "%", ""]))
+    numbers = [
+        "N03620Q1A1P36A2P135A3P235A4P300",
+        "N03621Q1A1P32A2P131A3P231A4P301",
+        "N03622Q1A1P39A2P138A3P238A4P312",
+        "N03623Q1A1P10A2P10A3P10A4P1",
+        "N03624Q1A1P50.0A2P50.0A3P50.0A4P30.0",
+    ]
+    (tmp_path / "CNC-PARA.TXT").write_text("\n".join(["%", "N00020Q1P17", *numbers, "N05711Q1L1P0L2P0", "%", ""]))
+    travels = "\n".join(f"[axes.{n}]\nrange_mm = [-250.0, 150.0]\nnodes = 5" for n in "XYZ")
+    (tmp_path / "m.toml").write_text(
+        f'name = "m"\nchain = "WXYFZT"\n{travels}\n[controllers.fanuc-pitch]\ndetection_unit_um = 0.1\n'
+    )
+    zeros = [f"{name},{position},0.0," for name in ("EXX", "EYY", "EZZ") for position in (-250.0, 150.0)]
+    (tmp_path / "zero.errors.csv").write_text("\n".join(["error,position_mm,value,u_value", *zeros, ""]))
+    files = [tmp_path / "PITCH.TXT", tmp_path / "CNC-PARA.TXT"]
+    words = ["merge", tmp_path / "m.toml", *files, "--style-from", files[0], "--style-from", files[1]]
+    words += ["--controller", "fanuc-pitch", "--errors", tmp_path / "zero.errors.csv", "--out", tmp_path / "out"]
+    assert run_command(cli, [str(word) for word in words]) == 0
+    written = (tmp_path / "out" / "PITCH.TXT").read_text().split()[1:-1]
+    assert written == [f"N{10000 + number}Q0P{value}" for number, value in tables.items()]
+    own = [row.split("A4")[0] for row in numbers]
+    assert (tmp_path / "out" / "PITCHPRM.TXT").read_text().split()[1:-1] == own
 
 
 def test_points_alone_do_not_say_which_axis_has_them(controls_files, make_errors):

@@ -14,6 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import compgen
+from compgen.cli import cli
+from compgen.cli.common import run_command
 from compgen.controllers import SourceFile, controller_named
 from compgen.controllers.mitsubishi.tables import values_of
 from compgen.core.error_table import Curve, ErrorTable
@@ -435,6 +437,32 @@ def test_tables_of_another_pair_go_into_free_sets_and_numbers(tmp_path, backup_f
     ]
     taken = {*range(4401, 4417), *range(4501, 4525)}
     assert not any(taken & set(range(table.first, table.last + 1)) for table in tables.sets)
+
+
+def test_a_constant_at_the_reference_point_that_goes_is_said(tmp_path, make_errors):
+    (tmp_path / "ALL.PRM").write_bytes(backup(sets=SETS, values={4103: 2}).encode())
+    machine = following(tmp_path)
+    made = export(machine, make_errors(machine, squareness_rad=(0.0, 0.0, 0.0)), "mitsubishi")
+    assert "The value at the reference number #4103 was 2 and is now 0: X shifts by a constant" in made.preflight
+
+
+def test_what_is_active_comes_back_where_nothing_is_left_to_correct(tmp_path):
+    """Backup -> active tables -> merged with errors of zero: the same file, but for the points beyond the travel."""
+    sets = {k: v for k, v in SETS.items() if k}
+    sets |= {k: (n, n, 4110 + 20 * k, 4106 + 20 * k, 4115 + 20 * k, 2, "80.000") for k, n in enumerate("XYZ")}
+    shape = (-7, -6, -3, -1, 0, 2, 5, 4, 4, 3)
+    values = {4106 + 20 * k + j: value for k in range(3) for j, value in enumerate(shape)}
+    (tmp_path / "ALL.PRM").write_bytes(backup(sets=sets, values=values).encode())
+    machine = following(tmp_path).source
+    travels = "\n".join(f"[axes.{n}]\nrange_mm = [-320.0, 400.0]\nnodes = 5" for n in "XYZ")
+    text = f'name = "m"\nchain = "WXYFZT"\n{travels}\n[controllers.mitsubishi]\n{ONLY_OWN}\n'
+    machine.write_text(text)
+    zeros = [f"{name},{position},0.0," for name in ("EXX", "EYY", "EZZ") for position in (-320.0, 400.0)]
+    (tmp_path / "zero.errors.csv").write_text("\n".join(["error,position_mm,value,u_value", *zeros, ""]))
+    words = ["merge", machine, tmp_path / "ALL.PRM", "--style-from", tmp_path / "ALL.PRM", "--controller", "mitsubishi"]
+    words += ["--errors", tmp_path / "zero.errors.csv", "--out", tmp_path / "out"]
+    assert run_command(cli, [str(word) for word in words]) == 0
+    assert (tmp_path / "out" / "ALL-NEW.PRM").read_bytes() == (tmp_path / "ALL.PRM").read_bytes()
 
 
 def test_a_set_of_ours_that_is_no_longer_used_is_switched_off(tmp_path, make_errors):

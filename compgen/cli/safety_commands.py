@@ -20,6 +20,7 @@ from compgen.cli.common import (
     stdout,
 )
 from compgen.cli.safety_options import limits_option
+from compgen.cli.sample_options import sample_options
 from compgen.controllers import CONTROLLERS
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import format_errors
@@ -113,6 +114,7 @@ def _difference_csv(machine: Machine, result: TableDifference) -> str:
 @machine_argument
 @click.argument("old", nargs=-1, required=True, metavar="OLD...", type=click.Path(path_type=Path))
 @controller_option()
+@sample_options
 @click.option("--controller-old", metavar="NAME", help="Control of the old tables; default: that of the new.")
 @click.option(
     "--errors",

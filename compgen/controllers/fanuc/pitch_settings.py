@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Any, Literal
 
-from compgen.controllers.fanuc.sample import PointGrid, Sample, take_sample
+from compgen.controllers.fanuc.sample import PointGrid, Sample, check_increments, take_sample
 from compgen.controllers.fanuc.style import FanucStyle
 from compgen.controllers.grids import take_loss_mm
 from compgen.core import tomlio
@@ -211,12 +211,8 @@ def _check_together(section: tomlio.Section, settings: PitchSettings) -> None:
     if settings.last_number < settings.first_number:
         raise section.fail("last_number", f"lies below first_number = {settings.first_number}")
     _check_bidirectional(section, settings)
-    totals = settings.sample.common.get(3602)
-    if totals is not None and totals[0].endswith("1") and not settings.total:
-        raise totals[1].fail(
-            'bit 0 (APE) is 1: this control takes total values; state value_type = "total" in [controllers.fanuc-pitch], or '
-            "set the bit to 0 and punch the files again"
-        )
+    if not settings.total:
+        check_increments(settings.sample.common)
     if settings.number_base < 10000 and not settings.style.q_word:
         raise section.fail(
             "number_base",

@@ -23,6 +23,7 @@ from compgen.controllers.fanuc.sample import (
     UNIT_PARAMETER,
     Parameters,
     PunchedRecords,
+    check_increments,
     length_of,
 )
 from compgen.controllers.fanuc.text import Record, read_records, type_word
@@ -154,7 +155,7 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
             _sort_in(record, settings.number_base, found, points)
     found.check_metric()
     if not settings.total:
-        found.check_increments()
+        check_increments(found.common)
     parameters = found.axes
     _check_directions(settings, parameters)
     blocks = [_block(settings, texts[0], axis, parameters, points) for axis in range(3)]

@@ -244,15 +244,6 @@ class PunchedRecords:
         records = "1 record" if self.passed_over == 1 else f"{self.passed_over} records"
         return f"passed over: {records} that cannot change a {kind} table"
 
-    def check_increments(self) -> None:
-        """Refuse pitch data in total values (3602#0, APE) where increments are read or written."""
-        found = self.common.get(TOTAL_PARAMETER)
-        if found is not None and found[0][-1:] == "1":
-            raise found[1].fail(
-                'bit 0 (APE) is 1: the pitch data of this control are total values; state value_type = "total" in the machine '
-                "file, or set the bit to 0 and punch the files again"
-            )
-
     def check_metric(self) -> None:
         """Refuse a machine whose least command increment is in inch (1001#0, INM)."""
         found = self.common.get(UNIT_PARAMETER)
@@ -261,6 +252,16 @@ class PunchedRecords:
                 "bit 0 (INM) is 1: an inch machine, whose parameter 3624 and detection unit are in inch. Only metric "
                 "machines are read and written"
             )
+
+
+def check_increments(common: Mapping[int, tuple[str, Record]]) -> None:
+    """Refuse a control whose pitch data are total values (3602#0, APE) where increments are read or written."""
+    text, record = common.get(TOTAL_PARAMETER, ("0", None))
+    if record is not None and text.endswith("1"):
+        raise record.fail(
+            'bit 0 (APE) is 1: the pitch data of this control are total values; state value_type = "total" in '
+            "[controllers.fanuc-pitch], or set the bit to 0 and punch the files again"
+        )
 
 
 def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:

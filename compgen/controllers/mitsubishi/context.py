@@ -115,6 +115,18 @@ def _overwrites(settings: MitsubishiSettings, tables: MitsubishiTables, rows: li
         ]
         found.append(f"Parameters that change: {', '.join(parameters) or 'none'}")
         found.append(f"Values that change: {len(changed) - len(parameters)}")
+    for table in tables.sets:
+        old = sample.entries.get(table.reference)
+        if (
+            table.absolute
+            and old is not None
+            and settings.kept((table.output, table.base))
+            and not _same(old.value, "0")
+        ):
+            found.append(
+                f"The value at the reference number #{table.reference} was {old.value} and is now 0: "
+                f"{AXES[table.output]} shifts by a constant, set the workpiece up anew"
+            )
     cleared = [f"set {item.index + 1} ({item.output} over {item.base})" for item in _no_longer_used(settings, tables)]
     if cleared:
         found.append(f"Switched off, because this export has no such table: {', '.join(cleared)}")
