@@ -68,6 +68,8 @@ METHOD_HELP = {
     "over the range that the readings cover. For parts, and deviations at one height or without a component.",
     "u_deviation_um": "Standard uncertainty of a measured deviation (*.deviations.csv), um; default: the file's, else 1 um "
     "scaled by the residuals.",
+    "small_deviations": "Take deviations that are all zero, or all below 0.1 um, as they are; without it they are refused, "
+    "because nothing was measured then, or the values are in mm.",
 }
 
 
@@ -110,11 +112,12 @@ def method_options(command: Command) -> Command:
     @functools.wraps(command)
     def wrapper(*args: Any, method: str, stations: str | None, no_temperature: bool, **options: Any) -> Any:
         known = read_stations(stations) if stations not in (None, "nominal") else stations
-        choices = {"method": method, "stations": known, "temperature": not no_temperature}
-        choices |= {name: options.pop(name) for name in ("u_deviation_um", "part_scale", "travel")}
-        return command(*args, choices=choices, **options)
+        choices: dict[str, Any] = {"method": method, "stations": known, "temperature": not no_temperature}
+        names = ("u_deviation_um", "small_deviations", "part_scale", "travel")
+        return command(*args, choices={**choices, **{name: options.pop(name) for name in names}}, **options)
 
-    decorated: Any = click.option("--u-deviation-um", type=float, help=METHOD_HELP["u_deviation_um"])(wrapper)
+    decorated: Any = click.option("--small-deviations", is_flag=True, help=METHOD_HELP["small_deviations"])(wrapper)
+    decorated = click.option("--u-deviation-um", type=float, help=METHOD_HELP["u_deviation_um"])(decorated)
     for option, name, values in (
         ("--part-scale", "part_scale", ("known", "free")),
         ("--range", "travel", ("machine", "from-data")),

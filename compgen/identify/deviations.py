@@ -20,6 +20,7 @@ from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjustment import Adjustment
 from compgen.identify.effects import without_effects
 from compgen.identify.free_pose import identify_with_free_pose, needs_free_pose
+from compgen.identify.misfit import Series, labels_of, misfit_of
 from compgen.identify.noise import IdentifyOptions
 from compgen.identify.outliers import Rejected, accepted_readings
 from compgen.identify.parameters import ErrorParameters, common_tool, parameters_for_tools
@@ -193,6 +194,17 @@ def _result(
     )
     errors = error_table(layout, solution.state.errors, adjustment.covariance_factor())
     errors = errors.replace(metadata=metadata_of(layout.machine, deviations.metadata))
+    row, component = np.divmod(components.index[accepted], 3)
+    time = deviations.covariates.get("time_s")
+    labels = labels_of(deviations.labels, deviations.origin, deviations.position_mm)
+    series = Series(
+        residual_um=residual[accepted] / MM_PER_UM,
+        bare_um=None,
+        sigma_um=components.sigma_mm[accepted] / MM_PER_UM,
+        group=component,
+        labels={name: label[row] for name, label in labels.items()},
+        time_s=None if time is None or not np.isfinite(time).all() else time[row],
+    )
     return Identification(
         errors=errors,
         stations=(),
@@ -215,6 +227,7 @@ def _result(
         layout=layout,
         adjustment=adjustment,
         method="deviations",
+        misfit=misfit_of(chi_square, freedom, u_scale, components.source, series),
     )
 
 

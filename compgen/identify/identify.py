@@ -15,7 +15,7 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
-from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify.affine_start import affine_start
 from compgen.identify.covariance import with_systematic
 from compgen.identify.determined import determined, unmirrored, weakness
@@ -23,6 +23,7 @@ from compgen.identify.grid_problem import GridProblem
 from compgen.identify.kernels import count_identification
 from compgen.identify.known_stations import HeldStations, KnownStations, hold, locate_stations, with_known_start
 from compgen.identify.located import TracerReadings
+from compgen.identify.misfit import EXPLAINS, Cause, labels_of, split_labels
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
 from compgen.identify.outcome import assemble
 from compgen.identify.outliers import belonging
@@ -61,14 +62,59 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
     chosen = options or IdentifyOptions()
     count_identification()
     with one_thread():
-        found = identify_at_reference(
-            machine,
-            lengths,
-            lambda readings: _identify(machine, readings, chosen),
-            lambda readings: _rough(machine, readings),
-            temperature=chosen.temperature,
-        )
-        return with_systematic(machine, lengths, found, chosen.systematic)
+        try:
+            found = _at_reference(machine, lengths, chosen)
+        except ConvergenceError as error:
+            raise ConvergenceError(f"{error}{_explained(machine, lengths, chosen)}") from error
+        return with_systematic(machine, lengths, _with_causes(machine, lengths, chosen, found), chosen.systematic)
+
+
+def _at_reference(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification:
+    return identify_at_reference(
+        machine,
+        lengths,
+        lambda readings: _identify(machine, readings, options),
+        lambda readings: _rough(machine, readings),
+        temperature=options.temperature,
+    )
+
+
+def _with_causes(machine: Machine, lengths: Lengths, options: IdentifyOptions, found: Identification) -> Identification:
+    """Add to a misfit what explains most of it: the errors are identified again with dead lengths for each run, ..."""
+    misfit = found.misfit
+    if misfit is None or misfit.series is None or misfit.causes:
+        return found
+    for code, text, label in split_labels(misfit.series):
+        every = np.full(len(lengths), int(label.min()), dtype=np.int64)
+        every[found.accepted] = label
+        again = _split_by(machine, lengths, options, every)
+        if again is None:
+            continue
+        share = 1.0 - again.reduced_chi_square / misfit.reduced_chi_square
+        if share > EXPLAINS:
+            return replace(found, misfit=replace(misfit, causes=(Cause(code, text, round(share, 4)),)))
+    return found
+
+
+def _explained(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> str:
+    """Say what makes readings fit that no optimum was found for; empty if nothing simple does."""
+    for name, label in labels_of(lengths.labels, lengths.origin, lengths.position_mm, lengths.station).items():
+        if label.min() < label.max() and _split_by(machine, lengths, options, label) is not None:
+            return f"; with dead lengths of its own for each {name} the readings fit: there is a step between {name}s"
+    return "; `compgen diagnose` looks for what the model lacks"
+
+
+def _split_by(machine: Machine, lengths: Lengths, options: IdentifyOptions, label: IntArray) -> Identification | None:
+    """Identify with a set-up, and so dead lengths, of its own for each value of a label (n,); None where that fails."""
+    setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
+    _, number = np.unique(np.column_stack([setup, label]), axis=0, return_inverse=True)
+    labels = {**lengths.labels, "setup": np.asarray(number, dtype=np.int64).ravel()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        try:
+            return _at_reference(machine, replace(lengths, labels=labels), options)
+        except CompgenError:
+            return None
 
 
 def _rough(machine: Machine, lengths: Lengths) -> tuple[ErrorParameters, State, IntArray]:

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
 
+import numpy as np
+
 from compgen.core.axis_runs import AxisRuns, holds_axis_runs, read_axis_runs
 from compgen.core.deviations import Deviations, holds_deviations, read_deviations
 from compgen.core.diagonals import holds_diagonals
 from compgen.core.error_table import ErrorTable
 from compgen.core.lengths import Lengths, read_lengths
 from compgen.core.machine import Machine
-from compgen.core.names import AXES
+from compgen.core.names import AXES, MM_PER_UM
 from compgen.core.parts import PART, holds_parts, read_parts
 from compgen.errors import InputError
 from compgen.identify.axis_runs import identify_axis_runs
@@ -26,6 +28,9 @@ from compgen.identify.sixdof import SixDofMeasurement, identify_sixdof
 from compgen.identify.systematic import SystematicInputs
 from compgen.sixdof.instrument import read_instrument
 from compgen.sixdof.readings import holds_sixdof, read_sixdof
+
+#: Deviations that are all smaller than this are asked about: 100 um in the wrong unit, mm for um.
+SMALLEST_UM = 0.1
 
 
 @dataclass(frozen=True)
@@ -130,6 +135,8 @@ def identify_measurement(
         if chosen.u_deviation_um is not None:
             raise InputError("an uncertainty of deviations (--u-deviation-um) was given, but the files hold lengths")
         return identify(machine, measurement, chosen)
+    if isinstance(measurement, Deviations | AxisRuns) and not chosen.small_deviations:
+        _check_size(measurement)
     stated = chosen.u_length_um is not None or chosen.u_length_um_per_m is not None
     other = stated or chosen.method != "joint" or chosen.stations is not None
     other = other or chosen.systematic != SystematicInputs()
@@ -153,3 +160,20 @@ def identify_measurement(
             "deviations, for which --u-deviation-um counts"
         )
     return identify_deviations(machine, measurement, chosen)
+
+
+def _check_size(measurement: Deviations | AxisRuns) -> None:
+    """Ask about deviations that are all zero, or so small that their unit must be another one."""
+    values = measurement.deviation_mm
+    largest_um = float(np.max(np.abs(values[np.isfinite(values)]), initial=0.0)) / MM_PER_UM
+    if largest_um >= SMALLEST_UM:
+        return
+    file = measurement.origin[0][0] if measurement.origin else None
+    if largest_um == 0.0:
+        message = "all deviations are zero; was nothing measured? Give the measured values"
+    else:
+        message = (
+            f"the largest deviation is {largest_um:.3g} um, which no machine tool reaches; are the values in mm, a thousand "
+            "times too small for um? Give them in um"
+        )
+    raise InputError(f"{message}, or say --small-deviations if they are right", file=file)

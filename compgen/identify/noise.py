@@ -38,6 +38,7 @@ class IdentifyOptions:
     ``part_scale`` "free" takes one scale out of each set-up of a part (its temperature is not known), and ``travel``
     "from-data" lets the curves end where the readings do; both belong to positions in frames of unknown pose
     (:mod:`compgen.identify.free_pose`).
+    ``small_deviations`` takes deviations that are all zero, or smaller than any machine's, as they are.
     """
 
     u_length_um: float | None = None
@@ -50,6 +51,7 @@ class IdentifyOptions:
     temperature: bool = True
     part_scale: Literal["known", "free"] = "known"
     travel: Literal["machine", "from-data"] = "machine"
+    small_deviations: bool = False
 
 
 @dataclass(frozen=True)

@@ -10,17 +10,20 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
+from compgen.core.names import MM_PER_UM
 from compgen.identify.adjustment import Adjustment
 from compgen.identify.corrections import Conditions, reading_conditions
+from compgen.identify.misfit import Misfit, Series, labels_of, misfit_of, warn_of_misfit
 from compgen.identify.parameters import ErrorParameters
 from compgen.identify.result import Identification
 from compgen.identify.reversal import Reversal, Stops, approach_signs, estimate_reversal, stop_cells
 from compgen.identify.state import IntArray, State
-from compgen.identify.whiteness import Whiteness, check_whiteness, warn_of_misfit, warn_of_weakness
+from compgen.identify.whiteness import Whiteness, check_whiteness, warn_of_weakness
 from compgen.model.volumetric import tool_of
 
 ROUNDS = 3
@@ -52,7 +55,7 @@ def identify_at_reference(
         used = _added(lengths, conditions.correction_mm(lengths, *rough(lengths), still))
     found = adjust(used)
     approach = approach_signs(lengths)
-    reversal, removed = None, False
+    reversal, removed, taken_mm = None, False, still[:, 0]
     for _ in range(ROUNDS if approach is not None or conditions.needs_geometry else 0):
         assert found.adjustment is not None
         geometry = (found.layout, found.adjustment.state, found.adjustment.group)
@@ -69,13 +72,14 @@ def identify_at_reference(
             break
         again = _added(lengths, conditions.correction_mm(lengths, *geometry, moved))
         settled = np.abs(again.length_mm - used.length_mm).max() < SETTLED_MM
-        used = again
+        used, taken_mm = again, again.length_mm - lengths.length_mm - plain
         if settled:
             break
         found = adjust(used)
     if reversal is not None:
         reversal = replace(reversal, removed=removed)
-    return _tested(machine, used, found, conditions, reversal)
+    tested = _tested(machine, used, found, conditions, reversal)
+    return replace(tested, misfit=_misfit(used, tested, taken_mm if removed else None))
 
 
 def _added(lengths: Lengths, correction_mm: FloatArray) -> Lengths:
@@ -102,7 +106,7 @@ def _tested(
     if adjustment is not None:
         if adjustment.held_weight is None:  # known stations bring their own uncertainty in
             typical = adjustment.sigma_mm / float(np.sqrt(max(adjustment.weight.mean(), 1e-12)))
-            warn_of_weakness(found.worst_u, typical)
+            warn_of_weakness(machine, found.errors, found.worst_u, typical)
         warn_of_misfit(found.reduced_chi_square, found.u_source)
 
     def tests() -> Whiteness:
@@ -114,3 +118,27 @@ def _tested(
         return check_whiteness(used, adjustment.group, standardised, distance, found.unknowns)
 
     return replace(found, residual_tests=tests, reversal=reversal, corrections=conditions.notes)
+
+
+def _misfit(used: Lengths, found: Identification, reversal_mm: FloatArray | None) -> Misfit | None:
+    """Judge the size of the residuals; ``reversal_mm`` (n,) is what was added to each reading for a reversal."""
+    adjustment = found.adjustment
+    if adjustment is None:
+        return None
+    rows = found.accepted
+    residual_mm = found.residual_mm[rows]
+    labels = labels_of(used.labels, used.origin, used.position_mm, used.station)
+    series = Series(
+        residual_um=residual_mm / MM_PER_UM,
+        bare_um=None if reversal_mm is None else (residual_mm + reversal_mm[rows]) / MM_PER_UM,
+        sigma_um=adjustment.sigma_mm / found.u_scale / np.sqrt(adjustment.weight[rows]) / MM_PER_UM,
+        group=adjustment.group[rows],
+        labels={name: label[rows] for name, label in labels.items()},
+        time_s=_times(used, rows),
+    )
+    return misfit_of(found.reduced_chi_square, found.degrees_of_freedom, found.u_scale, found.u_source, series)
+
+
+def _times(used: Lengths, rows: NDArray[np.bool_]) -> FloatArray | None:
+    time = used.covariates.get("time_s")
+    return None if time is None or not np.isfinite(time[rows]).all() else time[rows]

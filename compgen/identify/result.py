@@ -16,6 +16,7 @@ from compgen.core.error_table import ErrorTable
 from compgen.core.names import MM_PER_UM
 from compgen.core.reversal import ReversalCurves
 from compgen.identify.adjustment import Adjustment
+from compgen.identify.misfit import Misfit
 from compgen.identify.outliers import Rejected
 from compgen.identify.parameters import ErrorParameters
 from compgen.identify.reversal import Reversal
@@ -79,6 +80,8 @@ class Identification:
     reversal_curves : reversals over the position of each axis, where the instrument shows them so.
     details : what the method has to say beside the figures that all have in common.
     objections : why nothing that is made of these errors may be accepted; empty if there is no such reason.
+    misfit : whether the residuals are larger than their uncertainty allows, and what explains them; None where no
+        uncertainty of the readings is part of the method.
     """
 
     errors: ErrorTable
@@ -113,6 +116,7 @@ class Identification:
     reversal_curves: ReversalCurves | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
     objections: tuple[str, ...] = ()
+    misfit: Misfit | None = None
 
     @property
     def has_covariance(self) -> bool:
@@ -161,6 +165,7 @@ class Identification:
             "unobservable": list(self.unobservable),
             "rejected": [asdict(item) for item in self.rejected],
             "segments": [item.summary() for item in self.segments],
+            "misfit": None if self.misfit is None else self.misfit.summary(),
             "reversal": None if self.reversal is None else self.reversal.summary(),
             "whiteness": None if self.whiteness is None else self.whiteness.summary(),
             "corrections": {key: value for key, value in self.corrections.items() if key != "effects"},

@@ -11,6 +11,7 @@ from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import ERROR_NAMES
 from compgen.identify.parameters import ErrorParameters
+from compgen.model.observability import observable_errors
 
 
 def error_table(layout: ErrorParameters, unknowns: FloatArray, factor: FloatArray) -> ErrorTable:
@@ -52,9 +53,13 @@ def metadata_of(machine: Machine, metadata: Mapping[str, str]) -> dict[str, str]
 
 def unobservable(layout: ErrorParameters) -> tuple[str, ...]:
     """Say in words which of the 21 errors the model leaves out, and why."""
+    machine = layout.machine
     identified = {curve.error.name for curve in layout.curves} | set(layout.squareness)
-    missing = [name for name in ERROR_NAMES if name not in identified]
+    shown = observable_errors(machine)
     return tuple(
-        f"{name}: no lever arm but its own axis' travel or one tool offset on chain {layout.machine.chain.name}"
-        for name in missing
+        f"{name}: left out of the machine file's errors, although it is observable on chain {machine.chain.name}"
+        if name in shown
+        else f"{name}: no lever arm but its own axis' travel or one tool offset on chain {machine.chain.name}"
+        for name in ERROR_NAMES
+        if name not in identified
     )

@@ -6,6 +6,7 @@ so that it errs on the quiet side, because fitting takes part of the noise out o
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -14,12 +15,16 @@ from typing import Any
 import numpy as np
 
 from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
 from compgen.core.lengths import Lengths
-from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.machine import Machine
+from compgen.core.names import AXES, ERROR_INDEX, MM_PER_UM
 from compgen.errors import CompgenWarning
 from compgen.identify.grid_readings import levels_of
+from compgen.identify.misfit import LARGEST_CHI_SQUARE
 from compgen.identify.segments import time_order
 from compgen.identify.state import IntArray
+from compgen.model.volumetric import c_matrix
 
 #: Probability of a false alarm of each of the four kinds of test, over all stations and axes; together below 1 %.
 FALSE_ALARM = 0.001
@@ -34,8 +39,8 @@ ROUNDING = 0.02
 MOST_BINS = 60
 #: An error is hardly determined when its standard uncertainty in um or urad is so many times that of a reading in um.
 WEAK = 50.0
-#: Reduced chi-square from which the model does not describe the readings, with stated and with assumed uncertainty.
-LARGEST_CHI_SQUARE = {"stated": 25.0, "assumed": 1000.0}
+#: ... or when it is more than this share of the error, and moves the tool by so many times that of a reading.
+WEAK_SHARE, WEAK_READINGS = 1.0 / 6.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -205,34 +210,51 @@ def _axis(lengths: Lengths, z: FloatArray, used: np.ndarray[Any, Any], axis: int
     return ratio, float((1.0 - spread + _normal_limit(3) * np.sqrt(spread)) ** 3)
 
 
-def warn_of_weakness(worst: Mapping[str, tuple[float, str]], sigma_mm: float) -> None:
-    """Warn when the standard uncertainty of an error is far above that of a reading: the set-up hardly shows it.
+def warn_of_weakness(
+    machine: Machine, errors: ErrorTable, worst: Mapping[str, tuple[float, str]], sigma_mm: float
+) -> None:
+    """Warn of errors that the set-up hardly shows.
 
-    ``worst`` is the largest standard uncertainty by unit with its error, ``sigma_mm`` that of a reading.
+    That is a standard uncertainty far above that of a reading, or one that is a good part of the error itself and moves the
+    tool, by the lever arms of this machine, by more than the readings scatter.
+
+    Parameters
+    ----------
+    machine : its chain, travel and tool give the lever arms.
+    errors : the identified errors.
+    worst : the largest standard uncertainty by unit with its error.
+    sigma_mm : standard uncertainty of a reading.
     """
+    advice = "place the stations at different heights, not on a line, and not in a plane with an end of the travel"
     for unit, (value, name) in worst.items():
         times = value * MM_PER_UM / sigma_mm
         if times > WEAK:
             warnings.warn(
                 f"{name} is hardly determined: its standard uncertainty is {value:.3g} {unit}, {times:.0f} "
-                "times that of a reading; place the stations at different heights, not on a line, and not in a plane with "
-                "an end of the travel",
+                f"times that of a reading; {advice}",
                 CompgenWarning,
                 stacklevel=4,
             )
             return
-
-
-def warn_of_misfit(reduced_chi_square: float, u_source: str) -> None:
-    """Warn of residuals that are too large for the model to be right."""
-    if reduced_chi_square > LARGEST_CHI_SQUARE[u_source]:
+    weak = [name for name in errors.names if _weak(machine, errors, name, sigma_mm)]
+    if weak:
         warnings.warn(
-            f"the model does not describe the readings: the residuals are {np.sqrt(reduced_chi_square):.0f} times their "
-            f"{u_source} uncertainty (reduced chi-square {reduced_chi_square:.3g}); check the chain and the errors of the "
-            "machine file, the order and the signs of the axes, and the uncertainty of a length",
+            f"{', '.join(weak)} {'are' if len(weak) > 1 else 'is'} hardly determined: the standard uncertainty is more than a "
+            f"sixth of the largest value; {advice}",
             CompgenWarning,
             stacklevel=4,
         )
+
+
+def _weak(machine: Machine, errors: ErrorTable, name: str, sigma_mm: float) -> bool:
+    if name in errors.squareness:
+        value, u = (abs(part) for part in errors.squareness[name])
+    else:
+        curve = errors.curves[name]
+        value, u = float(np.abs(curve.value).max()), float(curve.u.max())
+    corners = np.array(list(itertools.product(*zip(machine.lower_mm, machine.upper_mm, strict=True))))
+    lever = float(np.linalg.norm(c_matrix(machine, corners)[:, :, ERROR_INDEX[name]], axis=1).max())
+    return bool(u > WEAK_SHARE * value and u * lever > WEAK_READINGS * sigma_mm)
 
 
 def warn_of_residuals(whiteness: Whiteness, reduced_chi_square: float, u_source: str) -> None:
