@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -43,6 +44,7 @@ from compgen.verify.active import ActiveTables, without_active
 from compgen.verify.check_program import check_files
 from compgen.verify.evidence import verification_files
 from compgen.verify.safety import SafetyLimits
+from compgen.verify.verdict import MISFIT_CODES, blocking_reasons, measurement_objections, taken_away_um
 
 Progress = Callable[[str], None]
 
@@ -53,6 +55,7 @@ class Checks(TypedDict, total=False):
     active: ActiveTables | None
     limits: SafetyLimits | None
     instrument: str | Path | None
+    allow_misfit: bool
 
 
 @dataclass(frozen=True)
@@ -227,6 +230,7 @@ def _read_back(
     identified: ErrorTable,
     reversal: ReversalCurves | None = None,
     limits: SafetyLimits | None = None,
+    known: covariance.Covariance | None = None,
 ) -> Verification:
     """Verify what stands in the files after they were written; InputError if they cannot be read."""
     with tempfile.TemporaryDirectory(prefix="compgen-") as staging:
@@ -237,7 +241,23 @@ def _read_back(
             name = Path(error.file).name if error.file else None
             message = f"the rendered file cannot be read back, so its template is wrong: {error.message}"
             raise InputError(message, file=name, line=error.line) from error
-        return verify(machine, tables, identified, reversal=reversal, limits=limits)
+        return verify(machine, tables, identified, reversal=reversal, limits=limits, covariance=known)
+
+
+def _with_objections(verification: Verification, identification: Identification, *, allow_misfit: bool) -> Verification:
+    """Add what speaks against the measurement; what blocks is a reason against the tables, too."""
+    before, after = verification.before_rigid_removed, verification.after_rigid_removed
+    taken = taken_away_um(before.rms_um, after.rms_um) if verification.accepted else None  # else the tables are wrong
+    found = measurement_objections(identification, taken, allow_misfit=allow_misfit)
+    reasons = [*verification.reasons, *blocking_reasons(found)]
+    return replace(verification, objections=found, reasons=tuple(dict.fromkeys(reasons)))
+
+
+def _diagnosis_of(machine: Machine, measurements: Sequence[str | Path], folder: str | Path) -> str:
+    """Return the command that looks for what the model lacks."""
+    source = machine.name if machine.source is None else str(machine.source)
+    words = ["compgen", "diagnose", source, *map(str, measurements), "--out", str(Path(folder) / "diagnosis")]
+    return shlex.join(words)
 
 
 def identify_bare(
@@ -337,7 +357,8 @@ def run(
     progress : is told the name of each stage as it begins.
     checks : ``active``, tables that were active while the machine was measured (the new ones take their place),
         ``limits`` for the steps of the tables, and ``instrument``, the instrument file of six-DOF readings. Where these
-        contradict the machine's chain, nothing is accepted.
+        contradict the machine's chain, nothing is accepted. With ``allow_misfit`` residuals that are too large, or that a
+        step or a drift explains, are a reservation, and no reason to refuse the tables.
     """
     sub_folders = {name: name if len(set(controllers)) > 1 else "" for name in controllers}
     if not sub_folders:
@@ -368,9 +389,10 @@ def run(
             provenance=provenance,
             reversal=reversal,
         )
-        verification = _read_back(machine, exported, identification.errors, reversal, checks.get("limits"))
-        reasons = tuple(dict.fromkeys([*verification.reasons, *identification.objections]))
-        verification = replace(verification, reasons=reasons)
+        verification = _read_back(machine, exported, identification.errors, reversal, checks.get("limits"), known)
+        verification = _with_objections(verification, identification, allow_misfit=checks.get("allow_misfit", False))
+        if any(item.code in MISFIT_CODES for item in verification.objections):
+            verification = replace(verification, next_command=_diagnosis_of(machine, measurements, folder))
         beside = check_files(machine, exported, identification.errors, templates, reversal)
         checked[sub_folder] = exported, verification, beside
     evidence = evidence_files(machine, measurement, identification)

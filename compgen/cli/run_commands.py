@@ -55,6 +55,12 @@ from compgen.verify.safety import SafetyLimits
 @click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
 @active_options()
 @limits_option
+@click.option(
+    "--allow-misfit",
+    is_flag=True,
+    help="Accept tables, with reservations, although the residuals of the readings are above a third of what the tables "
+    "take away, or a step or a drift explains most of them. Without it the exit code is 1.",
+)
 @explain_option
 @click.option("--no-report", is_flag=True, help="Write no report.html, and none of the files that belong to it.")
 @json_option
@@ -74,6 +80,7 @@ def run_command(
     allow_unverified: bool,
     active: ActiveTables | None,
     limits: SafetyLimits,
+    allow_misfit: bool,
     explain: bool,
     no_report: bool,
     as_json: bool,
@@ -100,6 +107,7 @@ def run_command(
             allow_unverified=allow_unverified,
             active=active,
             limits=limits,
+            allow_misfit=allow_misfit,
             progress=show,
             instrument=instrument,
         )

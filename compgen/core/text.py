@@ -56,3 +56,12 @@ def one_line(text: object) -> str:
     """Return ``text`` as printable ASCII on one line, so that it is safe in a comment of a controller file."""
     flat = " ".join(str(text).split())
     return "".join(char if " " <= char <= "~" else "?" for char in flat)
+
+
+def um_text(value: float) -> str:
+    """A figure in um: two decimals below 10, none from 1000 on.
+
+    >>> um_text(0.157), um_text(42.34), um_text(1714.6)
+    ('0.16', '42.3', '1715')
+    """
+    return f"{value:.{2 if abs(value) < 9.995 else 1 if abs(value) < 999.95 else 0}f}"

@@ -121,7 +121,7 @@ def covariance_from_factor(
 def joint_covariance(result: Identification) -> Covariance:
     """Return the covariance of everything that was identified, systematic inputs included."""
     if result.values_factor is not None:
-        return _covariance_of_values(result.errors, result.values_factor, result.layout.machine.name)
+        return covariance_of_values(result.errors, result.values_factor, result.layout.machine.name)
     if result.adjustment is None:
         raise ValueError("this identification keeps no joint covariance")
     factor = result.adjustment.covariance_factor()
@@ -130,7 +130,7 @@ def joint_covariance(result: Identification) -> Covariance:
     return covariance_from_factor(result.layout, factor, [(item.station, item.setup) for item in result.stations])
 
 
-def _covariance_of_values(errors: ErrorTable, factor: FloatArray, machine: str) -> Covariance:
+def covariance_of_values(errors: ErrorTable, factor: FloatArray, machine: str) -> Covariance:
     """Covariance of error values that a factor (k, r) in the order of the errors file describes; no stations."""
     names: list[str] = []
     positions = []

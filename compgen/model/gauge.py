@@ -93,9 +93,14 @@ def _effects(
 def _rigid_fields(machine: Machine, tools_mm: FloatArray | None) -> FloatArray:
     """Fields of the three translations and three rotations of the tool tips, one column each."""
     position, tool = _sample(machine, tools_mm)
-    tip = position + tool
+    return rigid_fields(position + tool)
+
+
+def rigid_fields(tip_mm: FloatArray) -> FloatArray:
+    """Fields of three translations and three small rotations about the origin at tips (n, 3): columns, (3 n, 6)."""
     unit = np.eye(3)
-    fields = [np.broadcast_to(unit[k], tip.shape) for k in range(3)] + [np.cross(unit[k], tip) for k in range(3)]
+    fields = [np.broadcast_to(unit[k], tip_mm.shape) for k in range(3)]
+    fields += [np.cross(unit[k], tip_mm) for k in range(3)]
     return np.column_stack([field.ravel() for field in fields])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from compgen.core.names import error_named
-from compgen.core.text import one_line
+from compgen.core.text import one_line, um_text
 from compgen.fit import FitResult
 from compgen.identify import Identification
 from compgen.pipeline import RunResult
@@ -92,12 +93,12 @@ def _errors_table(result: Identification) -> Table:
         unit = error_named(name).si_per_unit
         if name in result.errors.squareness:
             value, u = result.errors.squareness[name]
-            table.add_row(name, f"{value / unit:+.3f}", "", f"{u / unit:.3f}", error_named(name).unit)
+            table.add_row(name, f"{value / unit:+.3f}", "", _u(u / unit), error_named(name).unit)
         else:
             curve = result.errors.curves[name]
             k = int(abs(curve.value).argmax())
             largest, u = curve.value[k] / unit, curve.u.max() / unit
-            table.add_row(name, f"{largest:+.3f}", f"{curve.position_mm[k]:g}", f"{u:.3f}", error_named(name).unit)
+            table.add_row(name, f"{largest:+.3f}", f"{curve.position_mm[k]:g}", _u(u), error_named(name).unit)
     return table
 
 
@@ -122,24 +123,41 @@ def fit_table(result: FitResult) -> Table:
     return table
 
 
-def _um(value: float) -> str:
-    """A figure in um: two decimals below 10, none from 1000 on."""
-    return f"{value:.{2 if abs(value) < 9.995 else 1 if abs(value) < 999.95 else 0}f}"
+def _u(value: float) -> str:
+    """A standard uncertainty; one that nothing tells is said to be so."""
+    return f"{value:.3f}" if math.isfinite(value) else "not known"
 
 
 def _pair(figures: Residuals) -> str:
-    return f"{_um(figures.max_um)} / {_um(figures.rms_um)}"
+    return f"{um_text(figures.max_um)} / {um_text(figures.rms_um)}"
 
 
-def _verdict(item: Verification) -> Text:
-    if not item.accepted:
-        return Text("REJECTED", "bold red")
-    return Text("partial", "yellow") if item.partial else Text("accepted", "green")
+VERDICTS = {
+    "accepted": ("accepted", "green"),
+    "partial": ("partial", "yellow"),
+    "accepted_with_reservations": ("reservations", "yellow"),
+    "better_after_new_setup": ("new set-up", "yellow"),
+    "not_accepted": ("REJECTED", "bold red"),
+}
+
+
+def _uncertainty(results: Sequence[Verification]) -> str:
+    """What the uncertainty of the measurement adds to the figures after compensation."""
+    known = results[0].uncertainty  # of the errors and points, so much the same for all controls
+    if known is None:
+        return "the uncertainty of the measurement is not known, so neither is that of the figures after"
+    return (
+        f"the uncertainty of the measurement (U, k = 2) comes on top of the figures by the files: +-{um_text(known.max_um)} / "
+        f"{um_text(known.rms_um)} um on after, +-{um_text(known.max_rigid_removed_um)} / "
+        f"{um_text(known.rms_rigid_removed_um)} um on after*"
+    )
 
 
 def verification_table(results: Sequence[Verification]) -> Group:
     """Return before and after for every control, read from the files, and why tables were not accepted."""
-    title = "tool tip error over the volume, max / rms in um, by the files read back"
+    volumetric = all(item.volumetric for item in results)
+    what = "tool tip error over the volume" if volumetric else "effect of the measured errors alone on the tool tip"
+    title = f"{what}, max / rms in um, by the files read back"
     table = Table(
         title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False, collapse_padding=True
     )
@@ -149,24 +167,32 @@ def verification_table(results: Sequence[Verification]) -> Group:
     table.add_column("verdict", no_wrap=True, min_width=9)
     notes: list[Text] = []
     for item in results:
-        verdict = _verdict(item)
         table.add_row(
             item.controller,
             _pair(item.before),
             _pair(item.after),
             _pair(item.before_rigid_removed),
             _pair(item.after_rigid_removed),
-            _um(item.unrepresentable_um),
-            verdict,
+            um_text(item.unrepresentable_um),
+            Text(*VERDICTS[item.state]),
         )
+        if item.accepted and item.state != "accepted":
+            notes.append(Text(f"{item.controller}: {item.headline}", VERDICTS[item.state][1]))
         notes += [Text(f"{item.controller}: {reason}", "red") for reason in item.reasons[:MOST_REASONS]]
         if len(item.reasons) > MOST_REASONS:
             notes.append(Text(f"{item.controller}: and {len(item.reasons) - MOST_REASONS} more in result.json", "red"))
-        notes += [Text(f"{item.controller}: {note}", "yellow") for note in item.notes if item.accepted]
+        notes += [
+            Text(f"{item.controller}: {note}", "yellow")
+            for note in item.notes
+            if item.accepted and note not in item.headline
+        ]
+        if item.next_command:
+            notes.append(Text(f"{item.controller}: next: {one_line(item.next_command)}"))
         if item.uncorrected_um:
-            listed = ", ".join(f"{name} {_um(value)} um" for name, value in list(item.uncorrected_um.items())[:8])
+            listed = ", ".join(f"{name} {um_text(value)} um" for name, value in list(item.uncorrected_um.items())[:8])
             more = f" and {len(item.uncorrected_um) - 8} more" if len(item.uncorrected_um) > 8 else ""
             notes.append(Text(f"{item.controller} leaves uncorrected: {listed}{more}"))
+    notes += [Text(_uncertainty(results))] if results else []
     legend = (
         "before, after: as it stands, the reference point fixed; before*, after*: the best-fit rigid motion of the "
         "workpiece taken out; not held: the largest error that no table of this control can express"

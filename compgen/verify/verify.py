@@ -20,15 +20,26 @@ from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.points import Points
 from compgen.core.reversal import ReversalCurves
-from compgen.core.text import one_line
+from compgen.core.text import one_line, um_text
 from compgen.errors import CompgenWarning, InputError
 from compgen.export.synthesis import Projector, wanted_correction
+from compgen.identify.covariance import Covariance
 from compgen.model.exact import exact_error
 from compgen.model.volumetric import tool_of, volumetric_error
 from compgen.verify.judge import judge_of
 from compgen.verify.residuals import Residuals, residuals, without_rigid_motion
 from compgen.verify.reversal import in_both_directions, left_by_reversal, mean_correction, reversal_reasons
 from compgen.verify.safety import Safety, SafetyLimits, safety_of
+from compgen.verify.verdict import (
+    WORSE_FROM_UM,
+    Coverage,
+    FigureUncertainty,
+    Objection,
+    State,
+    coverage_of,
+    figure_uncertainty,
+    worst,
+)
 
 #: Errors that stay uncorrected by less than this are not named.
 NAMED_FROM_MM = 0.1 * MM_PER_UM
@@ -36,6 +47,8 @@ NAMED_FROM_MM = 0.1 * MM_PER_UM
 #: Largest controller file that is read; the largest tables that the controls take have some 200 000 rows.
 MOST_BYTES, MOST_LINES = 20_000_000, 250_000
 
+#: A correction below this is none; 1e-9 mm is far below what any control resolves.
+ZERO_MM = 1e-9
 #: A control that cannot express more than this share of the largest error gives a partial compensation.
 PARTIAL_SHARE = 0.1
 
@@ -220,16 +233,95 @@ class Verification:
     files: tuple[tuple[str, str], ...]
     reasons: tuple[str, ...]
     reservations: tuple[str, ...]
+    measured: Coverage
     safety: Safety = field(repr=False)
     position_mm: FloatArray = field(repr=False)
     error_before_mm: FloatArray = field(repr=False)
     error_after_mm: FloatArray = field(repr=False)
     machine: str = ""
+    objections: tuple[Objection, ...] = ()
+    uncertainty: FigureUncertainty | None = None
+    next_command: str = ""
 
     @property
     def accepted(self) -> bool:
-        """Whether the tables may be loaded."""
+        """Whether the tables may be loaded, with whatever the verdict says beside."""
         return not self.reasons
+
+    @property
+    def volumetric(self) -> bool:
+        """Whether figures over the volume can be claimed: every error that the machine's chain shows is known."""
+        return not self.measured.missing
+
+    @property
+    def worse_as_it_stands(self) -> bool:
+        """Whether the tables make the rms error larger for a workpiece that is left where it is."""
+        return self.after.rms_um > self.before.rms_um + WORSE_FROM_UM
+
+    @property
+    def state(self) -> State:
+        """The verdict in one word."""
+        found: list[State] = []
+        if self.partial or not self.volumetric:
+            found.append("partial")
+        if self.objections or self.reservations:
+            found.append("accepted_with_reservations")
+        if self.worse_as_it_stands:
+            found.append("better_after_new_setup")
+        if not self.accepted:
+            found.append("not_accepted")
+        return worst(found)
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence, with the one figure that it rests on."""
+        if not self.accepted:
+            more = f" (and {len(self.reasons) - 1} more)" if len(self.reasons) > 1 else ""
+            return f"not accepted: {self.reasons[0]}{more}"
+        parts = [*(item.text for item in self.objections if not item.blocking), *self.reservations]
+        reserved = f"accepted with reservations: {'; '.join(parts)}" if parts else ""
+        whole = [self._setup_text, reserved, self._partial_text]
+        return "; ".join(text for text in whole if text) or f"accepted: {self.figure}"
+
+    @property
+    def figure(self) -> str:
+        """What the tables do, in one figure: rms over the volume as it stands, with the uncertainty of the measurement."""
+        change = f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms"
+        known = "not known" if self.uncertainty is None else f"{um_text(self.uncertainty.rms_um)} um"
+        bounds = f"uncertainty of the measurement U = {known}" + ("" if self.uncertainty is None else ", k = 2")
+        if self.volumetric:
+            return f"the error over the volume goes from {change} as it stands ({bounds})"
+        return f"the effect of the measured errors alone goes from {change} ({bounds}); the error over the volume is not known"
+
+    @property
+    def _setup_text(self) -> str:
+        if not self.worse_as_it_stands:
+            return ""
+        before, after = self.before_rigid_removed, self.after_rigid_removed
+        return (
+            f"better only after the workpiece is set up anew: as it stands the error grows from {um_text(self.before.rms_um)} to "
+            f"{um_text(self.after.rms_um)} um rms; with the best-fit rigid motion of the workpiece taken out it goes from "
+            f"{um_text(before.rms_um)} to {um_text(after.rms_um)} um rms"
+        )
+
+    @property
+    def _partial_text(self) -> str:
+        parts = []
+        if not self.volumetric:
+            parts.append(self.measured.text)
+        if self.partial:
+            parts.append(self._beyond_text)
+        if not parts:
+            return ""
+        return f"partial: {'; '.join(parts)}" + ("" if self.worse_as_it_stands else f"; {self.figure}")
+
+    @property
+    def _beyond_text(self) -> str:
+        share = 100.0 * self.after_rigid_removed.rms_um / max(self.before_rigid_removed.rms_um, 1e-12)
+        return (
+            f"this control cannot express {um_text(self.unrepresentable_um)} um of the error; {share:.0f} % of the rms stays "
+            "with the best-fit rigid motion taken out"
+        )
 
     @property
     def partial(self) -> bool:
@@ -241,15 +333,11 @@ class Verification:
         """What else the user should know of accepted tables."""
         notes = [*self.reservations, *self.safety.warnings]
         if self.partial:
-            share = 100.0 * self.after_rigid_removed.rms_um / max(self.before_rigid_removed.rms_um, 1e-12)
+            notes.append(self._beyond_text)
+        if self.after.max_um > self.before.max_um + 0.05 and not self.worse_as_it_stands:
             notes.append(
-                f"partial: this control cannot express {self.unrepresentable_um:.0f} um of the error; "
-                f"{share:.0f} % of the rms stays (rigid motion taken out)"
-            )
-        if self.after.max_um > self.before.max_um + 0.05 or self.after.rms_um > self.before.rms_um + 0.05:
-            notes.append(
-                f"as it stands the error grows from {self.before.max_um:.1f} to {self.after.max_um:.1f} um max, "
-                f"{self.before.rms_um:.1f} to {self.after.rms_um:.1f} um rms, by a rigid motion of the workpiece"
+                f"as it stands the largest error grows from {self.before.max_um:.1f} to {self.after.max_um:.1f} um, "
+                "by a rigid motion of the workpiece"
             )
         return tuple(notes)
 
@@ -257,6 +345,11 @@ class Verification:
         """Return the contents of ``result.json``."""
         return {
             "accepted": self.accepted,
+            "verdict": self.state,
+            "headline": self.headline,
+            "objections": [item.as_dict() for item in self.objections],
+            "measured": self.measured.as_dict(),
+            "volumetric": self.volumetric,
             "partial": self.partial,
             "notes": list(self.notes),
             "reasons": list(self.reasons),
@@ -267,8 +360,10 @@ class Verification:
             "after": self.after.as_dict(),
             "before_rigid_motion_removed": self.before_rigid_removed.as_dict(),
             "after_rigid_motion_removed": self.after_rigid_removed.as_dict(),
+            "after_uncertainty": None if self.uncertainty is None else self.uncertainty.as_dict(),
             "unrepresentable_um": self.unrepresentable_um,
             "uncorrected_um": self.uncorrected_um,
+            "next_command": self.next_command or None,
             "safety": self.safety.summary(),
             "files": [{"name": name, "sha256": digest} for name, digest in self.files],
         }
@@ -281,6 +376,7 @@ def verify(
     points: Points | None = None,
     limits: SafetyLimits | None = None,
     reversal: ReversalCurves | None = None,
+    covariance: Covariance | None = None,
 ) -> Verification:
     """Judge parsed tables against the errors of the machine.
 
@@ -294,6 +390,8 @@ def verify(
     limits : for the steps of the tables, see :func:`compgen.verify.safety.safety_of`.
     reversal : what each axis does differently in its two directions, beside the errors (their mean); points that do
         not say from where they were approached are then looked at from both sides.
+    covariance : joint covariance of the errors, for the uncertainty of the figures; without it that of the single values
+        counts.
     """
     control = tables.controller
     judge = judge_of(machine, control, errors, tables.tables)
@@ -308,8 +406,11 @@ def verify(
         rest = rest - rest.mean(axis=0)
     on_grid, on_lines = (tables.mean_correction(machine, part) for part in (grid_mm, judge.line_mm))
     safety = safety_of(machine, control, tables.tables, lambda part: solver.field(judge.values, part), limits)
+    figures = [residuals(error) for error in (before, after)]
+    rigid_removed = [residuals(without_rigid_motion(nominal, error)) for error in (before, after)]
     reasons = [
         *control.violations(machine, tables.settings, tables.tables),
+        *_useless_reasons(machine, tables, points_mm=(grid_mm, judge.line_mm), figures=figures, removed=rigid_removed),
         *judge.reasons(on_grid, on_lines),
         *_reversal_reasons(machine, tables, reversal),
         *tables.contradictions,
@@ -317,10 +418,10 @@ def verify(
     ]
     return Verification(
         controller=control.name,
-        before=residuals(before),
-        after=residuals(after),
-        before_rigid_removed=residuals(without_rigid_motion(nominal, before)),
-        after_rigid_removed=residuals(without_rigid_motion(nominal, after)),
+        before=figures[0],
+        after=figures[1],
+        before_rigid_removed=rigid_removed[0],
+        after_rigid_removed=rigid_removed[1],
         unrepresentable_um=float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM,
         uncorrected_um={
             **_uncorrected(machine, errors, solver),
@@ -333,12 +434,46 @@ def verify(
             *control.reservations(machine, tables.settings, tables.tables),
             *control.left_out(machine, tables.settings, errors),
         ),
+        measured=coverage_of(machine, errors),
         safety=safety,
         position_mm=where.position_mm,
         error_before_mm=before,
         error_after_mm=after,
         machine=machine.name,
+        uncertainty=figure_uncertainty(machine, errors, where.position_mm, covariance),
     )
+
+
+def _useless_reasons(
+    machine: Machine,
+    tables: ReadTables,
+    *,
+    points_mm: Sequence[FloatArray],
+    figures: Sequence[Residuals],
+    removed: Sequence[Residuals],
+) -> list[str]:
+    """Say so of tables that hold zeros only, or with which the machine is worse whatever is done with the workpiece.
+
+    ``figures`` are before and after as it stands, ``removed`` those without the best-fit rigid motion.
+    """
+    largest = 0.0
+    for position_mm in points_mm:
+        for side in (1.0, -1.0):
+            points = Points(position_mm, approach=np.full_like(position_mm, side))
+            largest = max(largest, float(np.abs(tables.correction(machine, points)).max()))
+    step_um = tables.controller.resolution_mm(tables.settings) / MM_PER_UM
+    if largest < ZERO_MM:
+        return [
+            f"the tables hold zeros only and change nothing, while the errors reach {um_text(figures[0].max_um)} um: either this "
+            f"control has no table for them, or its smallest step is too coarse (rounding of an entry: up to {step_um:.3g} um)"
+        ]
+    if figures[1].rms_um > figures[0].rms_um + WORSE_FROM_UM and removed[1].rms_um > removed[0].rms_um:
+        return [
+            f"the tables make the machine worse: {um_text(figures[0].rms_um)} um rms before, {um_text(figures[1].rms_um)} "
+            f"after; with the best-fit rigid motion taken out {um_text(removed[0].rms_um)} before, "
+            f"{um_text(removed[1].rms_um)} after"
+        ]
+    return []
 
 
 def _errors_before_after(

@@ -81,10 +81,13 @@ def _verification(item: Mapping[str, Any]) -> dict[str, Any]:
         for when in ("before", "after")
         for key, text in FIGURES
     ]
+    what = "error of the tool tip over the volume"
+    if not item["volumetric"]:
+        what = "effect of the measured errors alone on the tool tip"
     return {
-        "name": f"error of the tool tip over the volume, tables of {item['name']}",
+        "name": f"{what}, tables of {item['name']}",
         "usedMethod": "emulation of the files that were read back; computed, not measured",
-        "conformity": {"accepted": item["state"] != "rejected", "reasons": item["reasons"]},
+        "conformity": {"accepted": item["state"] != "rejected", "reasons": [*item["reasons"], *item["objections"]]},
         "results": results,
         "files": item["files"],
     }

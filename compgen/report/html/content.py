@@ -25,7 +25,14 @@ FIGURES = (
     ("v_y_um", "V_Y, range of the Y component (ISO 230-1)"),
     ("v_z_um", "V_Z, range of the Z component (ISO 230-1)"),
 )
-VERDICTS = {"accepted": "Accepted", "partial": "Accepted, partial", "rejected": "Not accepted"}
+#: States of tables from the best to the worst, and how they are called; the middle ones are amber on the page.
+VERDICTS = {
+    "accepted": "Accepted",
+    "partial": "Accepted, partial",
+    "accepted_with_reservations": "Accepted with reservations",
+    "better_after_new_setup": "Better only after a new set-up",
+    "rejected": "Not accepted",
+}
 
 
 def content(source: ResultFolder) -> dict[str, Any]:
@@ -65,12 +72,17 @@ def _machine_name(source: ResultFolder) -> str:
 
 def _control(item: ControlFolder) -> dict[str, Any]:
     result = item.result
-    accepted = bool(result.get("accepted"))
-    state = "rejected" if not accepted else "partial" if result.get("partial") else "accepted"
+    state = _state(result)
     return {
         "name": item.name,
         "state": state,
         "verdict": VERDICTS[state],
+        "headline": str(result.get("headline", "")),
+        "volumetric": bool(result.get("volumetric", True)),
+        "measured": str(dict(result.get("measured", {})).get("text", "")),
+        "objections": [str(entry.get("text", "")) for entry in result.get("objections", []) if isinstance(entry, dict)],
+        "uncertainty": dict(result.get("after_uncertainty") or {}),
+        "next_command": str(result.get("next_command") or ""),
         "format": item.manifest.get("format", ""),
         "evidence": item.manifest.get("evidence", ""),
         "points": result.get("points"),
@@ -95,6 +107,14 @@ def _control(item: ControlFolder) -> dict[str, Any]:
             for f in item.files
         ],
     }
+
+
+def _state(result: Mapping[str, Any]) -> str:
+    """The state of a control's tables; results of earlier versions say only whether they are accepted, and partial."""
+    if not result.get("accepted"):
+        return "rejected"
+    state = str(result.get("verdict", "partial" if result.get("partial") else "accepted"))
+    return state if state in VERDICTS else "accepted_with_reservations"
 
 
 def why_uncorrected(name: str) -> str:
@@ -128,8 +148,7 @@ def um(value: Any) -> str:
 
 def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     if controls:
-        states = [item["state"] for item in controls]
-        state = "rejected" if "rejected" in states else "partial" if "partial" in states else "accepted"
+        state = max((str(item["state"]) for item in controls), key=list(VERDICTS).index)
         return {"state": state, "headline": _headline(state, controls), "text": _verdict_text(controls)}
     if source.kind == "compare":
         return _compare_verdict(source.compare)
@@ -169,10 +188,17 @@ def _compare_verdict(compare: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
+    if len(controls) == 1 and state == "partial" and not controls[0]["volumetric"]:
+        return f"Partial: {controls[0]['measured']}; the tables correct what was measured and nothing else"
     if len(controls) == 1:
         return {
             "accepted": "The tables may be loaded, by the preflight list",
             "partial": "The tables may be loaded, by the preflight list, but much of the error is beyond this control",
+            "accepted_with_reservations": (
+                "The tables may be loaded, by the preflight list, with reservations: the model does not describe the "
+                "readings as well as their uncertainty asks for"
+            ),
+            "better_after_new_setup": "Better only after the workpiece is set up anew",
             "rejected": "Do not load these tables",
         }[state]
     count = {name: sum(item["state"] == name for item in controls) for name in VERDICTS}
@@ -181,13 +207,23 @@ def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
-    best = min(controls, key=lambda item: item["after"].get("rms_um", math.inf)) if len(controls) > 1 else controls[0]
+    loadable = [item for item in controls if item["state"] != "rejected"] or controls
+    best = min(loadable, key=lambda item: item["after"].get("rms_um", math.inf))
     before, after = best["before"], best["after"]
     name = f"With {best['name']} the" if len(controls) > 1 else "The"
-    return (
-        f"{name} error of the tool tip over the volume goes from {um(before.get('max_um'))} to {um(after.get('max_um'))} µm "
-        f"at most, from {um(before.get('rms_um'))} to {um(after.get('rms_um'))} µm rms, as the files that were read back say."
-    )
+    change = f"goes from {um(before.get('rms_um'))} to {um(after.get('rms_um'))} µm rms"
+    known = um(best["uncertainty"].get("U_rms_um")) if best["uncertainty"] else ""
+    bounds = f"± {known} µm (uncertainty of the measurement, k = 2)" if known else "(its uncertainty is not known)"
+    if not best["volumetric"]:
+        return (
+            f"{name} effect of the measured errors alone {change} {bounds}, as the files that were read back say. The error "
+            "over the volume is not known: the other errors were not measured."
+        )
+    text = f"{name} error of the tool tip over the volume {change} {bounds}, as it stands, as the files that were read back say."
+    if best["state"] == "better_after_new_setup":
+        rigid = f"{um(best['before_rigid'].get('rms_um'))} to {um(best['after_rigid'].get('rms_um'))} µm rms"
+        text += f" With the best-fit rigid motion of the workpiece taken out it goes from {rigid}."
+    return text
 
 
 def _errors(table: ErrorTable | None) -> list[dict[str, Any]]:

@@ -42,6 +42,9 @@ def dossier_data(data: Mapping[str, Any]) -> dict[str, Any]:
                 for key in (
                     "name",
                     "state",
+                    "headline",
+                    "measured",
+                    "objections",
                     "points",
                     "before",
                     "after",
@@ -181,6 +184,7 @@ def _verified(item: Mapping[str, Any]) -> list[str]:
     parts = ("before", "after", "before_rigid", "after_rigid")
     rows = [[text, *(um(item[part].get(key)) for part in parts)] for key, text in FIGURES]
     lines += _table(["um", "before", "after", "before, rigid motion removed", "after, rigid motion removed"], rows)
+    lines += [f"- {plain_markdown(text)}" for text in (item["headline"], *item["objections"]) if text]
     lines += [f"- Cannot be expressed by this control: {um(item['unrepresentable_um'])} um"]
     lines += [f"- Stays: {item['error']} {um(item['um'])} um; {item['why']}" for item in item["uncorrected"]]
     return [*lines, *(f"- {plain_markdown(text)}" for text in (*item["reasons"], *item["notes"])), ""]

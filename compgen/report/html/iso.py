@@ -15,6 +15,7 @@ from compgen.core.machine import Machine
 from compgen.errors import CompgenError
 from compgen.report.html.folder import ResultFolder
 from compgen.report.html.tables import read_back
+from compgen.verify.verdict import coverage_of
 
 #: Reference line of straightness and squareness.
 LINE = "ls"
@@ -28,6 +29,9 @@ GROUPS = {
     "reversal": "Reversal: both directions (ISO 230-2, ISO 230-6)",
     "squareness indication": "Squareness, an indication from the diagonals",
 }
+
+#: Groups that every error of the machine has a part in: without all of them they would claim what was not measured.
+VOLUMETRIC = ("volume", "orientation", "diagonals", "squareness indication")
 
 
 def accuracy_groups(source: ResultFolder) -> dict[str, Any]:
@@ -52,7 +56,11 @@ def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> di
     given = error_source(machine, errors)
     ((full, pairs),) = volume_fields(machine, (given,), "axes")
     found: dict[str, Mapping[str, Figure]] = {"volume": volume_figures(full, pairs), **groups_of_errors(given, LINE)}
-    found.pop("errors")  # they stand with their curves
+    found.pop("errors")  # they are shown with their curves
+    coverage = coverage_of(machine, errors)
+    for name in VOLUMETRIC if coverage.missing else ():
+        found.pop(name, None)
+    partial = f"{coverage.text}: no figure of the volume and its diagonals is given, for the other errors are not known"
     groups = [
         {"name": GROUPS[name], "rows": _rows({key: item.summary() for key, item in group.items()})}
         for name, group in found.items()
@@ -64,6 +72,7 @@ def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> di
             *statements_of(machine, full, LINE),
             independent,
             "the machine as it was identified, without tables",
+            *([partial] if coverage.missing else []),
         ],
         "with_tables": _with_tables(source, machine, errors),
     }

@@ -67,6 +67,7 @@ def _environment() -> Environment:
     environment.filters |= {
         "um": um,
         "number": number,
+        "known": lambda value: "not known" if value is None else number(value),
         "markdown": markdown,
         "unit": lambda name: LABEL.get(name, name),
     }
