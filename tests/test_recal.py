@@ -18,12 +18,13 @@ from compgen.core.points import Points
 from compgen.core.steady import steady
 from compgen.model.exact import exact_error
 from compgen.model.grid import volume_grid
-from compgen.recal import actions, decisions, inbox, publish, runner
+from compgen.recal import actions, decisions, inbox, overview, publish, runner
 from compgen.recal.inbox import measurement_of
 from compgen.recal.job import Policy, read_job
 from compgen.recal.judge import Judgement, judge_measurement
 from compgen.recal.runner import run_jobs
 from compgen.recal.store import Store, open_store
+from compgen.serve.fleet import fleet
 from compgen.verify import read_tables
 
 NOISE_UM = 0.3
@@ -550,3 +551,45 @@ def test_a_file_that_is_no_table_is_refused_soon_and_the_next_machine_has_its_tu
     assert outcome.exit_code == 1
     assert outcome.outcomes[0].processed == outcome.outcomes[1].processed == ("good.deviations.csv",)
     assert max(map(len, outcome.outcomes[0].messages)) < 2000
+
+
+# --- what speaks against the measurement ---------------------------------------------------------------------------
+
+
+def misfit_text(machine, errors, *, step_um, stated_um):
+    """Two runs over the volume, the second shifted in X, with an uncertainty stated that the noise does not keep."""
+    once = volume_grid(machine, tuple(axis.nodes_mm for axis in machine.axes)).position_mm
+    position, run = np.vstack([once, once]), np.repeat([1, 2], len(once))
+    noise = np.random.default_rng(5).normal(0.0, NOISE_UM * 1e-3, position.shape)
+    measured = exact_error(machine, errors, position) + noise + np.outer(run == 2, [step_um * 1e-3, 0.0, 0.0])
+    notes = {"u_deviation_um": str(stated_um), "measured_at": time_of(0)}
+    u_mm = np.full_like(measured, stated_um * 1e-3)
+    return format_deviations(Deviations(position, measured, u_mm=u_mm, labels={"run": run}, metadata=notes))
+
+
+def test_a_step_between_runs_is_held_back_until_a_person_overrides(plant, small_machine, small_errors):
+    plant.write('approval = "auto"')
+    text = misfit_text(small_machine, small_errors, step_um=20.0, stated_um=NOISE_UM)
+    (plant.inbox / "a.deviations.csv").write_text(text)
+    assert plant.run().exit_code == 1
+    (table,) = open_store(plant.job().store).tables()
+    assert (table.state, table.accepted) == ("held", True)
+    assert any("step between runs" in reason for reason in table.reasons)
+    actions.approve(plant.job(), "mill", 1, "ada", override=True, reason="the shift is that of the probe")
+    assert (plant.out / "active" / "NC_CEC.INI").exists()
+
+
+def test_residuals_above_their_uncertainty_are_published_and_shown(plant, small_machine, small_errors):
+    plant.write('approval = "auto"')
+    text = misfit_text(small_machine, small_errors, step_um=0.0, stated_um=0.2 * NOISE_UM)
+    (plant.inbox / "a.deviations.csv").write_text(text)
+    assert plant.run().exit_code == 0
+    store = open_store(plant.job().store)
+    (table,) = store.tables()
+    assert table.state == "active"
+    assert [reason[: len("reservation: ")] for reason in table.reasons] == ["reservation: "]
+    assert "times their stated uncertainty" in table.reasons[0]
+    (status,) = overview.status(store, plant.job())
+    assert status.state == "ok" and "with reservations" in status.message
+    (row,) = fleet(store).rows
+    assert row.status == "reserved"

@@ -20,6 +20,7 @@ from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.identify.covariance import Covariance, error_design
+from compgen.model.gauge import rigid_fields
 from compgen.model.volumetric import volumetric_error
 
 #: Points along each axis of the grid on which the change is looked at.
@@ -225,9 +226,7 @@ def _spread(machine: Machine, covariance: Covariance, position_mm: FloatArray) -
 def _without_rigid(machine: Machine, position_mm: FloatArray) -> FloatArray:
     """Projector (3 n, 3 n) that takes translations and rotations out of a field at points (n, 3)."""
     tip = (position_mm - position_mm.mean(axis=0)) / 1000.0
-    unit = np.eye(3)
-    fields = [np.broadcast_to(unit[k], tip.shape) for k in range(3)] + [np.cross(unit[k], tip) for k in range(3)]
-    rigid, _ = np.linalg.qr(np.column_stack([field.ravel() for field in fields]))
+    rigid, _ = np.linalg.qr(rigid_fields(tip))
     return np.asarray(np.eye(tip.size) - rigid @ rigid.T)
 
 

@@ -284,6 +284,7 @@ def _identify(keys: _Keys) -> dict[str, Any]:
     names = ("u_length_um", "u_length_um_per_m", "u_deviation_um")
     found: dict[str, Any] = {name: keys.take(name, tomlio.not_negative, None) for name in names}
     found["temperature"] = keys.take("temperature", tomlio.flag, True)
+    found["small_deviations"] = keys.take("small_deviations", tomlio.flag, False) or None  # so that the hash stays
     keys.finish()
     return {name: value for name, value in found.items() if value is not None}
 

@@ -19,6 +19,7 @@ from compgen.recal.change import Change, change_between, likeness, spread_of, vo
 from compgen.recal.inbox import holds_one_of
 from compgen.recal.job import MachineJob, Policy
 from compgen.recal.records import (
+    RESERVATION,
     DecisionRecord,
     EventRecord,
     IdentificationRecord,
@@ -30,6 +31,7 @@ from compgen.recal.states import AFTER
 from compgen.recal.store import Store
 from compgen.verify import ReadTables, verify
 from compgen.verify.diff import difference
+from compgen.verify.verdict import MISFIT_CODES
 
 #: A measurement from further in the future than this has a wrong time.
 FUTURE = timedelta(days=1)
@@ -41,9 +43,10 @@ STATED = "active_table_stated"
 
 @dataclass
 class Judgement:
-    """Reasons to hold tables back, and figures by name; both grow while the rules are looked at."""
+    """Reasons to hold tables back, reservations that are shown only, and figures by name; all grow while rules are looked at."""
 
     hold: list[str] = field(default_factory=list)
+    reservations: list[str] = field(default_factory=list)
     figures: dict[str, Any] = field(default_factory=dict)
 
 
@@ -71,6 +74,21 @@ def judge_measurement(
         judgement.hold.append(f"the active tables come from a newer measurement ({_day(latest)})")
     if policy.temperature_c is not None:
         judgement.hold += _temperature(policy.temperature_c, measurement.temperatures_c)
+
+
+def judge_misfit(judgement: Judgement, result: RunResult) -> None:
+    """Hold what a large misfit speaks against, and note what else keeps the verdict from a plain "accepted".
+
+    A person may approve over a misfit, as `--allow-misfit` does; residuals above their uncertainty alone are shown only.
+    """
+    for item in result.results:
+        found = item.verification
+        if not found.accepted:
+            continue
+        misfit = [objection.text for objection in found.objections if objection.code in MISFIT_CODES]
+        judgement.hold += [text for text in misfit if text not in judgement.hold]
+        if found.state != "accepted" and not misfit:
+            judgement.reservations.append(f"{RESERVATION}{found.controller}: {found.headline}")
 
 
 def judge_order(

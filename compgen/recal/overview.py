@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from compgen.recal import exclude
 from compgen.recal.job import Job, MachineJob
-from compgen.recal.records import AttemptRecord, MachineRecord, TableRecord
+from compgen.recal.records import AttemptRecord, MachineRecord, TableRecord, reservations_of
 from compgen.recal.schedule import Cron, Schedule
 from compgen.recal.store import Store
 
@@ -103,7 +103,10 @@ def _state(tables: Sequence[TableRecord], attempts: Sequence[AttemptRecord]) -> 
     if last is not None and last.state in ("held", "refused"):
         return "held", "; ".join(last.reasons)
     waiting = [str(table.version) for table in tables if table.state == "pending"]
-    return ("waiting", f"version {', '.join(waiting)} waits for approval") if waiting else ("ok", "")
+    shown = "; ".join(
+        reason for table in tables if table.state == "active" for reason in reservations_of(table.reasons)
+    )
+    return ("waiting", f"version {', '.join(waiting)} waits for approval") if waiting else ("ok", shown)
 
 
 def schedule_text(schedule: Schedule | None) -> str:

@@ -31,6 +31,7 @@ from compgen.recal.judge import (
     judge_change,
     judge_likeness,
     judge_measurement,
+    judge_misfit,
     judge_order,
     judge_tables,
     judge_twins,
@@ -97,6 +98,7 @@ def process(
         past = Past(store.decisions(record), tables, store.measurements(record), store.events(record))
         measured = _active_then(job, measurement, past, said)
         checks: Checks = {"instrument": job.instrument, "limits": SafetyLimits(job.policy.max_step_um)}
+        checks["allow_misfit"] = True  # a misfit that refuses the tables of `run` holds them back here: judge_misfit
         if measured is not None:
             checks["active"] = _parsed(store, machine, measured, job.controllers[0], Path(folder) / "then")
         outcome = run(
@@ -257,6 +259,7 @@ def _judged(
         judge_tables(judgement, machine, result, new, active)
     if result.accepted:
         apply_limits(judgement, machine, new, {} if active is None else active.tables, job.policy)
+    judge_misfit(judgement, result)
     judgement.figures["active_version"] = None if active is None else active.version
     judgement.figures["result"] = {item.verification.controller: item.verification.summary() for item in result.results}
     if not result.accepted:
@@ -293,5 +296,6 @@ def _result(
         "files": tuple(files),
         "accepted": outcome.accepted,
         "hold": tuple(judgement.hold),
+        "reservations": tuple(judgement.reservations),
         "judgement": judgement.figures,
     }

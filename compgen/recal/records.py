@@ -11,6 +11,9 @@ from typing import Any, Literal
 TableState = Literal["pending", "held", "refused", "superseded", "rejected", "active", "retired"]
 DecisionKind = Literal["propose", "hold", "refuse", "supersede", "approve", "reject", "rollback"]
 
+#: How a reason begins that is shown beside tables and holds nothing back.
+RESERVATION = "reservation: "
+
 
 @dataclass(frozen=True)
 class MachineRecord:
@@ -86,8 +89,9 @@ class IdentificationRecord:
 class TableRecord:
     """A set of tables of one machine; ``version`` counts from 1.
 
-    ``accepted`` says whether the round trip accepted the files, ``reasons`` why the policy holds them back,
-    ``summary`` holds the figures of the judgement, ``state`` what the last decision made of it.
+    ``accepted`` says whether the round trip accepted the files, ``reasons`` why the policy holds them back, and the
+    reservations of the verdict, which begin with :data:`RESERVATION` and hold nothing back; ``summary`` holds the figures
+    of the judgement, ``state`` what the last decision made of it.
     """
 
     id: int
@@ -154,9 +158,9 @@ class NewMeasurement:
 class NewResult:
     """What processing a measurement gave, kept in one transaction.
 
-    ``hold`` lists why the policy holds the tables back; with ``approve`` they become active at once unless held or not
-    accepted. ``revision`` counts how often the measurement is identified; from the second time on ``actor`` and
-    ``reason`` say who wanted it and why.
+    ``hold`` lists why the policy holds the tables back, ``reservations`` what is shown beside them; with ``approve`` they
+    become active at once unless held or not accepted. ``revision`` counts how often the measurement is identified; from
+    the second time on ``actor`` and ``reason`` say who wanted it and why.
     """
 
     machine_text: bytes
@@ -176,3 +180,9 @@ class NewResult:
     revision: int = 1
     actor: str = ""
     reason: str = ""
+    reservations: Sequence[str] = ()
+
+
+def reservations_of(reasons: Sequence[str]) -> list[str]:
+    """Return those of the reasons beside tables that are shown only, without their beginning."""
+    return [text.removeprefix(RESERVATION) for text in reasons if text.startswith(RESERVATION)]

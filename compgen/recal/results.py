@@ -78,7 +78,8 @@ def _decide(store: Store, connection: sa.Connection, machine: MachineRecord, tab
     elif new.hold:
         add_decision(store, connection, machine, "hold", table_id, actor, reason)
     else:
-        add_decision(store, connection, machine, "propose", table_id, actor, reason)
+        shown = "; ".join(filter(None, [reason, *new.reservations]))
+        add_decision(store, connection, machine, "propose", table_id, actor, shown)
         if new.approve:
             add_decision(store, connection, machine, "approve", table_id, AUTOMATIC, "approval = auto")
 
@@ -112,7 +113,7 @@ def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, cla
         "identification_id": identification_id,
         "accepted": new.accepted,
         "controllers": list(dict.fromkeys(file.controller for file in new.files)),
-        "reasons": list(new.hold),
+        "reasons": [*new.hold, *new.reservations],
         "summary": clean(new.judgement),
         "at": now,
     }

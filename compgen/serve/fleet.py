@@ -11,7 +11,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from compgen.recal import schema
-from compgen.recal.records import DecisionRecord, MachineRecord, TableState
+from compgen.recal.records import DecisionRecord, MachineRecord, TableState, reservations_of
 from compgen.recal.states import AFTER, AUTOMATIC, OPEN
 from compgen.recal.store import Store
 
@@ -26,6 +26,7 @@ STATUSES = {
     "refused": "not accepted",
     "pending": "waits for approval",
     "new": "no tables yet",
+    "reserved": "active with reservations",
     "ok": "up to date",
 }
 
@@ -35,7 +36,8 @@ class FleetRow:
     """One machine, as far as the overview shows it.
 
     ``waiting`` are the versions that wait for a person, newest first, ``pending`` whether one of them is not held back;
-    ``newest`` is the state of the newest version; ``failure`` says why the last attempt failed, if it did.
+    ``newest`` is the state of the newest version; ``failure`` says why the last attempt failed, if it did;
+    ``reserved`` whether the verdict on the active tables has reservations.
     """
 
     machine: MachineRecord
@@ -47,6 +49,7 @@ class FleetRow:
     measured_at: datetime | None
     measurements: int
     failure: str
+    reserved: bool = False
 
     @property
     def status(self) -> str:
@@ -57,7 +60,9 @@ class FleetRow:
             return str(self.newest)
         if self.pending:
             return "pending"
-        return "ok" if self.active is not None else "new"
+        if self.active is None:
+            return "new"
+        return "reserved" if self.reserved else "ok"
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,8 @@ def _row(
         newest = "retired"
     versions = sorted((row.version for row in waiting), reverse=True)
     pending = any(AFTER[row.kind] == "pending" for row in waiting)
-    return FleetRow(machine, version, since, versions, pending, newest, *measured, failure)
+    reserved = version is not None and bool(reservations_of(active.reasons))
+    return FleetRow(machine, version, since, versions, pending, newest, *measured, failure, reserved)
 
 
 def _queries() -> dict[str, sa.Select[Any]]:
@@ -156,7 +162,8 @@ def _active(newest: sa.Subquery) -> sa.Select[Any]:
         .subquery()
     )
     same = sa.and_(decisions.c.machine_id == last.c.machine_id, decisions.c.sequence == last.c.sequence)
-    query = sa.select(decisions.c.machine_id, tables.c.version, decisions.c.at, newest.c.version.label("newest"))
+    top = newest.c.version.label("newest")
+    query = sa.select(decisions.c.machine_id, tables.c.version, decisions.c.at, tables.c.reasons, top)
     query = query.select_from(last).join(decisions, same).outerjoin(tables, tables.c.id == decisions.c.table_id)
     return query.outerjoin(newest, newest.c.machine_id == decisions.c.machine_id)
 

@@ -38,13 +38,17 @@ DRAWN, DIFF_LINES, DIFF_BYTES = 6, 400, 400_000
 
 @dataclass(frozen=True)
 class Comparison:
-    """Error of one control in the volume, um: rows of (name, without tables, with the active ones, with these)."""
+    """Error of one control in the volume, um: rows of (name, without tables, with the active ones, with these).
+
+    Without ``volumetric`` the figures hold the effect of the measured errors alone.
+    """
 
     controller: str
     rows: Sequence[tuple[str, float | None, float | None, float | None]]
     largest_change_um: float | None
     reference_change_um: Mapping[str, float]
     accepted: bool | None
+    volumetric: bool = True
 
     def bars(self, *values: float | None) -> list[float]:
         """Return the lengths of bars for some figures, the longest 200 px."""
@@ -168,7 +172,9 @@ def _comparison(
     }
     accepted = result.get("accepted") if isinstance(result.get("accepted"), bool) else None
     known = [row for row in rows if any(value is not None for value in row[1:])]
-    return Comparison(name, known, _number(moved.get("max_change_um")), reference, accepted)
+    return Comparison(
+        name, known, _number(moved.get("max_change_um")), reference, accepted, result.get("volumetric") is not False
+    )
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
