@@ -87,7 +87,8 @@ def judge_misfit(judgement: Judgement, result: RunResult) -> None:
             continue
         misfit = [objection.text for objection in found.objections if objection.code in MISFIT_CODES]
         judgement.hold += [text for text in misfit if text not in judgement.hold]
-        if found.state != "accepted" and not misfit:
+        measured = found.objections or not found.volumetric or found.worse_as_it_stands
+        if measured and not misfit:
             judgement.reservations.append(f"{RESERVATION}{found.controller}: {found.headline}")
 
 

@@ -194,10 +194,7 @@ def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
         return {
             "accepted": "The tables may be loaded, by the preflight list",
             "partial": "The tables may be loaded, by the preflight list, but much of the error is beyond this control",
-            "accepted_with_reservations": (
-                "The tables may be loaded, by the preflight list, with reservations: the model does not describe the "
-                "readings as well as their uncertainty asks for"
-            ),
+            "accepted_with_reservations": "The tables may be loaded, by the preflight list, with the reservations below",
             "better_after_new_setup": "Better only after the workpiece is set up anew",
             "rejected": "Do not load these tables",
         }[state]
