@@ -18,6 +18,7 @@ from compgen.cli.common import (
     stdout,
 )
 from compgen.cli.emphasis_options import emphasis_options
+from compgen.cli.fit_options import covariance_of
 from compgen.cli.options_commands import explain_option
 from compgen.cli.safety_options import active_options, limits_option
 from compgen.cli.sample_options import sample_options
@@ -201,7 +202,8 @@ def verify_command(
     where = read_points(points) if points else None
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     parsed, table = read_tables(machine, tables, controller), open_errors(errors)
-    result = verify(machine, parsed, table, where, reversal=both, limits=limits)
+    known = covariance_of(errors, table, None, independent=False)
+    result = verify(machine, parsed, table, where, reversal=both, limits=limits, covariance=known)
     write_all(out, verification_files(result))
     if as_json:
         print_json(result.summary())

@@ -194,17 +194,6 @@ def _result(
     )
     errors = error_table(layout, solution.state.errors, adjustment.covariance_factor())
     errors = errors.replace(metadata=metadata_of(layout.machine, deviations.metadata))
-    row, component = np.divmod(components.index[accepted], 3)
-    time = deviations.covariates.get("time_s")
-    labels = labels_of(deviations.labels, deviations.origin, deviations.position_mm)
-    series = Series(
-        residual_um=residual[accepted] / MM_PER_UM,
-        bare_um=None,
-        sigma_um=components.sigma_mm[accepted] / MM_PER_UM,
-        group=component,
-        labels={name: label[row] for name, label in labels.items()},
-        time_s=None if time is None or not np.isfinite(time).all() else time[row],
-    )
     return Identification(
         errors=errors,
         stations=(),
@@ -227,7 +216,26 @@ def _result(
         layout=layout,
         adjustment=adjustment,
         method="deviations",
-        misfit=misfit_of(chi_square, freedom, u_scale, components.source, series),
+        misfit=misfit_of(
+            chi_square, freedom, u_scale, components.source, lambda: _series(deviations, components, residual, accepted)
+        ),
+    )
+
+
+def _series(
+    deviations: Deviations, components: _Components, residual_mm: FloatArray, accepted: NDArray[np.bool_]
+) -> Series:
+    """Residuals of the components that were used, with what may explain them."""
+    row, component = np.divmod(components.index[accepted], 3)
+    labels = labels_of(deviations.labels, deviations.origin, deviations.position_mm)
+    time = deviations.covariates.get("time_s")
+    return Series(
+        residual_um=residual_mm[accepted] / MM_PER_UM,
+        bare_um=None,
+        sigma_um=components.sigma_mm[accepted] / MM_PER_UM,
+        group=component,
+        labels={name: label[row] for name, label in labels.items()},
+        time_s=None if time is None or not np.isfinite(time).all() else time[row],
     )
 
 

@@ -9,7 +9,7 @@ with the reversal put back: a step between two runs that came from opposite side
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -137,18 +137,19 @@ class Misfit:
 
 
 def misfit_of(
-    reduced_chi_square: float, degrees_of_freedom: int, scaled_by: float, source: str, series: Series | None = None
+    reduced_chi_square: float, degrees_of_freedom: int, scaled_by: float, source: str, series: Callable[[], Series]
 ) -> Misfit:
     """Judge the size of the residuals, and look for causes where it is beyond the limit.
 
-    ``series`` holds the readings that were used; None looks for no cause.
+    ``series`` makes the readings that were used, where they are looked at.
     """
     noise_alone = float(chdtri(degrees_of_freedom, FALSE_ALARM)) / degrees_of_freedom
     limit = noise_alone * (ASSUMED_FACTOR**2 if source == "assumed" else 1.0)
     found = Misfit(reduced_chi_square, degrees_of_freedom, limit, scaled_by, source)
-    if series is None or reduced_chi_square <= noise_alone:
+    if not reduced_chi_square > noise_alone:
         return found
-    return replace(found, causes=tuple(_causes(series)), series=series)
+    readings = series()
+    return replace(found, causes=tuple(_causes(readings)), series=readings)
 
 
 def warn_of_misfit(reduced_chi_square: float, u_source: str) -> None:

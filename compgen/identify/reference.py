@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
@@ -125,20 +124,21 @@ def _misfit(used: Lengths, found: Identification, reversal_mm: FloatArray | None
     adjustment = found.adjustment
     if adjustment is None:
         return None
+    figures = (found.reduced_chi_square, found.degrees_of_freedom, found.u_scale, found.u_source)
+    return misfit_of(*figures, lambda: _series(used, found, adjustment, reversal_mm))
+
+
+def _series(used: Lengths, found: Identification, adjustment: Adjustment, reversal_mm: FloatArray | None) -> Series:
+    """Residuals of the readings that were used, with what may explain them."""
     rows = found.accepted
     residual_mm = found.residual_mm[rows]
     labels = labels_of(used.labels, used.origin, used.position_mm, used.station)
-    series = Series(
+    time = used.covariates.get("time_s")
+    return Series(
         residual_um=residual_mm / MM_PER_UM,
         bare_um=None if reversal_mm is None else (residual_mm + reversal_mm[rows]) / MM_PER_UM,
         sigma_um=adjustment.sigma_mm / found.u_scale / np.sqrt(adjustment.weight[rows]) / MM_PER_UM,
         group=adjustment.group[rows],
         labels={name: label[rows] for name, label in labels.items()},
-        time_s=_times(used, rows),
+        time_s=None if time is None or not np.isfinite(time[rows]).all() else time[rows],
     )
-    return misfit_of(found.reduced_chi_square, found.degrees_of_freedom, found.u_scale, found.u_source, series)
-
-
-def _times(used: Lengths, rows: NDArray[np.bool_]) -> FloatArray | None:
-    time = used.covariates.get("time_s")
-    return None if time is None or not np.isfinite(time[rows]).all() else time[rows]

@@ -79,9 +79,9 @@ def _control(item: ControlFolder) -> dict[str, Any]:
         "verdict": VERDICTS[state],
         "headline": str(result.get("headline", "")),
         "volumetric": bool(result.get("volumetric", True)),
-        "measured": str(dict(result.get("measured", {})).get("text", "")),
-        "objections": [str(entry.get("text", "")) for entry in result.get("objections", []) if isinstance(entry, dict)],
-        "uncertainty": dict(result.get("after_uncertainty") or {}),
+        "measured": str(_mapping(result.get("measured")).get("text", "")),
+        "objections": [str(_mapping(entry).get("text", "")) for entry in result.get("objections") or []],
+        "uncertainty": dict(_mapping(result.get("after_uncertainty"))),
         "next_command": str(result.get("next_command") or ""),
         "format": item.manifest.get("format", ""),
         "evidence": item.manifest.get("evidence", ""),
@@ -107,6 +107,10 @@ def _control(item: ControlFolder) -> dict[str, Any]:
             for f in item.files
         ],
     }
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
 
 
 def _state(result: Mapping[str, Any]) -> str:
