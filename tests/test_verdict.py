@@ -5,6 +5,7 @@ import io
 import json
 import math
 import random
+import re
 import warnings
 from pathlib import Path
 
@@ -140,6 +141,17 @@ def test_a_drift_of_all_lengths_is_not_accepted(tmp_path):
     assert code == 1
     assert not result["accepted"]
     assert {item["code"] for item in result["objections"]} & {"drift", "step_between_runs"}
+
+
+def test_a_drift_that_a_reversal_hides_is_found_by_repeated_readings(tmp_path):
+    """10 um that die away within the first run; up and down in Z, it looks like a reversal of Z."""
+    path = changed_lengths(
+        tmp_path / "a.lengths.csv", lambda row: 0.01 * (1 - math.exp(-float(row["time_s"]) / 3000.0))
+    )
+    code, result, _ = run(tmp_path, path)
+    assert (code, result["accepted"]) == (1, False)
+    (text,) = (item["text"] for item in result["objections"] if item["code"] == "drift")
+    assert float(re.search(r"range of about ([\d.]+) um", text).group(1)) == pytest.approx(10.0, abs=1.0)
 
 
 def test_residuals_above_the_stated_uncertainty_alone_are_amber(tmp_path):

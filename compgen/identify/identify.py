@@ -15,6 +15,7 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
+from compgen.core.names import MM_PER_UM
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify.affine_start import affine_start
 from compgen.identify.covariance import with_systematic
@@ -23,7 +24,7 @@ from compgen.identify.grid_problem import GridProblem
 from compgen.identify.kernels import count_identification
 from compgen.identify.known_stations import HeldStations, KnownStations, hold, locate_stations, with_known_start
 from compgen.identify.located import TracerReadings
-from compgen.identify.misfit import EXPLAINS, Cause, labels_of, split_labels
+from compgen.identify.misfit import EXPLAINS, Cause, drift_of_repeats, labels_of, split_labels
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
 from compgen.identify.outcome import assemble
 from compgen.identify.outliers import belonging
@@ -93,7 +94,17 @@ def _with_causes(machine: Machine, lengths: Lengths, options: IdentifyOptions, f
         share = 1.0 - again.reduced_chi_square / misfit.reduced_chi_square
         if share > EXPLAINS:
             return replace(found, misfit=replace(misfit, causes=(Cause(code, text, round(share, 4)),)))
-    return found
+    drift_mm = drift_of_repeats(lengths)
+    again = None if drift_mm is None else _quietly(machine, _added(lengths, -drift_mm), options)
+    share = 0.0 if again is None else 1.0 - again.reduced_chi_square / misfit.reduced_chi_square
+    if drift_mm is None or share <= EXPLAINS:
+        return found
+    text = f"a drift with time over a range of about {float(np.ptp(drift_mm)) / MM_PER_UM:.3g} um"
+    return replace(found, misfit=replace(misfit, causes=(Cause("drift", text, round(share, 4)),)))
+
+
+def _added(lengths: Lengths, correction_mm: FloatArray) -> Lengths:
+    return replace(lengths, length_mm=lengths.length_mm + correction_mm)
 
 
 def _explained(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> str:
@@ -109,10 +120,15 @@ def _split_by(machine: Machine, lengths: Lengths, options: IdentifyOptions, labe
     setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
     _, number = np.unique(np.column_stack([setup, label]), axis=0, return_inverse=True)
     labels = {**lengths.labels, "setup": np.asarray(number, dtype=np.int64).ravel()}
+    return _quietly(machine, replace(lengths, labels=labels), options)
+
+
+def _quietly(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification | None:
+    """Identify without warnings; None where that fails."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CompgenWarning)
         try:
-            return _at_reference(machine, replace(lengths, labels=labels), options)
+            return _at_reference(machine, lengths, options)
         except CompgenError:
             return None
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from compgen.core.csvio import FloatArray
+from compgen.core.lengths import Lengths
 from compgen.errors import CompgenWarning
 
 IntArray = NDArray[np.int64]
@@ -32,6 +33,8 @@ EXPLAINS = 0.5
 READINGS_PER_PARAMETER = 10
 #: Degree of the polynomial in time that a drift is looked for with.
 DRIFT_DEGREE = 3
+#: Degree of the polynomial in time that repeated readings are compared with.
+REPEATS_DEGREE = 5
 #: Moments at which a step is tried.
 MOMENTS = 200
 #: Times the uncertainty from which the machine file or the units, and not the measurement, are in doubt.
@@ -82,9 +85,7 @@ class Series:
     @property
     def clock(self) -> FloatArray:
         """Time of each reading, scaled to -1 ... 1; the order of the rows where no time is known."""
-        time = np.arange(len(self.group), dtype=np.float64) if self.time_s is None else self.time_s
-        span = float(np.ptp(time))
-        return np.asarray(2.0 * (time - time.min()) / span - 1.0) if span > 0 else np.zeros(len(time))
+        return scaled_clock(np.arange(len(self.group)) if self.time_s is None else self.time_s)
 
 
 @dataclass(frozen=True)
@@ -264,6 +265,37 @@ def _drift(series: Series, value_um: FloatArray, clock: FloatArray) -> FloatArra
             weight = 1.0 / series.sigma_um[own]
             fitted[own] = design @ np.linalg.lstsq(weight[:, None] * design, weight * value_um[own], rcond=None)[0]
     return fitted
+
+
+def drift_of_repeats(lengths: Lengths) -> FloatArray | None:
+    """Return the drift of each station with time that repeated readings show, (n,), mm; None if too few are repeated.
+
+    Two readings of one station at one position differ by what drifted between them, whatever the machine's errors are. The
+    drift is a polynomial in time for each station, zero on average.
+    """
+    setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
+    keys = np.column_stack([np.round(lengths.position_mm, 4), lengths.station, setup])
+    _, first, stop = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    earlier = first[stop.ravel()]
+    time = lengths.covariates.get("time_s")
+    clock = scaled_clock(np.arange(len(lengths)) if time is None or not np.isfinite(time).all() else time)
+    design = np.polynomial.legendre.legvander(clock, REPEATS_DEGREE)[:, 1:]
+    drift = np.zeros(len(lengths))
+    for station in range(len(lengths.stations)):
+        rows = np.flatnonzero((lengths.station == station) & (earlier != np.arange(len(lengths))))
+        if len(rows) < READINGS_PER_PARAMETER * REPEATS_DEGREE:
+            return None
+        moved = lengths.length_mm[rows] - lengths.length_mm[earlier[rows]]
+        found = np.linalg.lstsq(design[rows] - design[earlier[rows]], moved, rcond=None)[0]
+        own = lengths.station == station
+        drift[own] = design[own] @ found - float(np.mean(design[own] @ found))
+    return drift
+
+
+def scaled_clock(time: NDArray[Any]) -> FloatArray:
+    """Moments (n,) scaled to -1 ... 1."""
+    span = float(np.ptp(time))
+    return np.asarray(2.0 * (time - time.min()) / span - 1.0) if span > 0 else np.zeros(len(time))
 
 
 def labels_of(
