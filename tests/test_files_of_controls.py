@@ -4,16 +4,19 @@ All texts are made up here in the form of the real ones; their numbers are worke
 """
 
 import json
+import re
 import shutil
 
 import numpy as np
 import pytest
 
+import compgen
 from compgen.cli import cli, run_command
 from compgen.controllers import controller_named
 from compgen.core.error_table import format_errors
 from compgen.core.machine import read_machine
 from compgen.core.points import Points
+from compgen.core.reversal import ReversalCurves
 from compgen.errors import CompgenWarning, InputError
 from compgen.export.render import load_format, render_files
 from compgen.verify import read_tables
@@ -481,3 +484,48 @@ def test_a_comp_file_without_a_letter_is_asked_about_and_a_wrong_type_is_refused
         read(tmp_path, POSITIONS, "linuxcnc-comp", "", "screwcompX.dat")
     with pytest.raises(InputError, match="these are trims .file type 1."):
         read(tmp_path, "0 0 0\n500 0.002 0.004\n950 0.001 0\n", "linuxcnc-comp", own, "screwcompX.dat")
+
+
+# --- ISG -------------------------------------------------------------------------------------------------------------
+
+
+def test_comments_of_any_language_do_not_keep_a_table_from_being_read(tmp_path):
+    text = "// gepr\u00fcft\nX EXX\n0.0 0.0\n950.0 0.019\n"
+    tables = read(tmp_path, text.encode("latin-1"), "isg-csv", name="volcomp0.csv")
+    assert added(machine_with(tmp_path), tables, [[475, 0, 0]])[0, 0] == pytest.approx(-9.5, abs=0.01)
+    assert any("not ASCII" in remark for remark in tables.remarks)
+    with pytest.raises(InputError):
+        read(tmp_path, text.replace("950.0 ", "950.0\u00a0").encode("latin-1"), "isg-csv", name="volcomp0.csv")
+    with pytest.raises(InputError, match="ASCII"):
+        read_tables(machine_with(tmp_path), tmp_path / "volcomp0.csv", "isg-csv")
+
+
+# --- tables of other axes stay where they are ------------------------------------------------------------------------
+
+
+def test_new_tables_keep_off_the_indices_of_other_axes(tmp_path, small_machine, small_errors):
+    """An archive with a table of a rotary axis at index 7 says so; with kept_tables nothing is written there."""
+    assert "kept_tables = [7]" in "\n".join(read(tmp_path, cec_archive()).remarks)
+    own = "[controllers.siemens-cec]\nkept_tables = [7, 1]\n"
+    assert "kept_tables = " not in "\n".join(read(tmp_path, cec_archive(), settings=own).remarks)
+    plain = compgen.export(small_machine, small_errors, "siemens-cec").files["NC_CEC.INI"]
+    kept = small_machine.with_setting("siemens-cec", "kept_tables", [0, 3, 7])
+    made = compgen.export(kept, small_errors, "siemens-cec")
+    text = made.files["NC_CEC.INI"]
+    assert not re.search(r"\$[A-Z_]+\[[037][],]", text)
+    assert len(re.findall("STEP", text)) == len(re.findall("STEP", plain))
+    paths = made.write(tmp_path / "out")
+    result = compgen.verify(kept, read_tables(kept, paths, "siemens-cec"), small_errors)
+    assert result.accepted and result.after.max_um < 1.0
+    other = small_machine.with_setting("siemens-cec", "kept_tables", [5])
+    judged = compgen.verify(other, read_tables(other, paths, "siemens-cec"), small_errors)
+    assert any("table 5" in reason and "kept_tables" in reason for reason in judged.reasons)
+
+
+def test_a_pair_of_one_direction_keeps_off_them_too(small_machine, small_errors):
+    reversal = ReversalCurves({(0, 0): compgen.Curve(np.zeros(1), np.array([-8e-3]), np.zeros(1))})
+    plain = compgen.export(small_machine, small_errors, "siemens-cec", reversal=reversal).files["NC_CEC.INI"]
+    last = max(int(index) for index in re.findall(r"STEP\[(\d+)\]", plain))
+    machine = small_machine.with_setting("siemens-cec", "kept_tables", [last])
+    text = compgen.export(machine, small_errors, "siemens-cec", reversal=reversal).files["NC_CEC.INI"]
+    assert f"$AN_CEC_STEP[{last}]" not in text and f"$AN_CEC_STEP[{last + 1}]" in text

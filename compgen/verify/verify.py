@@ -171,9 +171,13 @@ def _foreign_tables(
     """What the control's reader of other files makes of them; None for files of our own, which stay strict."""
     if any(_OWN_FILE.search(content[:4000]) for _, content in contents):
         return None
-    return control.parse_foreign(
-        machine, settings, [SourceFile(path, _any_text(content)) for path, content in contents]
-    )
+    sources = [SourceFile(path, _any_text(content)) for path, content in contents]
+    other = control.parse_foreign(machine, settings, sources)
+    if other is not None or all(source.text.isascii() for source in sources):
+        return other
+    # A control without a reader of other files: the comments may hold any character, the rest stays strict.
+    plain = [SourceFile(source.path, source.text.encode("ascii", "replace").decode()) for source in sources]
+    return control.parse(machine, settings, plain), ["comments hold characters that are not ASCII: passed over"]
 
 
 def _any_text(content: bytes) -> str:

@@ -25,6 +25,7 @@ from compgen.controllers.siemens.products import (
     NEGLIGIBLE_PRODUCT_MM,
     CecMap,
     CecTable,
+    beside_kept,
     folded_tables,
     labels_in,
     sum_into_axes,
@@ -136,16 +137,15 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         self, machine: Machine, settings: CecSettings, tables: CecTables, reversal: ReversalCurves
     ) -> CecTables:
         """Return the tables with a pair DIRECTION 1 and -1 for each reversal."""
-        return CecTables(
-            with_reversal_tables(
-                machine,
-                tables.tables,
-                reversal,
-                subtracts=settings.subtracts,
-                max_points=settings.max_points,
-                step_mm=settings.step_mm,
-            )
+        found = with_reversal_tables(
+            machine,
+            tables.tables,
+            reversal,
+            subtracts=settings.subtracts,
+            max_points=settings.max_points,
+            step_mm=settings.step_mm,
         )
+        return CecTables(beside_kept(found, settings.kept_tables))
 
     def context(self, machine: Machine, settings: CecSettings, tables: CecTables) -> dict[str, Any]:
         """Return tables, machine data and the sign with a number from the file."""
@@ -216,6 +216,10 @@ class SiemensCec(Controller[CecSettings, CecTables]):
     def violations(self, machine: Machine, settings: CecSettings, tables: CecTables) -> list[str]:
         """Return broken rules of the set, and sums above MD32720 or too fast for MD32730 if the file states them."""
         found = set_violations(machine, tables.tables, settings.max_points, settings.tables_available)
+        found += [
+            f"table {index} belongs to other axes (kept_tables of the machine file) and would be overwritten"
+            for index in sorted(set(tables.tables) & set(settings.kept_tables))
+        ]
         return found + stated_limit_violations(machine, tables.tables, settings)
 
     def other_readings(self, settings: CecSettings, tables: CecTables) -> dict[str, CecSettings]:
@@ -284,7 +288,8 @@ def cec_tables_of(
     """Return the tables of term values, rounded as written."""
     travel = [axis.range_mm for axis in machine.axes]
     mode = settings.mult_mode
-    return CecTables(folded_tables(terms, values, flip=settings.subtracts, mode=mode, travel_mm=travel))
+    tables = folded_tables(terms, values, flip=settings.subtracts, mode=mode, travel_mm=travel)
+    return CecTables(beside_kept(tables, settings.kept_tables))
 
 
 def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], settings: CecSettings) -> CecTables:
@@ -342,6 +347,10 @@ def foreign_cec_tables(given: Foreign, machine: Machine, settings: CecSettings, 
         else:
             apart.add(index)
             findings.apart.append(f"table {index} ({axes[0]} into {axes[1]}, up to {part.largest})")
+    if missing := sorted(apart - set(settings.kept_tables)):
+        findings.notes.append(
+            f"new tables would overwrite these: with kept_tables = {missing} in the machine file nothing is written there"
+        )
     _check_products(parts, set(found), apart, settings)
     if not found:
         listed = f"; of other axes: {'; '.join(findings.apart)}" if apart else ""

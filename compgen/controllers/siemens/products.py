@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,6 +104,16 @@ def sum_into_axes(tables: CecMap, mode: str, outputs: Mapping[int, FloatArray]) 
         for part in parts:
             totals[table.output_axis] = totals[table.output_axis] + part
     return totals
+
+
+def beside_kept(tables: CecMap, kept: Collection[int]) -> dict[int, CecTable]:
+    """Return the tables with other indices, so that none of the ``kept`` ones is used; multipliers follow."""
+    free = (index for index in count() if index not in kept)
+    place = {old: next(free) for old in sorted(tables)}
+    return {
+        place[old]: replace(entry, multiplier=place[entry.multiplier - 1] + 1 if entry.multiplier else 0)
+        for old, entry in sorted(tables.items())
+    }
 
 
 def term_names(tables: CecMap) -> set[str]:

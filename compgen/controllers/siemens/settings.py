@@ -59,6 +59,7 @@ class CecSettings:
     max_points : nodes that the control can hold per table.
     tables_available : tables that the control has, or None if that is not known.
     tables_reserved : tables of these that are kept free, e.g. for pairs of one direction.
+    kept_tables : indices of tables of other axes, which are never written.
     max_sum_mm : MD32720 of X, Y, Z in mm, or None if that is not stated.
     max_velo_percent : MD32730 of X, Y, Z in % of MD32000, or None if that is not stated.
     max_speed_mm_min : MD32000 of X, Y, Z; only their ratio matters.
@@ -77,6 +78,7 @@ class CecSettings:
     max_points: int
     tables_available: int | None
     tables_reserved: int
+    kept_tables: tuple[int, ...]
     max_sum_mm: tuple[float, float, float] | None
     max_velo_percent: tuple[float, float, float] | None
     max_speed_mm_min: tuple[float, float, float]
@@ -90,7 +92,10 @@ class CecSettings:
     @property
     def tables_usable(self) -> int | None:
         """How many tables the errors may take, None if no number is known."""
-        return None if self.tables_available is None else max(self.tables_available - self.tables_reserved, 1)
+        if self.tables_available is None:
+            return None
+        kept = sum(1 for index in self.kept_tables if index < self.tables_available)
+        return max(self.tables_available - self.tables_reserved - kept, 1)
 
 
 @dataclass(frozen=True)
@@ -144,6 +149,7 @@ def take_cec_settings(section: tomlio.Section, machine: Machine) -> CecSettings:
         max_points=max_points,
         tables_available=tables_available,
         tables_reserved=section.take("tables_reserved", tomlio.whole(0, 1000), 0),
+        kept_tables=section.take("kept_tables", _indices, ()),
         max_sum_mm=section.take("max_sum_mm", _per_axis, None),
         max_velo_percent=section.take("max_velo_percent", _per_axis, None),
         max_speed_mm_min=section.take("max_speed_mm_min", _per_axis, (1.0, 1.0, 1.0)),
@@ -176,6 +182,14 @@ def take_container(section: tomlio.Section) -> Container:
     if enables and kind == "ini":
         raise section.fail("program_enables", 'needs container = "program": an INI file switches nothing on')
     return Container(kind, enables)
+
+
+def _indices(value: Any) -> tuple[int, ...]:
+    """A list of different indices of tables."""
+    whole = tomlio.whole(0, 999)
+    if not isinstance(value, list) or len({whole(item) for item in value}) != len(value):
+        raise ValueError("a list of different table indices, e.g. [6, 7], is expected")
+    return tuple(sorted(value))
 
 
 def _per_axis(value: Any) -> tuple[float, float, float]:
