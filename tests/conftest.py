@@ -27,6 +27,8 @@ nodes = 5
 [axes.Z]
 range_mm = [-240.0, 0.0]
 nodes = 7
+[controllers.mitsubishi]
+mode = "incremental"
 [controllers.siemens-cec]
 sign = "error"
 mult_mode = "S1"
