@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from compgen.controllers import controller_named
 from compgen.core.csvio import FloatArray, format_csv
 from compgen.core.deviations import Deviations, format_deviations
 from compgen.core.error_table import Curve, ErrorTable, format_errors
-from compgen.core.files import OutputFolder, read_bytes, sha256_of
+from compgen.core.files import OutputFolder, read_bytes, sha256_of, working_folder
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
@@ -233,7 +232,7 @@ def _read_back(
     known: covariance.Covariance | None = None,
 ) -> Verification:
     """Verify what stands in the files after they were written; InputError if they cannot be read."""
-    with tempfile.TemporaryDirectory(prefix="compgen-") as staging:
+    with working_folder() as staging:
         written = exported.write(staging, accepted=True)
         try:
             tables = read_tables(machine, written, exported.controller)

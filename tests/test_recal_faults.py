@@ -24,6 +24,7 @@ import sqlalchemy as sa
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
+from compgen.core import files
 from compgen.recal import claims, database, fleet, publish, results, runner, schema
 from compgen.recal.claims import Claim, Renewal
 from compgen.recal.records import NewMeasurement, NewResult, TableFile
@@ -796,3 +797,40 @@ def test_runners_that_are_killed_from_outside_do_not_count_and_the_others_have_t
     store = site.store()
     assert store.attempts(store.machine("mill")) == []
     store.close()
+
+
+# --- what killed runs leave behind ------------------------------------------------------------------------------------
+
+
+def test_temporary_files_and_folders_of_killed_runs_are_removed_by_the_next_and_those_of_others_stay(
+    site, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    target = tmp_path / "tables" / "a.csv"
+    child = os.fork()
+    if child == 0:
+        with files.working_folder("test-") as folder:
+            (folder / "big").write_bytes(b"0" * 1000)
+            target.parent.mkdir()
+            files._write_temporary(target, b"half")
+            os.kill(os.getpid(), 9)
+    os.waitpid(child, 0)
+    (left,) = tmp_path.glob("compgen-test-*")
+    (half,) = target.parent.glob(".a.csv.*.tmp")
+    for path in (left / ".lock", half):
+        os.utime(path, (time.time() - 10,) * 2)
+    other = target.with_name(".a.csv.notes.tmp")
+    other.write_text("of somebody else")
+    with files.working_folder() as mine:  # whoever works keeps its own, however old it looks
+        alive = files._write_temporary(target, b"by this process")
+        for path in (mine / ".lock", alive):
+            os.utime(path, (time.time() - 10,) * 2)
+        site.measure()
+        assert site.run() == 0
+        files.write_file(target, "whole")
+        assert mine.is_dir() and alive.read_bytes() == b"by this process"
+    files._unlock(alive)
+    assert not left.exists() and not half.exists()
+    assert other.read_text() == "of somebody else"
+    assert target.read_text() == "whole"
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("compgen-")) == []

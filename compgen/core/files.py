@@ -7,13 +7,22 @@ import filecmp
 import hashlib
 import itertools
 import os
+import re
+import shutil
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from compgen.errors import InputError
 
 TEMPORARY = ".tmp"
+#: How temporary folders of the program begin, and the file by whose lock one sees that its process still runs.
+FOLDERS, LOCK = "compgen-", ".lock"
+#: What is newer may be about to be locked, s.
+NEW_S = 2.0
+#: Temporary files of this process, each with the open file that keeps its lock.
+_locks: dict[Path, int] = {}
 
 
 def sha256_of(content: bytes) -> str:
@@ -70,6 +79,7 @@ class OutputFolder:
         temporary: dict[str, Path] = {}
         made = _missing_folders(paths.values())
         try:
+            _remove_abandoned_files(paths.values())
             for path in paths.values():
                 path.parent.mkdir(parents=True, exist_ok=True)
                 if path.is_dir():
@@ -85,6 +95,9 @@ class OutputFolder:
         except BaseException:
             _remove([*temporary.values()], made)
             raise
+        finally:
+            for path in temporary.values():
+                _unlock(path)
         return paths
 
 
@@ -129,7 +142,9 @@ def _replace_all(moves: Sequence[tuple[Path, Path]]) -> None:
                 elif before is None:
                     target.unlink()
                 else:
-                    os.replace(_write_temporary(target, before), target)
+                    again = _write_temporary(target, before)
+                    os.replace(again, target)
+                    _unlock(again)
         raise
 
 
@@ -137,6 +152,9 @@ def _write_temporary(target: Path, content: bytes) -> Path:
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=TEMPORARY, dir=target.parent)
     path = Path(name)
     try:
+        kept = os.dup(handle)
+        _locks[path] = kept
+        _locked(kept)
         with os.fdopen(handle, "wb") as stream:
             stream.write(content)
             stream.flush()
@@ -144,8 +162,78 @@ def _write_temporary(target: Path, content: bytes) -> Path:
         path.chmod(0o666 & ~_umask())
     except BaseException:
         path.unlink(missing_ok=True)
+        _unlock(path)
         raise
     return path
+
+
+def _locked(handle: int) -> bool:
+    """Take the lock of an open file, which the system gives back when this process ends; False if another one has it."""
+    try:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:  # a system without such locks: nothing is ever taken for abandoned
+        return False
+    except OSError:
+        return False
+    return True
+
+
+def _unlock(path: Path) -> None:
+    handle = _locks.pop(path, None)
+    if handle is not None:
+        os.close(handle)
+
+
+def _abandoned(path: Path) -> bool:
+    """Whether the process that made a temporary file, or the lock of a folder, was killed: nobody keeps its lock."""
+    try:
+        if time.time() - path.lstat().st_mtime < NEW_S:
+            return False
+        handle = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+    except OSError:
+        return False
+    try:
+        return _locked(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove_abandoned_files(targets: Iterable[Path]) -> None:
+    """Remove what processes that were killed left of files with these names."""
+    names: dict[Path, set[str]] = {}
+    for target in targets:
+        names.setdefault(target.parent, set()).add(target.name)
+    for folder, own in names.items():
+        with contextlib.suppress(OSError):
+            for path in list(folder.iterdir()):
+                found = re.fullmatch(r"\.(.+)\.[a-z0-9_]{8}" + re.escape(TEMPORARY), path.name, re.DOTALL)
+                if found and found[1] in own and _abandoned(path):
+                    path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def working_folder(name: str = "") -> Iterator[Path]:
+    """Yield a temporary folder that is removed at the end, and by the next process if this one is killed."""
+    remove_abandoned_folders()
+    with tempfile.TemporaryDirectory(prefix=f"{FOLDERS}{name}") as text:
+        lock = os.open(Path(text) / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            _locked(lock)
+            yield Path(text)
+        finally:
+            os.close(lock)
+
+
+def remove_abandoned_folders() -> None:
+    """Remove this user's temporary folders whose processes were killed."""
+    with contextlib.suppress(OSError):
+        for path in Path(tempfile.gettempdir()).glob(f"{FOLDERS}*"):
+            with contextlib.suppress(OSError):
+                mine = not hasattr(os, "geteuid") or path.lstat().st_uid == os.geteuid()
+                if mine and path.is_dir() and not path.is_symlink() and _abandoned(path / LOCK):
+                    shutil.rmtree(path, ignore_errors=True)
 
 
 def _umask() -> int:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import tempfile
 from pathlib import Path
 
 import sqlalchemy as sa
 
+from compgen.core.files import working_folder
 from compgen.errors import InputError
 from compgen.recal import schema
 from compgen.recal.database import StoreError, first_line, retried, shown
@@ -83,10 +83,9 @@ def restore(path: Path, url: str) -> dict[str, int]:
     """
     if not path.is_file():
         raise InputError("no such backup", file=path)
-    with tempfile.TemporaryDirectory(prefix="compgen-restore-") as folder:
-        copy = (
-            Path(folder) / "copy.sqlite"
-        )  # a backup of an older program is upgraded, and may be on a read-only medium
+    with working_folder("restore-") as folder:
+        # a backup of an older program is upgraded, and may be on a read-only medium
+        copy = folder / "copy.sqlite"
         try:
             with path.open("rb") as stream:
                 if stream.read(len(MAGIC)) != MAGIC:

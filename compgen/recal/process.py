@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tempfile
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from compgen.core.files import read_bytes
+from compgen.core.files import FOLDERS, read_bytes, working_folder
 from compgen.core.machine import Machine, load_machine
 from compgen.errors import CompgenWarning, InputError
 from compgen.export import program_version
@@ -91,7 +90,7 @@ def process(
     machine = load_machine(job.machine)
     tables = store.tables(record)
     now = store.read(store.now)
-    with tempfile.TemporaryDirectory(prefix=FOLDER) as folder, warnings.catch_warnings(record=True) as caught:
+    with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
         paths = write_files(Path(folder) / "measurement", store.contents_of(measurement))

@@ -7,20 +7,18 @@ Open it with :func:`open_store`. Approval and rollback are in :mod:`compgen.reca
 from __future__ import annotations
 
 import os
-import tempfile
 import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
 from compgen.core.error_table import ErrorTable, read_errors
-from compgen.core.files import sha256_of
+from compgen.core.files import sha256_of, working_folder
 from compgen.core.machine import Machine, read_machine
 from compgen.errors import CompgenError, InputError
 from compgen.identify.covariance import Covariance, read_covariance
@@ -167,8 +165,8 @@ class Store:
         """Return the machine as its file described it when the errors were identified."""
         table = schema.machine_versions
         query = sa.select(table.c.sha256).where(table.c.id == identification.machine_version_id)
-        with tempfile.TemporaryDirectory(prefix="compgen-") as folder:
-            path = Path(folder) / "machine.toml"
+        with working_folder() as folder:
+            path = folder / "machine.toml"
             path.write_bytes(self.blob(self.read(lambda c: c.execute(query).scalar_one())))
             return replace(read_machine(path), source=None)
 
@@ -291,8 +289,8 @@ class Store:
         digest = identification.fitted_sha256 if fitted else identification.errors_sha256
         if digest is None:
             raise InputError("this identification keeps no fitted errors")
-        with tempfile.TemporaryDirectory(prefix="compgen-") as folder:
-            path = Path(folder) / "identified.errors.csv"
+        with working_folder() as folder:
+            path = folder / "identified.errors.csv"
             path.write_bytes(self.blob(digest))
             return read_errors(path)
 
@@ -300,8 +298,8 @@ class Store:
         """Return the joint covariance of the identified errors, None if there is none."""
         if identification.covariance_sha256 is None:
             return None
-        with tempfile.TemporaryDirectory(prefix="compgen-") as folder:
-            path = Path(folder) / "identified.covariance.npz"
+        with working_folder() as folder:
+            path = folder / "identified.covariance.npz"
             path.write_bytes(self.blob(identification.covariance_sha256))
             return read_covariance(path)
 
