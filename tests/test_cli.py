@@ -22,6 +22,7 @@ from compgen.cli.common import run_command
 from compgen.core.csvio import read_csv
 from compgen.core.error_table import format_errors
 from compgen.core.files import sha256_of
+from compgen.identify.covariance import Covariance, format_covariance, read_covariance
 from compgen.model.volumetric import c_matrix
 
 COMMANDS = sorted(cli.commands)
@@ -775,3 +776,45 @@ def test_control_characters_of_names_reach_no_terminal(name, capsys):
     said = capsys.readouterr().err
     assert name not in said
     assert name.encode("unicode_escape").decode() in said
+
+
+@pytest.mark.parametrize("value", ["1e300", "9e18", "-9e18", "1e308", "5e-324", "1e-300"])
+@pytest.mark.parametrize("where", ["range", "offset", "error", "u", "option"])
+def test_numbers_at_the_edge_are_bad_input_and_no_internal_error(
+    where, value, small_machine_file, small_machine, small_errors, tmp_path, capsys
+):
+    machine, errors = tmp_path / "m.toml", tmp_path / "e.errors.csv"
+    text, table = small_machine_file.read_text(), format_errors(small_errors)
+    options, expected = [], {2}
+    if where == "range":
+        text = text.replace("range_mm = [-300.0, 200.0]", f"range_mm = [-300.0, {value}]")
+    elif where == "offset":
+        text = text.replace("-80.0]", f"{value}]", 1)
+    elif where in ("error", "u"):
+        lines = table.splitlines()
+        row = next(k for k, line in enumerate(lines) if line.startswith("EXX,"))
+        cells = lines[row].split(",")
+        cells[2 if where == "error" else 3] = value
+        table = "\n".join([*lines[:row], ",".join(cells), *lines[row + 1 :]]) + "\n"
+        expected = {2} if float(value) > 1e15 or float(value) < 0 else {0, 1}  # next to nothing is nothing
+    elif where == "option":
+        options = ["--smoothness", value]
+    machine.write_text(text)
+    errors.write_text(table)
+    code = run_command(cli, ["fit", str(machine), str(errors), "--out", str(tmp_path / "out"), *options])
+    assert code in expected, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("value", [1e300, -9e18, np.inf, np.nan])
+def test_a_covariance_file_with_numbers_at_the_edge_is_refused(value, small_errors, tmp_path):
+    positions = {
+        name: small_errors.curves[name].position_mm if name in small_errors.curves else [np.nan]
+        for name in small_errors.names
+    }
+    names = tuple(name for name in small_errors.names for _ in positions[name])
+    joined = np.concatenate([positions[name] for name in small_errors.names])
+    made = Covariance(names, joined, (), np.zeros(0, dtype=np.int64), np.full((len(names), 2), value))
+    path = tmp_path / "identified.covariance.npz"
+    path.write_bytes(format_covariance(made, ""))
+    with pytest.raises(compgen.InputError, match="not finite, or above"):
+        read_covariance(path)

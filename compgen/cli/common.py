@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.text import Text
 
 from compgen.controllers import CONTROLLERS
+from compgen.core import tomlio
 from compgen.core.machine import Machine, load_machine
 from compgen.core.plugins import restored, why_missing
 from compgen.core.text import nearest, visible
@@ -53,6 +54,24 @@ PROGRAM_NAMES = ("compgen", "volcomp")
 STOPPED, READER_GONE = 130, 141
 #: Tables into a pipe or a file get the width that they need, not that of an unknown terminal.
 PIPE_WIDTH = None if sys.stdout.isatty() else 130
+
+
+class Number(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.4 on
+    """A finite number; zero, or of a size that a number in a file may have."""
+
+    name = "float"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number; wrong usage for anything else."""
+        try:
+            return tomlio.number(float(value))
+        except ValueError as error:
+            self.fail(
+                f"{value!r}: {error if str(error).startswith('a finite') else 'a number is expected'}", param, ctx
+            )
+
+
+NUMBER = Number()
 
 
 class Terminal(Console):

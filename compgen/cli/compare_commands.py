@@ -23,7 +23,7 @@ from compgen.accuracy.match import compare_prediction, compare_sides, with_predi
 from compgen.accuracy.pairing import ALIGN
 from compgen.accuracy.sides import Reader, Side, read_side
 from compgen.accuracy.straightness import LINES
-from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.cli.common import NUMBER, Command, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
@@ -66,12 +66,12 @@ def budget_options(command: Command) -> Command:
         return command(*args, machine=machine, budgets=budgets, **options)
 
     decorated: Any = click.option(
-        "--from-20-k", type=float, default=0.0, help="How far the axis was from 20 degC, K (default 0)."
+        "--from-20-k", type=NUMBER, default=0.0, help="How far the axis was from 20 degC, K (default 0)."
     )(wrapper)
     for name, text in reversed(BUDGET_HELP.items()):
         option = f"--u-{name.replace('_', '-')}"
         help_text = f"Axis runs: standard uncertainty {text} (default 0)."
-        decorated = click.option(option, f"u_{name}", type=float, default=0.0, help=help_text)(decorated)
+        decorated = click.option(option, f"u_{name}", type=NUMBER, default=0.0, help=help_text)(decorated)
     return decorated  # type: ignore[no-any-return]
 
 
@@ -99,7 +99,7 @@ def evaluation_options(command: Command) -> Command:
     constants = click.option(
         "--instrument", metavar="FILE", type=kind, help="Constants of a six-DOF instrument (TOML)."
     )
-    u_um = click.option("--u-deviation-um", type=float, help="Standard uncertainty of measured deviations, um.")
+    u_um = click.option("--u-deviation-um", type=NUMBER, help="Standard uncertainty of measured deviations, um.")
     axis = click.option(
         "--axis",
         type=click.Choice(AXES, case_sensitive=False),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.cli.common import NUMBER, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.cli.diagnose_batch import Asked, diagnose_each, diagnosed
 from compgen.cli.identify_commands import sixdof_option
 from compgen.cli.parallel_options import fleet_options
@@ -29,7 +29,7 @@ from compgen.errors import InputError
 @click.option("--effects", metavar="NAME,...", help="Look for these effects only; default: the whole catalogue.")
 @click.option("--add", "added", multiple=True, metavar="NAME", help="Add this effect whether it was found or not.")
 @sixdof_option
-@click.option("--u-um", type=float, help="Standard uncertainty of a reading, um; used where no line was repeated.")
+@click.option("--u-um", type=NUMBER, help="Standard uncertainty of a reading, um; used where no line was repeated.")
 @click.option(
     "--against",
     type=click.Path(path_type=Path),

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import Command
+from compgen.cli.common import NUMBER, Command
 from compgen.core.error_table import ErrorTable
 from compgen.core.files import read_bytes, sha256_of
 from compgen.errors import CompgenWarning, InputError
@@ -46,7 +46,7 @@ def fitting_options(command: Command) -> Command:
         value = "NAME=WAY" if key == "monotone" else "NAME=LIMIT"
         option = f"--{key.replace('_', '-')}"
         decorated = click.option(option, key, metavar=value, multiple=True, help=_HELP[key])(decorated)
-    return click.option("--smoothness", type=float, help=_HELP["smoothness"])(decorated)  # type: ignore[no-any-return]
+    return click.option("--smoothness", type=NUMBER, help=_HELP["smoothness"])(decorated)  # type: ignore[no-any-return]
 
 
 def _pairs(key: str, given: Sequence[str]) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import Command, json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.cli.common import NUMBER, Command, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.cli.fit_options import covariance_of, covariance_options, fitting_options
 from compgen.cli.parallel_options import fleet_options, mapper
 from compgen.cli.safety_options import active_options
@@ -82,10 +82,10 @@ def sixdof_option(command: Command) -> Command:
 def instrument_options(command: Command) -> Command:
     """Add what the user may say about the readings."""
     constant = click.option(
-        "--u-length-um", type=float, help="Constant part of the standard uncertainty of a length, um."
+        "--u-length-um", type=NUMBER, help="Constant part of the standard uncertainty of a length, um."
     )
     proportional = click.option(
-        "--u-length-um-per-m", type=float, help="Part of the standard uncertainty that grows with the length, um/m."
+        "--u-length-um-per-m", type=NUMBER, help="Part of the standard uncertainty that grows with the length, um/m."
     )
     keep = click.option("--keep-all", is_flag=True, help="Reject no reading, however far it is from the model.")
     return constant(proportional(keep(command)))
@@ -102,7 +102,7 @@ def systematic_options(command: Command) -> Command:
     decorated: Any = wrapper
     for name, key in reversed(SYSTEMATIC_OPTIONS):
         option = f"--u-{name.replace('_', '-')}"
-        decorated = click.option(option, type=float, default=0.0, help=SYSTEMATIC_HELP[key])(decorated)
+        decorated = click.option(option, type=NUMBER, default=0.0, help=SYSTEMATIC_HELP[key])(decorated)
     return decorated  # type: ignore[no-any-return]
 
 
@@ -117,7 +117,7 @@ def method_options(command: Command) -> Command:
         return command(*args, choices={**choices, **{name: options.pop(name) for name in names}}, **options)
 
     decorated: Any = click.option("--small-deviations", is_flag=True, help=METHOD_HELP["small_deviations"])(wrapper)
-    decorated = click.option("--u-deviation-um", type=float, help=METHOD_HELP["u_deviation_um"])(decorated)
+    decorated = click.option("--u-deviation-um", type=NUMBER, help=METHOD_HELP["u_deviation_um"])(decorated)
     for option, name, values in (
         ("--part-scale", "part_scale", ("known", "free")),
         ("--range", "travel", ("machine", "from-data")),

@@ -10,7 +10,7 @@ from typing import Any, cast
 import click
 import numpy as np
 
-from compgen.cli.common import json_option, machine_argument, out_option, print_json, progress, stdout
+from compgen.cli.common import NUMBER, json_option, machine_argument, out_option, print_json, progress, stdout
 from compgen.core.error_table import format_errors
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
@@ -50,8 +50,8 @@ Progress = Callable[[str], None]
     "--points", type=click.Path(path_type=Path), help="*.points.csv (mm); a point that stands twice is read twice."
 )
 @click.option("--grid", is_flag=True, help="All nodes of the machine as points, in place of --points.")
-@click.option("--u-length-um", type=float, help="Constant part of the standard uncertainty of a length, um.")
-@click.option("--u-length-um-per-m", type=float, help="Part of it that grows with the length, um/m.")
+@click.option("--u-length-um", type=NUMBER, help="Constant part of the standard uncertainty of a length, um.")
+@click.option("--u-length-um-per-m", type=NUMBER, help="Part of it that grows with the length, um/m.")
 @click.option("--suggest", "search", is_flag=True, help="Search better places for the stations.")
 @click.option(
     "--box", multiple=True, metavar="LABEL:XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX", help="Where a station may stand, mm."
@@ -70,7 +70,7 @@ Progress = Callable[[str], None]
     help=f"Arrangements that the search looks at (default: {DEFAULT_EVALUATIONS}).",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=1, help="Seed of the search (default: 1).")
-@click.option("--target-um", type=float, help="Propose the smallest trajectory whose worst u of E is below this, um.")
+@click.option("--target-um", type=NUMBER, help="Propose the smallest trajectory whose worst u of E is below this, um.")
 @out_option
 @json_option
 def plan_command(

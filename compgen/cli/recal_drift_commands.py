@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from compgen.cli.common import json_option, print_json, stdout
+from compgen.cli.common import NUMBER, json_option, print_json, stdout
 from compgen.cli.recal_commands import job_option, opened, recal
 from compgen.cli.recal_decision_commands import actor_of, who_option
 from compgen.errors import InputError
@@ -63,9 +63,9 @@ def _write(path: Path, drift: Drift) -> Path:
 @click.argument("machine")
 @click.option("--stations", required=True, metavar="FILE", help="Stations file of compgen plan or identify.")
 @click.option("--error", required=True, metavar="NAME", help="Error whose change is to be seen, e.g. EC0Y.")
-@click.option("--change", required=True, type=float, metavar="SIZE", help="Its size, um or urad.")
-@click.option("--power", default=0.9, show_default=True, type=float, help="Probability of seeing it.")
-@click.option("--confidence", default=0.95, show_default=True, type=float, help="1 - probability of a false alarm.")
+@click.option("--change", required=True, type=NUMBER, metavar="SIZE", help="Its size, um or urad.")
+@click.option("--power", default=0.9, show_default=True, type=NUMBER, help="Probability of seeing it.")
+@click.option("--confidence", default=0.95, show_default=True, type=NUMBER, help="1 - probability of a false alarm.")
 @click.option("--points", default=None, metavar="FILE", type=click.Path(path_type=Path), help="Write a points file.")
 @job_option
 @json_option

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from compgen.cli.common import (
+    NUMBER,
     controller_option,
     json_option,
     machine_argument,
@@ -64,7 +65,7 @@ class ManyAgainst(click.Command):
 @controller_option()
 @click.option("--controller-b", metavar="NAME", help="Control of set B; default: that of A.")
 @click.option("--points", type=click.Path(path_type=Path), help="*.points.csv (mm); default: a grid over the volume.")
-@click.option("--fail-above", type=float, metavar="UM", help="Exit code 1 if the largest difference exceeds UM um.")
+@click.option("--fail-above", type=NUMBER, metavar="UM", help="Exit code 1 if the largest difference exceeds UM um.")
 @out_option
 @json_option
 def diff_command(

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import Command
+from compgen.cli.common import NUMBER, Command
 from compgen.core.machine import Machine
 from compgen.errors import InputError
 from compgen.verify.active import ActiveTables, read_active
@@ -65,4 +65,4 @@ def limits_option(command: Command) -> Command:
             raise InputError(f"--max-step-um {max_step_um:g} is given; a number of um above zero is expected")
         return command(*args, limits=SafetyLimits(max_step_um), **options)
 
-    return click.option("--max-step-um", type=float, help=STEP_HELP)(wrapper)  # type: ignore[return-value]
+    return click.option("--max-step-um", type=NUMBER, help=STEP_HELP)(wrapper)  # type: ignore[return-value]

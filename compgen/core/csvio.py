@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from compgen.core.csvparse import CsvFile, parse_any, parse_plain
 from compgen.core.files import read_text
+from compgen.core.names import LARGEST, SMALLEST
 from compgen.core.text import doubled, nearest, one_line
 from compgen.errors import CompgenWarning, InputError
 
@@ -54,8 +55,8 @@ class CsvTable:
                 raise self.fail(row, column, "is empty; every row needs a label here")
         return list(cells)
 
-    def numbers(self, column: str, *, empty: float | None = None) -> FloatArray:
-        """Return a column as finite numbers, shape (rows,); empty cells become ``empty`` if that is given."""
+    def numbers(self, column: str, *, empty: float | None = None, most: float = LARGEST) -> FloatArray:
+        """Return a column as finite numbers up to ``most``, shape (rows,); empty cells become ``empty`` if it is given."""
         cells = self.columns[column]
         filled = list(cells) if empty is None else [cell or repr(empty) for cell in cells]
         try:
@@ -65,10 +66,13 @@ class CsvTable:
         together = "".join(filled)
         if "_" in together or not together.isascii():  # Python reads 1_000 and digits of other scripts; a file may not
             raise self._bad_number(column, filled)
-        if not np.isfinite(values).all():
-            row = next((k for k in range(len(cells)) if cells[k] and not math.isfinite(values[k])), None)
+        if not (np.abs(values) <= most).all():
+            row = next((k for k in range(len(cells)) if cells[k] and not abs(values[k]) <= most), None)
             if row is not None:
-                raise self.fail(row, column, f"{cells[row]!r} is not a finite number")
+                finite = math.isfinite(values[row])
+                what = f"is larger than {most:g}, which nothing here can be" if finite else "is not a finite number"
+                raise self.fail(row, column, f"{cells[row]!r} {what}")
+        values[np.abs(values) < SMALLEST] = 0.0  # nobody measured that, and its square would be no number
         return values
 
     def _bad_number(self, column: str, cells: Sequence[str]) -> InputError:
@@ -80,7 +84,7 @@ class CsvTable:
 
     def labels(self, column: str) -> NDArray[np.int64]:
         """Return a column of whole-number labels, shape (rows,)."""
-        values = self.numbers(column)
+        values = self.numbers(column, most=np.finfo(np.float64).max)
         wrong = np.flatnonzero((values != np.round(values)) | (np.abs(values) > _LARGEST_LABEL))
         if wrong.size:
             row = int(wrong[0])

@@ -28,6 +28,10 @@ ErrorSelection = Literal["observable", 17, 21] | tuple[str, ...]
 CHAINS: tuple[str, ...] = tuple(f"W{''.join(order)}T" for order in permutations("FXYZ"))
 
 
+#: Longest travel and offset of a machine, mm.
+MOST_MM = 1e6
+
+
 @dataclass(frozen=True)
 class Chain:
     """Kinematic chain from workpiece to tool, e.g. ``WFYXZT``; axes count 0, 1, 2 for X, Y, Z.
@@ -124,7 +128,7 @@ def read_machine(path: str | Path) -> Machine:
     name = root.take("name", tomlio.text)
     chain = root.take("chain", Chain)
     reference = root.take("squareness_reference", tomlio.choice("X", "Y"), "X")
-    tool_offset_mm = root.take("tool_offset_mm", tomlio.vector3, (0.0, 0.0, 0.0))
+    tool_offset_mm = root.take("tool_offset_mm", _offset, (0.0, 0.0, 0.0))
     reference_point_mm = root.take("reference_point_mm", tomlio.vector3, (0.0, 0.0, 0.0))
     errors: ErrorSelection = root.take("errors", _error_selection, "observable")
     curves = root.take("curves", tomlio.choice("linear", "cubic"), "linear")
@@ -161,8 +165,24 @@ def read_machine(path: str | Path) -> Machine:
     )
 
 
+def _travel(value: object) -> tuple[float, float]:
+    """Lower and upper end of the travel, mm."""
+    lower, upper = tomlio.interval(value)
+    if max(abs(lower), abs(upper)) > MOST_MM:
+        raise ValueError("a range within a kilometre of zero is expected; is the unit mm?")
+    return lower, upper
+
+
+def _offset(value: object) -> Vector3:
+    """A vector from one point of a machine to another, mm."""
+    x, y, z = tomlio.vector3(value)
+    if max(abs(x), abs(y), abs(z)) > MOST_MM:
+        raise ValueError("components of less than a kilometre are expected; is the unit mm?")
+    return x, y, z
+
+
 def _read_axis(section: tomlio.Section, curves: str) -> Axis:
-    range_mm = section.take("range_mm", tomlio.interval)
+    range_mm = section.take("range_mm", _travel)
     if "nodes_mm" in section or isinstance(section.data.get("nodes"), list):
         key = "nodes_mm" if "nodes_mm" in section else "nodes"
         nodes_mm = np.array(section.take(key, tomlio.ascending))

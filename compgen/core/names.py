@@ -8,6 +8,8 @@ from typing import Literal
 AXES = ("X", "Y", "Z")
 Kind = Literal["linear", "angular", "squareness"]
 
+#: Sizes of numbers that anybody gives, whatever their unit, but for zero: squares and quotients of them are numbers too.
+SMALLEST, LARGEST = 1e-30, 1e15
 MM_PER_UM = 1e-3
 RAD_PER_URAD = 1e-6
 

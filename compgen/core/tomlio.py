@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from compgen.core.files import read_text
+from compgen.core.names import LARGEST, SMALLEST
 from compgen.core.text import nearest, one_line
 from compgen.errors import InputError
 
@@ -181,9 +182,11 @@ def _refusal(check: Callable[[Any], Any], value: Any) -> str:
 
 
 def number(value: Any) -> float:
-    """A finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
+    """A finite number; zero, or of a size from SMALLEST to LARGEST, so that its square is one as well."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < math.inf:
         raise ValueError("a finite number is expected")
+    if not (value == 0 or SMALLEST <= abs(value) <= LARGEST):
+        raise ValueError(f"a finite number is expected: 0, or a size from {SMALLEST:g} to {LARGEST:g}")
     return float(value)
 
 

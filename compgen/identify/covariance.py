@@ -22,7 +22,7 @@ from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.files import read_bytes, sha256_of
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
-from compgen.core.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
+from compgen.core.names import ERROR_INDEX, LARGEST, SQUARENESS_NAMES, error_named
 from compgen.core.points import Points
 from compgen.errors import InputError
 from compgen.identify.parameters import ErrorParameters
@@ -333,8 +333,8 @@ def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covarianc
 
 
 def _check_numbers(source: Path, covariance: Covariance) -> None:
-    if not np.isfinite(covariance.factor).all():
-        raise InputError("the factor holds numbers that are not finite", file=source)
+    if not (np.abs(covariance.factor) <= LARGEST).all():
+        raise InputError(f"the factor holds numbers that are not finite, or above {LARGEST:g}", file=source)
     for name in dict.fromkeys(covariance.error):
         position = covariance.position_mm[np.array(covariance.error) == name]
         if name in SQUARENESS_NAMES:
