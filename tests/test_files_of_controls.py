@@ -166,6 +166,14 @@ def test_what_could_change_a_table_and_is_not_understood_is_refused_with_its_lin
     assert caught.value.line and caught.value.file.name == "control.arc"
 
 
+def test_an_archive_that_was_cut_within_its_machine_data_is_refused(tmp_path):
+    content = cec_archive()
+    cut = content[: content.index(b"N32710 $MA_CEC_ENABLE[AX2]")]
+    with pytest.raises(InputError, match="the archive ends within INITIAL.INI: it was cut") as caught:
+        read(tmp_path, cut)
+    assert caught.value.line
+
+
 def test_an_inch_control_is_refused(tmp_path):
     with pytest.raises(InputError, match="SCALING_SYSTEM_IS_METRIC"):
         read(tmp_path, cec_archive(initial=INITIAL.replace("IS_METRIC=1", "IS_METRIC=0")))

@@ -117,6 +117,11 @@ class _Part:
     lines: tuple[tuple[int, str], ...]
 
     @property
+    def has_end(self) -> bool:
+        """Whether some line is an end mark."""
+        return any(_END_WORD.fullmatch(line.partition(";")[0].strip().upper()) for _, line in self.lines)
+
+    @property
     def writes_tables(self) -> bool:
         """Whether some line, comments aside, gives a table a value."""
         return any(_WRITES_TABLE.match(line.upper()) for _, line in self.lines)
@@ -151,6 +156,11 @@ def foreign_assignments(files: Sequence[SourceFile], tables: Mapping[str, int], 
         archive = len(parts) > 1
         for part in _with_data(source, parts, findings):
             beside = archive and not part.writes_tables
+            if archive and part is parts[-1] and part.kind == "INI" and not part.has_end:
+                message = (
+                    f"the archive ends within {part.name}.{part.kind}: it was cut, and its switches are not all there"
+                )
+                raise source.fail(message, part.lines[-1][0])
             for item in _assignments(source, part, tables, findings, archive=archive):
                 key = item.variable, item.index
                 if item.variable in SWITCHES:
