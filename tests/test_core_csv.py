@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import compgen
 from compgen.core import files
-from compgen.core.csvio import fixed, format_csv, read_csv
+from compgen.core.csvio import csv_table, fixed, format_csv, read_csv
 from compgen.core.files import OutputFolder, read_bytes, read_text, write_file
 from compgen.core.points import Points, format_points, read_points
 from compgen.errors import CompgenWarning, InputError
+from compgen.identify.evidence import format_residuals
 
 
 @pytest.fixture
@@ -402,3 +404,13 @@ def test_reading_a_good_file_warns_of_nothing(saved):
         warnings.simplefilter("error")
         table = read_csv(saved("name,value\na,1\n"), ["name", "value"])
     assert len(table) == 1
+
+
+def test_no_label_of_the_residuals_is_a_formula_for_a_spreadsheet(small_machine, small_lengths_file, tmp_path):
+    text = small_lengths_file.read_text().replace("\nS1,", "\n=HYPERLINK(1),").replace("\nS2,", "\n@S2,")
+    path = tmp_path / "x.lengths.csv"
+    path.write_text(text)
+    lengths = compgen.read_lengths(path)
+    found = format_residuals(small_machine, lengths, compgen.identify(small_machine, lengths))
+    table = csv_table(tmp_path / "residuals.csv", found, ("station", "residual_um"), ("used", "x_mm", "y_mm", "z_mm"))
+    assert {"'=HYPERLINK(1)", "'@S2", "S3", "S4"} == set(table.text("station"))

@@ -256,6 +256,15 @@ def _template(values: Sequence[str] | FloatArray, digits: int) -> tuple[str, Seq
     return f"%.{digits}f", numbers.tolist()
 
 
+def for_people(cells: Iterable[str]) -> list[str]:
+    """Return labels as a file has them that people open with a spreadsheet: none is taken for a formula.
+
+    >>> for_people(["S1", "=1+1", "-A"])
+    ['S1', "'=1+1", "'-A"]
+    """
+    return [f"'{cell}" if cell[:1] in ("=", "+", "-", "@") else cell for cell in cells]
+
+
 def _quoted(cell: str) -> str:
     flat = " ".join(cell.split())
     return '"' + flat.replace('"', '""') + '"' if any(char in flat for char in ',"#') else flat
