@@ -156,7 +156,7 @@ static int tool_offset(double t[3])
     static long long last;
     const long long now = rtapi_get_time();
     const double usual = table.unit == VOLCOMP_INCH ? VOLKINS_RATE / 25.4 : VOLKINS_RATE;
-    const double step = (*pins->rate > 0 ? *pins->rate : usual) * 1e-9 * (double) (now - last);
+    const double step = (*pins->rate > 0 ? *pins->rate : usual) * 0.000000001 * (double) (now - last);
     const int first = last == 0;
     int k, left = 0;
     for (k = 0; k < 3; k++)
