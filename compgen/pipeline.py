@@ -216,14 +216,12 @@ def export_and_verify(
     OutputFolder(folder)
     exported = export(machine, fitted, controller, **export_options)
     reversal: ReversalCurves | None = export_options.get("reversal")
-    verification = _read_back(machine, exported, identified, reversal, limits)
-    reasons = tuple(dict.fromkeys([*verification.reasons, *exported.violations]))
-    verification = replace(verification, reasons=reasons)
+    verification = verified_export(machine, exported, identified, reversal, limits)
     beside = check_files(machine, exported, identified, export_options.get("templates"), reversal)
     return _write_results(OutputFolder(folder), {"": (exported, verification, beside)})[0][0]
 
 
-def _read_back(
+def verified_export(
     machine: Machine,
     exported: Export,
     identified: ErrorTable,
@@ -231,7 +229,10 @@ def _read_back(
     limits: SafetyLimits | None = None,
     known: covariance.Covariance | None = None,
 ) -> Verification:
-    """Verify what stands in the files after they were written; InputError if they cannot be read."""
+    """Verify what stands in the files after they were written; InputError if they cannot be read.
+
+    What the export itself could not hold (a limit that binds) is a reason too.
+    """
     with working_folder() as staging:
         written = exported.write(staging, accepted=True)
         try:
@@ -240,7 +241,8 @@ def _read_back(
             name = Path(error.file).name if error.file else None
             message = f"the rendered file cannot be read back, so its template is wrong: {error.message}"
             raise InputError(message, file=name, line=error.line) from error
-        return verify(machine, tables, identified, reversal=reversal, limits=limits, covariance=known)
+        result = verify(machine, tables, identified, reversal=reversal, limits=limits, covariance=known)
+        return replace(result, reasons=tuple(dict.fromkeys([*result.reasons, *exported.violations])))
 
 
 def _with_objections(verification: Verification, identification: Identification, *, allow_misfit: bool) -> Verification:
@@ -388,7 +390,7 @@ def run(
             provenance=provenance,
             reversal=reversal,
         )
-        verification = _read_back(machine, exported, identification.errors, reversal, checks.get("limits"), known)
+        verification = verified_export(machine, exported, identification.errors, reversal, checks.get("limits"), known)
         verification = _with_objections(verification, identification, allow_misfit=checks.get("allow_misfit", False))
         if any(item.code in MISFIT_CODES for item in verification.objections):
             verification = replace(verification, next_command=_diagnosis_of(machine, measurements, folder))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -29,9 +30,9 @@ from compgen.core.points import format_points, read_points
 from compgen.core.reversal import read_reversal
 from compgen.effects import effects_reversal
 from compgen.errors import CompgenWarning
-from compgen.export import export
+from compgen.export import REJECTED_PREFIX, export
 from compgen.imports import open_errors
-from compgen.pipeline import provenance_of, write_all
+from compgen.pipeline import provenance_of, verified_export, write_all
 from compgen.report.explain_text import explanation_markdown
 from compgen.report.text import verification_table
 from compgen.verify import read_tables, residuals, verify
@@ -65,6 +66,7 @@ def reversal_option(command: Command) -> Command:
 @reversal_option
 @active_options()
 @explain_option
+@click.option("--no-verify", is_flag=True, help="Do not read the files back and verify them.")
 @json_option
 def export_command(
     machine: Machine,
@@ -76,12 +78,14 @@ def export_command(
     reversal: Path | None,
     active: ActiveTables | None,
     explain: bool,
+    no_verify: bool,
     as_json: bool,
 ) -> int:
     """Export errors to the files of a control, with manifest.json and preflight.md.
 
     ERRORS is an *.errors.csv file (um, urad), usually the fitted one, or the exchange file of a laser tracer's software
-    (Etalon, variant Vendor; mm, rad). Files that break a limit of the control are
+    (Etalon, variant Vendor; mm, rad). The files are read back and verified against ERRORS as `verify` does it, with
+    result.json and volume.csv beside them. Files that are not acceptable, or break a limit of the control, are
     written as NOT-ACCEPTED-... (exit code 1). check/check-program.md says what to read at five positions of the machine.
     With --active ERRORS are those of the machine with its old tables; bare.errors.csv gets those without.
 
@@ -108,20 +112,32 @@ def export_command(
     explanation = explained(machine, table, exported, reversal=both, templates=templates) if explain else None
     if explanation is not None:
         beside["explain.md"] = explanation_markdown(explanation)
-    paths = exported.write(out, beside=beside)
+    reasons: tuple[str, ...] = tuple(exported.violations)
+    if not no_verify:
+        verification = verified_export(machine, exported, table, both)
+        reasons = verification.reasons
+        prefix = REJECTED_PREFIX if reasons else ""
+        named = tuple((prefix + name, digest) for name, digest in verification.files)
+        beside |= verification_files(replace(verification, files=named))
+    paths = exported.write(out, accepted=not reasons, beside=beside)
     for text in exported.warnings:
         stderr.print(f"warning: {text}", style="yellow", markup=False, soft_wrap=True)
-    for text in exported.violations:
+    for text in reasons:
         stderr.print(f"not acceptable: {text}", style="red", markup=False, soft_wrap=True)
     if as_json:
-        own = {"accepted": not exported.violations, "paths": [str(path) for path in paths]}
+        own = {
+            "accepted": not reasons,
+            "verified": not no_verify,
+            "reasons": list(reasons),
+            "paths": [str(path) for path in paths],
+        }
         print_json({**exported.manifest, **own, **({"explain": explanation.as_dict()} if explanation else {})})
     else:
         if explanation is not None:
             stdout.print(beside["explain.md"], markup=False, soft_wrap=True)
         for path in paths:
             stdout.print(f"  {path}", markup=False, soft_wrap=True)
-    return 1 if exported.violations else 0
+    return 1 if reasons else 0
 
 
 @click.command("read")

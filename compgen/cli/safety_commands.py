@@ -36,7 +36,7 @@ from compgen.report.safety_text import crash_table, difference_table, merge_text
 from compgen.report.text import verification_table
 from compgen.verify import read_tables
 from compgen.verify.active import read_active
-from compgen.verify.crash_test import CrashTest, crash_test
+from compgen.verify.crash_test import ENTRIES, CrashTest, crash_test
 from compgen.verify.diff import TableDifference, difference
 from compgen.verify.merge import merge_report, merged_errors
 from compgen.verify.safety import SafetyLimits
@@ -185,13 +185,24 @@ def merge_command(
     metavar="NAME",
     help="Name of a control, may be given several times; default: all that the machine file has the settings for.",
 )
+@click.option(
+    "--entries",
+    type=click.IntRange(0, 1_000_000),
+    default=ENTRIES,
+    show_default=True,
+    metavar="N",
+    help="How many numbers of each control's tables are changed, one at a time, spread evenly over all of them.",
+)
 @json_option
-def crash_test_command(machine: Machine, errors: Path, controllers: tuple[str, ...], as_json: bool) -> int:
+def crash_test_command(
+    machine: Machine, errors: Path, controllers: tuple[str, ...], entries: int, as_json: bool
+) -> int:
     """Feed wrong tables to the verification: signs, axes and units, and see that each is rejected.
 
     ERRORS is an *.errors.csv file (um, urad). Tried are the 47 wrong signed permutations of the axes, of the
-    correction and of the whole frame, um for mm, degrees for radians, errors for corrections. Nothing is written. Exit
-    code 1 if any wrong table is accepted, or the right one is not.
+    correction and of the whole frame, um for mm, degrees for radians, errors for corrections, and single numbers of the
+    tables, each changed so that the tip moves by more than 1 um and 3 % of the largest correction without its linear
+    part. Nothing is written. Exit code 1 if any wrong table is accepted, or the right one is not.
 
     \b
     Example:
@@ -202,7 +213,7 @@ def crash_test_command(machine: Machine, errors: Path, controllers: tuple[str, .
     with progress(quiet=as_json) as show:
         for name in _usable(machine, controllers):
             show(f"trying wrong tables: {name}")
-            results.append(crash_test(machine, table, name))
+            results.append(crash_test(machine, table, name, entries))
     passed = all(item.passed for item in results)
     if as_json:
         data: dict[str, Any] = {item.controller: item.summary() for item in results}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations
+from itertools import permutations, product
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from compgen.core import tomlio
 from compgen.core.csvio import FloatArray
-from compgen.core.emphasis import Emphasis, take_emphasis
+from compgen.core.emphasis import Emphasis, Interval, take_emphasis
 from compgen.core.emphasis import Vector3 as Vector3
 from compgen.core.names import AXES, ERROR_NAMES
 from compgen.core.text import nearest
@@ -24,6 +24,10 @@ Reference = Literal["X", "Y"]
 CurveBasis = Literal["linear", "cubic"]
 ErrorSelection = Literal["observable", 17, 21] | tuple[str, ...]
 
+ToolRange = tuple[Interval, Interval, Interval]
+
+#: How far the tool may reach beyond the machine's own offset in X, Y and Z where no file says it, mm.
+ASSUMED_TOOL_MM: Vector3 = (100.0, 100.0, 200.0)
 #: The 24 valid chains: W, every order of X, Y, Z and F, then T.
 CHAINS: tuple[str, ...] = tuple(f"W{''.join(order)}T" for order in permutations("FXYZ"))
 
@@ -81,7 +85,8 @@ class Machine:
 
     ``errors`` is ``"observable"``, 17, 21 or a tuple of names (resolved by :func:`compgen.model.modelled_errors`).
     ``controllers`` keeps the raw settings of each control; the control itself checks them. ``emphasis`` says where
-    tables have to be best that cannot be good everywhere. ``effects`` keeps the raw ``[effects.NAME]`` sections, which
+    tables have to be best that cannot be good everywhere. ``tool_range_mm`` are the tool offsets that the machine may
+    carry, None if its file does not say. ``effects`` keeps the raw ``[effects.NAME]`` sections, which
     :func:`compgen.effects.active_effects` reads.
     """
 
@@ -97,6 +102,27 @@ class Machine:
     source: Path | None = None
     emphasis: Emphasis = Emphasis()
     effects: Mapping[str, tomlio.Section] = field(default_factory=dict)
+    tool_range_mm: ToolRange | None = None
+
+    @property
+    def tool_range(self) -> ToolRange:
+        """Ranges of the tool offset in X, Y and Z, mm, from the machine file, or assumed around its own offset."""
+        if self.tool_range_mm is not None:
+            return self.tool_range_mm
+        x, y, z = ((own - reach, own + reach) for own, reach in zip(self.tool_offset_mm, ASSUMED_TOOL_MM, strict=True))
+        return x, y, z
+
+    @property
+    def tool_range_text(self) -> str:
+        """:attr:`tool_range` in words, and whether it was assumed."""
+        parts = [f"{axis} {low:g} ... {high:g}" for axis, (low, high) in zip(AXES, self.tool_range, strict=True)]
+        assumed = " (assumed; state tool_range_mm in the machine file)" if self.tool_range_mm is None else ""
+        return f"tool offsets {', '.join(parts)} mm{assumed}"
+
+    @property
+    def tool_corners_mm(self) -> list[Vector3]:
+        """Tool offsets at the corners of :attr:`tool_range`, each once."""
+        return list(dict.fromkeys(product(*self.tool_range)))
 
     @property
     def lower_mm(self) -> FloatArray:
@@ -147,6 +173,7 @@ def read_machine(path: str | Path) -> Machine:
                 f"{axis_name} = {reference_mm:g} mm lies outside the travel {low:g} ... {high:g} mm; the "
                 f"position-dependent errors are zero there, so it must lie within the travel; set reference_point_mm",
             )
+    tool_range_mm = _take_tool_range(root, tool_offset_mm)
     emphasis = take_emphasis(root, [axis.range_mm for axis in axes])
     root.finish()
     return Machine(
@@ -162,6 +189,7 @@ def read_machine(path: str | Path) -> Machine:
         source=Path(path),
         emphasis=emphasis,
         effects=effects,
+        tool_range_mm=tool_range_mm,
     )
 
 
@@ -178,6 +206,16 @@ def _offset(value: object) -> Vector3:
     x, y, z = tomlio.vector3(value)
     if max(abs(x), abs(y), abs(z)) > MOST_MM:
         raise ValueError("components of less than a kilometre are expected; is the unit mm?")
+    return x, y, z
+
+
+def _take_tool_range(root: tomlio.Section, own_mm: Vector3) -> ToolRange | None:
+    """Take ``tool_range_mm``: ranges of the tool offset; an axis that is not named has the machine's own offset."""
+    if "tool_range_mm" not in root:
+        return None
+    section = root.section("tool_range_mm")
+    x, y, z = (section.take(axis, tomlio.interval, (own, own)) for axis, own in zip(AXES, own_mm, strict=True))
+    section.finish()
     return x, y, z
 
 

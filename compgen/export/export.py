@@ -10,7 +10,6 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from compgen.controllers import AnyController, SourceFile, controller_named
-from compgen.controllers.base import Term
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable, format_errors
 from compgen.core.files import OutputFolder, sha256_of
@@ -23,7 +22,7 @@ from compgen.errors import InputError
 from compgen.export.companions import companion_files, errors_context
 from compgen.export.render import Format, load_format, render, render_files
 from compgen.export.superseded import MANIFEST, REJECTED_PREFIX, set_aside_superseded
-from compgen.export.synthesis import synthesize
+from compgen.export.synthesis import Projector, best_values, projector
 
 
 def program_version() -> str:
@@ -143,7 +142,8 @@ def export(
     settings = control.read_settings(machine)
     card = usable_format(controller, templates, allow_unverified=allow_unverified)
     basis = control.basis(machine, settings, errors)
-    tables = control.build(machine, settings, basis, _table_values(control, machine, settings, errors, basis))
+    solver = projector(machine, basis, anchored=control.anchored)
+    tables = control.build(machine, settings, basis, table_values(control, machine, settings, errors, solver))
     rest = reversal
     if reversal is not None:
         held = control.reversal_in_tables(settings, reversal)
@@ -167,14 +167,26 @@ def export(
     return Export(controller, files, manifest, preflight, violations, own["warnings"], companions)
 
 
-def _table_values(
-    control: AnyController, machine: Machine, settings: Any, errors: ErrorTable, basis: Sequence[Term]
+def table_values(
+    control: AnyController,
+    machine: Machine,
+    settings: Any,
+    errors: ErrorTable,
+    solver: Projector,
+    plain: FloatArray | None = None,
 ) -> dict[str, FloatArray]:
+    """Return the best values of a control's tables by term, before rounding.
+
+    ``plain`` may give what :func:`compgen.export.synthesis.best_values` says of the solver alone, if it is known.
+    """
+
     def applied(values: Mapping[str, FloatArray], points: Points) -> FloatArray:
-        return control.emulate(machine, settings, control.build(machine, settings, basis, values), points)
+        return control.emulate(machine, settings, control.build(machine, settings, solver.basis, values), points)
 
     how = applied if control.finite_rotations else None
-    return synthesize(machine, errors, basis, anchored=control.anchored, at_axes=control.at_axes, applied=how)
+    if plain is None or how is not None or control.at_axes:
+        plain = best_values(machine, errors, solver, at_axes=control.at_axes, applied=how)
+    return solver.by_name(plain)
 
 
 def _described(files: Mapping[str, str]) -> list[dict[str, str]]:

@@ -19,6 +19,7 @@ KINDS = {
     "frame": "signed axes of the frame",
     "unit": "units",
     "errors": "errors",
+    "entry": "single entries",
 }
 #: Components of a difference beyond this number stand in diff.json only.
 MOST_COMPONENTS = 12

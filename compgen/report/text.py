@@ -197,7 +197,8 @@ def verification_table(results: Sequence[Verification]) -> Group:
         "before, after: as it stands, the reference point fixed; before*, after*: the best-fit rigid motion of the "
         "workpiece taken out; not held: the largest error that no table of this control can express"
     )
-    return Group(table, Text(legend), *notes)
+    judged = dict.fromkeys(f"every entry was judged with the machine's tool and {item.tools}" for item in results)
+    return Group(table, Text(legend), *(Text(text) for text in judged), *notes)
 
 
 def run_json(result: RunResult) -> dict[str, Any]:

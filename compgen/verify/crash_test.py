@@ -8,6 +8,9 @@ Wrong ones at the level of the **emulated correction** c(p), that is after the t
 
 Wrong ones at the level of the **errors** that tables are made of, exported and parsed anew: degrees for radians in both
 directions, and the errors in place of the correction.
+
+Wrong ones at the level of the **numbers** of the parsed tables: one number that depends on the errors is changed so that
+the tip moves by a little more than the goal of one entry (``Judge.goal_mm``), with the machine's own tool or any other.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +31,19 @@ from compgen.core.names import AXES, MM_PER_UM, error_named
 from compgen.core.points import Points
 from compgen.errors import CompgenError
 from compgen.export import export
+from compgen.verify.entries import entry_check, numbers_of, with_number
 from compgen.verify.judge import COMPONENT_FLOOR_MM, Judge, judge_of
-from compgen.verify.verify import ReadTables
+from compgen.verify.verify import ReadTables, reasons_against
 
 Correction = Callable[[FloatArray], FloatArray]
 #: Outcomes of one trial.
 REJECTED, SAME, ACCEPTED = "rejected", "same", "ACCEPTED"
+#: Numbers of the tables that are changed one at a time, if not said otherwise.
+ENTRIES = 24
+#: Part of the goal that a changed number exceeds it by.
+BEYOND_GOAL = 0.05
+#: Changes by which it is found out what a number does, in its own unit (mm, rad, um, counts), and the least that says it.
+TRIALS, LEAST_MOVED_MM = (1e-6, 1e-3, 1.0), 1e-7
 
 
 @dataclass(frozen=True)
@@ -113,13 +123,14 @@ def exported_tables(machine: Machine, errors: ErrorTable, controller: str) -> Re
     return ReadTables(control, settings, control.parse(machine, settings, sources), ())
 
 
-def crash_test(machine: Machine, errors: ErrorTable, controller: str) -> CrashTest:
+def crash_test(machine: Machine, errors: ErrorTable, controller: str, entries: int = ENTRIES) -> CrashTest:
     """Hold every wrong variant of a control's tables against the errors.
 
     Parameters
     ----------
     machine, errors : the errors (mm, rad) that the tables are made of and judged against.
     controller : name of the control.
+    entries : how many numbers of the tables are changed, spread evenly over all that depend on the errors.
     """
     control = controller_named(controller)
     judge = judge_of(machine, control, errors)
@@ -136,6 +147,7 @@ def crash_test(machine: Machine, errors: ErrorTable, controller: str) -> CrashTe
     ]
     trials = [court.trial(kind, name, wrong) for kind, name, wrong in _wrong_corrections(machine, correction)]
     trials += [court.exported(name, wrong, controller) for name, wrong in _wrong_errors(errors)]
+    trials += _entry_trials(machine, judge, right, entries)
     return CrashTest(controller, tuple(trials), tuple(baseline), visible_mm / MM_PER_UM)
 
 
@@ -170,6 +182,40 @@ class _Court:
             return self.trial("errors", name, lambda part: _from_below(self.machine, tables, part), found)
         except (CompgenError, OverflowError) as error:
             return Trial("errors", name, REJECTED, math.inf, f"cannot be exported: {error}")
+
+
+def _entry_trials(machine: Machine, judge: Judge, right: ReadTables, most: int) -> Iterator[Trial]:
+    """Change one number at a time, by a little more than the goal; what cannot move the tip by so much is left out."""
+    depends = entry_check(machine, judge, right).depends
+    places = [(place, int(k)) for place, part in depends.items() for k in np.flatnonzero(part)]
+    picked = np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int))
+    position_mm = np.vstack([judge.grid.position_mm, judge.line_mm])
+    corners_mm = np.array(machine.tool_corners_mm)[np.arange(len(judge.line_mm)) % len(machine.tool_corners_mm)]
+    points = [Points(judge.line_mm, corners_mm)]
+    for side in (1.0, -1.0) if right.controller.bidirectional else (1.0,):
+        points.append(Points(position_mm, approach=np.full_like(position_mm, side)))
+    before = np.vstack([right.correction(machine, part) for part in points])
+    numbers = numbers_of(right.tables)
+
+    def changed(place: str, k: int, step: float) -> tuple[ReadTables, float]:
+        tables = replace(right, tables=with_number(right.tables, place, k, step))
+        after = [tables.correction(machine, part) for part in points]
+        return tables, float(np.max(np.linalg.norm(np.vstack(after) - before, axis=1)))
+
+    for number, (place, k) in enumerate(places[i] for i in picked):
+        sign = 1.0 if number % 2 else -1.0
+        for trial in TRIALS:
+            tables, moved = changed(place, k, sign * trial)
+            if moved >= LEAST_MOVED_MM:
+                break
+        else:
+            continue
+        moved_by = abs(float(numbers_of(tables.tables)[place][k] - numbers[place][k])) / moved
+        tables, moved = changed(place, k, math.copysign((1.0 + BEYOND_GOAL) * judge.goal_mm * moved_by, sign))
+        reasons = reasons_against(machine, tables, judge)[1]
+        outcome = REJECTED if reasons else SAME if moved <= judge.goal_mm else ACCEPTED
+        name = f"{place.lstrip('.')}, number {k + 1}"
+        yield Trial("entry", name, outcome, moved / MM_PER_UM, reasons[0] if reasons else "")
 
 
 def _wrong_corrections(machine: Machine, right: Correction) -> Iterator[tuple[str, str, Correction]]:

@@ -24,6 +24,8 @@ from compgen.verify.components import components, rms
 from compgen.verify.residuals import residuals, without_rigid_motion
 from compgen.verify.scan import displacement_uncertainty, point_reasons, scan_lines
 
+#: One entry of a table may move the tip by this share of the largest correction without its linear part, or this much.
+GOAL_SHARE, GOAL_MM = 0.03, 1.0 * MM_PER_UM
 #: A component of the correction may miss the best possible one by this share of it ...
 COMPONENT_SHARE = 0.3
 #: ... or by this much, whichever is larger; the quantum of the format comes on top, and this many standard
@@ -41,6 +43,8 @@ class Judge:
     solver, values : the control's basis over the volume, and the best values in it before rounding.
     grid, best_mm : points (n, 3) over the volume, nodes and middles, and the best correction there (n, 3).
     line_mm, line_best_mm : points (m, 3) on lines along the axes, and the best correction there (m, 3).
+    bent_mm : largest range of the best correction of an axis without its linear part.
+    goal_mm : what one entry of a table may move the tip by and still pass.
     slack_mm, u_mm : what quantum and uncertainty explain of a component, and the uncertainty of E, shapes (3,).
     resolution_mm : largest error of the format's rounding.
     """
@@ -53,6 +57,8 @@ class Judge:
     best_mm: FloatArray
     line_mm: FloatArray
     line_best_mm: FloatArray
+    bent_mm: float
+    goal_mm: float
     slack_mm: FloatArray
     u_mm: FloatArray
     resolution_mm: float
@@ -62,7 +68,9 @@ class Judge:
         return [
             *self.shrink_reasons(grid_correction_mm),
             *self.component_reasons(grid_correction_mm),
-            *point_reasons(self.line_mm, line_correction_mm, self.line_best_mm, self.u_mm, self.resolution_mm),
+            *point_reasons(
+                self.line_mm, line_correction_mm, self.line_best_mm, self.bent_mm, self.u_mm, self.resolution_mm
+            ),
         ]
 
     def component_reasons(self, correction_mm: FloatArray) -> list[str]:
@@ -113,6 +121,7 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, table
     grid = volume_grid(machine, nodes)
     line_mm = scan_lines(machine, nodes)
     best_mm = solver.field(values, grid.position_mm)
+    bent_mm = _without_linear_part(grid.position_mm, best_mm)
     resolution_mm = control.resolution_mm(settings)
     grid_u_mm = COMPONENT_UNCERTAINTIES * displacement_uncertainty(machine, errors, grid.position_mm)
     return Judge(
@@ -124,10 +133,19 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, table
         best_mm=best_mm,
         line_mm=line_mm,
         line_best_mm=solver.field(values, line_mm),
+        bent_mm=float(np.ptp(bent_mm, axis=0).max()),
+        goal_mm=max(GOAL_MM, GOAL_SHARE * float(np.max(np.linalg.norm(bent_mm, axis=1)))),
         slack_mm=resolution_mm + np.minimum(grid_u_mm, COMPONENT_SHARE * np.std(best_mm, axis=0)),
         u_mm=displacement_uncertainty(machine, errors, line_mm),
         resolution_mm=resolution_mm,
     )
+
+
+def _without_linear_part(position_mm: FloatArray, field_mm: FloatArray) -> FloatArray:
+    """Take the best-fit constant and slopes (squareness, pitch) out of a field (n, 3) at points (n, 3)."""
+    columns = np.column_stack([np.ones(len(position_mm)), position_mm - position_mm.mean(axis=0)])
+    linear, *_ = np.linalg.lstsq(columns, field_mm, rcond=None)
+    return np.asarray(field_mm - columns @ linear)
 
 
 def _nodes(machine: Machine, errors: ErrorTable, solver: Projector) -> tuple[FloatArray, ...]:

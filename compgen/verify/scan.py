@@ -14,10 +14,11 @@ from compgen.model.volumetric import c_matrix
 
 #: Positions along a line beside the nodes of the tables: evenly spread over the travel.
 POSITIONS = 1001
-#: At a point the correction may miss the best possible one by this share of the range of the best one ...
+#: At a point the correction may miss the best possible one by this share of its range, and of the largest range of all
+#: axes without the linear parts (a squareness of millimetres must hide nothing) ...
 POINT_SHARE = 0.3
 #: ... or by this much, whichever is larger; on top come the quantum and this many standard uncertainties of the
-#: errors, up to POINT_SHARE of the range.
+#: errors, up to POINT_SHARE of the whole range.
 POINT_FLOOR_MM = 1.0 * MM_PER_UM
 POINT_UNCERTAINTIES = 5.0
 
@@ -34,7 +35,9 @@ def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> FloatArray
     return np.vstack(lines)
 
 
-def displacement_uncertainty(machine: Machine, errors: ErrorTable, position_mm: FloatArray) -> FloatArray:
+def displacement_uncertainty(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
+) -> FloatArray:
     """Standard uncertainty of E = C P at positions (n, 3) from those of the errors, shape (3,): the largest, mm.
 
     Correlations are left out; an uncertainty that is not known counts as zero.
@@ -42,26 +45,29 @@ def displacement_uncertainty(machine: Machine, errors: ErrorTable, position_mm: 
     curves = {name: replace(curve, value=np.nan_to_num(curve.u)) for name, curve in errors.curves.items()}
     squareness = {name: (float(np.nan_to_num(u)), 0.0) for name, (_, u) in errors.squareness.items()}
     u = ErrorTable(curves, squareness).at(position_mm)
-    return np.asarray(np.sqrt(np.einsum("nij,nj->ni", c_matrix(machine, position_mm) ** 2, u**2)).max(axis=0))
+    return np.asarray(np.sqrt(np.einsum("nij,nj->ni", c_matrix(machine, position_mm, tool_mm) ** 2, u**2)).max(axis=0))
 
 
 def point_reasons(
     position_mm: FloatArray,
     correction_mm: FloatArray,
     best_mm: FloatArray,
+    bent_mm: float,
     u_mm: FloatArray,
     resolution_mm: float,
 ) -> list[str]:
     """Name for each axis the point (of n) where the correction (n, 3) misses the best one most, if it is too far.
 
-    ``u_mm`` (3,) is the standard uncertainty that the errors give the correction, ``resolution_mm`` the format's.
+    ``bent_mm`` is the largest range of the best one without its linear part, ``u_mm`` (3,) the standard uncertainty
+    that the errors give the correction, ``resolution_mm`` the format's.
     """
     reasons = []
     for output, letter in enumerate(AXES):
         miss = np.abs(correction_mm[:, output] - best_mm[:, output])
         worst = int(np.argmax(miss))
         share = POINT_SHARE * float(np.ptp(best_mm[:, output]))
-        limit = max(share, POINT_FLOOR_MM) + min(POINT_UNCERTAINTIES * u_mm[output], share) + resolution_mm
+        limit = max(min(share, POINT_SHARE * bent_mm), POINT_FLOOR_MM) + resolution_mm
+        limit += min(POINT_UNCERTAINTIES * u_mm[output], share)
         if miss[worst] > limit:
             x, y, z = position_mm[worst]
             reasons.append(

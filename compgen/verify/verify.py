@@ -26,7 +26,8 @@ from compgen.export.synthesis import Projector, wanted_correction
 from compgen.identify.covariance import Covariance
 from compgen.model.exact import exact_error
 from compgen.model.volumetric import tool_of, volumetric_error
-from compgen.verify.judge import judge_of
+from compgen.verify.entries import entry_check
+from compgen.verify.judge import Judge, judge_of
 from compgen.verify.residuals import Residuals, residuals, without_rigid_motion
 from compgen.verify.reversal import in_both_directions, left_by_reversal, mean_correction, reversal_reasons
 from compgen.verify.safety import Safety, SafetyLimits, safety_of
@@ -80,12 +81,17 @@ class ReadTables:
         def added(points: Points) -> FloatArray:
             return self.correction(machine, points)
 
-        mean = mean_correction(added, position_mm)
-        if (
-            self.controller.anchored
-        ):  # zero at the reference point in one direction only: a constant, which does no harm
-            mean -= mean_correction(added, self.controller.anchor_mm(machine, self.settings)[None])
-        return mean
+        return mean_correction(added, position_mm) - self.anchor_offset_mm(machine)
+
+    def anchor_offset_mm(self, machine: Machine) -> FloatArray:
+        """Return the mean of both directions where an anchored control's tables are zero, shape (3,), mm.
+
+        They are zero there in one direction only, by a constant, which does no harm.
+        """
+        if not (self.controller.bidirectional and self.controller.anchored):
+            return np.zeros(3)
+        anchor_mm = self.controller.anchor_mm(machine, self.settings)[None]
+        return np.asarray(mean_correction(lambda points: self.correction(machine, points), anchor_mm)[0])
 
 
 def read_tables(
@@ -246,6 +252,7 @@ class Verification:
     objections: tuple[Objection, ...] = ()
     uncertainty: FigureUncertainty | None = None
     next_command: str = ""
+    tools: str = ""
 
     @property
     def accepted(self) -> bool:
@@ -368,6 +375,7 @@ class Verification:
             "unrepresentable_um": self.unrepresentable_um,
             "uncorrected_um": self.uncorrected_um,
             "next_command": self.next_command or None,
+            "judged_with_tools": self.tools,
             "safety": self.safety.summary(),
             "files": [{"name": name, "sha256": digest} for name, digest in self.files],
         }
@@ -408,18 +416,12 @@ def verify(
     rest = wanted_correction(machine, errors, grid_mm) - judge.best_mm
     if control.anchored:
         rest = rest - rest.mean(axis=0)
-    on_grid, on_lines = (tables.mean_correction(machine, part) for part in (grid_mm, judge.line_mm))
-    safety = safety_of(machine, control, tables.tables, lambda part: solver.field(judge.values, part), limits)
     figures = [residuals(error) for error in (before, after)]
     rigid_removed = [residuals(without_rigid_motion(nominal, error)) for error in (before, after)]
-    reasons = [
-        *control.violations(machine, tables.settings, tables.tables),
-        *_useless_reasons(machine, tables, points_mm=(grid_mm, judge.line_mm), figures=figures, removed=rigid_removed),
-        *judge.reasons(on_grid, on_lines),
-        *_reversal_reasons(machine, tables, reversal),
-        *tables.contradictions,
-        *safety.reasons,
-    ]
+    safety, reasons = reasons_against(machine, tables, judge, limits, reversal)
+    useless = _useless_reasons(
+        machine, tables, points_mm=(grid_mm, judge.line_mm), figures=figures, removed=rigid_removed
+    )
     return Verification(
         controller=control.name,
         before=figures[0],
@@ -433,7 +435,7 @@ def verify(
         },
         points=len(where),
         files=tables.files,
-        reasons=tuple(dict.fromkeys(reasons)),
+        reasons=tuple(dict.fromkeys([*useless, *reasons])),
         reservations=(
             *control.reservations(machine, tables.settings, tables.tables),
             *control.left_out(machine, tables.settings, errors),
@@ -445,7 +447,29 @@ def verify(
         error_after_mm=after,
         machine=machine.name,
         uncertainty=figure_uncertainty(machine, errors, where.position_mm, covariance),
+        tools=machine.tool_range_text,
     )
+
+
+def reasons_against(
+    machine: Machine,
+    tables: ReadTables,
+    judge: Judge,
+    limits: SafetyLimits | None = None,
+    reversal: ReversalCurves | None = None,
+) -> tuple[Safety, tuple[str, ...]]:
+    """Return what parsed tables would make the axes do, and every reason not to accept them, each once."""
+    control = tables.controller
+    on_grid, on_lines = (tables.mean_correction(machine, part) for part in (judge.grid.position_mm, judge.line_mm))
+    safety = safety_of(machine, control, tables.tables, lambda part: judge.solver.field(judge.values, part), limits)
+    reasons = [
+        *control.violations(machine, tables.settings, tables.tables),
+        *(judge.reasons(on_grid, on_lines) or entry_check(machine, judge, tables, reversal).reasons()),
+        *_reversal_reasons(machine, tables, reversal),
+        *tables.contradictions,
+        *safety.reasons,
+    ]
+    return safety, tuple(dict.fromkeys(reasons))
 
 
 def _useless_reasons(
