@@ -17,6 +17,7 @@ from compgen.errors import InputError
 from compgen.recal import actions
 from compgen.recal.backup import backup, restore
 from compgen.recal.database import StoreError
+from compgen.recal.inbox import with_twins
 from compgen.recal.job import read_job
 from compgen.recal.publish import LEDGER
 from compgen.recal.runner import run_jobs
@@ -374,3 +375,16 @@ def test_adopt_from_the_command_line(second, capsys):
     }
     code, said = call("history", "mill", "--json")
     assert "given to this store by ada, what was there is in SET-ASIDE-1: Sunday counts" in said.out
+
+
+def test_what_a_job_knows_of_other_machines_does_not_grow_with_the_fleet(tmp_path):
+    names = [f"m{k}" for k in range(300)]
+    (tmp_path / "recal.toml").write_text("".join(MACHINE.format(name=name, out=f"out/{name}") for name in names))
+    job = read_job(tmp_path / "recal.toml")
+    for k, name in enumerate(names):
+        (tmp_path / "inbox" / name).mkdir(parents=True)
+        (tmp_path / "inbox" / name / "a.lengths.csv").write_text(f"{k:04d}")
+    shutil.copy(tmp_path / "inbox/m7/a.lengths.csv", tmp_path / "inbox/m9/b.lengths.csv")
+    found = with_twins(job.machines.values(), job.machines.values())
+    others = {item.name: [other.name for other in item.others] for item in found if item.others}
+    assert others == {"m7": ["m9"], "m9": ["m7"]}

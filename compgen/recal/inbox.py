@@ -7,7 +7,7 @@ import csv
 import os
 import stat
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -135,27 +135,61 @@ def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes
     return content, after
 
 
-def holds_one_of(other: OtherInbox, contents: Iterable[bytes]) -> bool:
-    """Whether a file that fits, in another machine's inbox or a sub-folder, holds one of these contents.
+def with_twins(chosen: Iterable[MachineJob], every: Iterable[MachineJob]) -> list[MachineJob]:
+    """Return the jobs, each with the other machines whose inboxes hold one of its files as well as ``others``.
 
-    Empty ones do not count; only files of the same size are read. What cannot be read is reported by the pass over that
-    machine.
+    Only files of the same size are read. What cannot be read is reported by the pass over its machine.
     """
+    boxes = {job.name: OtherInbox(job.name, job.inbox, job.patterns) for job in every}
+    by_size: dict[int, list[tuple[str, Path]]] = {}
+    for box in boxes.values():
+        for path, size in _listed(box):
+            by_size.setdefault(size, []).append((box.name, path))
+    sharing: dict[str, set[str]] = {}
+    for size, files in by_size.items():
+        if len({name for name, _ in files}) < 2:
+            continue
+        same: dict[str, set[str]] = {}
+        for name, path in files:
+            with contextlib.suppress(InputError):
+                content, _ = _read_regular(path, size, folder_is_real=path.parent != boxes[name].inbox)
+                same.setdefault(sha256_of(content), set()).add(name)
+        for names in same.values():
+            for name in names:
+                sharing.setdefault(name, set()).update(names - {name})
+    found = []
+    for job in chosen:
+        known = {item.name for item in job.others}
+        more = tuple(boxes[name] for name in sorted(sharing.get(job.name, set()) - known))
+        found.append(replace(job, others=(*job.others, *more)))
+    return found
+
+
+def holds_one_of(other: OtherInbox, contents: Iterable[bytes]) -> bool:
+    """Whether a file that fits, in another machine's inbox or a sub-folder, holds one of these contents, empty ones apart."""
     wanted = {(len(content), sha256_of(content)) for content in contents if content}
     sizes = {size for size, _ in wanted}
-    try:
-        entries = sorted(other.inbox.iterdir())
+    for path, size in _listed(other):
+        if size in sizes:
+            with contextlib.suppress(InputError):
+                content, _ = _read_regular(path, size, folder_is_real=path.parent != other.inbox)
+                if (len(content), sha256_of(content)) in wanted:
+                    return True
+    return False
+
+
+def _listed(box: OtherInbox) -> list[tuple[Path, int]]:
+    """Return path and size of the regular files that fit, in an inbox and its sub-folders; nothing where it is not read."""
+    found = []
+    with contextlib.suppress(OSError):
+        entries = sorted(box.inbox.iterdir())
         folders = [entry for entry in entries if entry.is_dir() and not entry.is_symlink()]
         for path in [*entries, *(path for folder in folders for path in sorted(folder.iterdir()))]:
-            size = path.lstat().st_size
-            if size in sizes and any(fnmatchcase(path.name, pattern) for pattern in other.patterns):
-                with contextlib.suppress(InputError):
-                    content, _ = _read_regular(path, size, folder_is_real=path.parent != other.inbox)
-                    if (len(content), sha256_of(content)) in wanted:
-                        return True
-    except OSError:
-        return False
-    return False
+            state = path.lstat()
+            named = any(fnmatchcase(path.name, pattern) for pattern in box.patterns)
+            if named and stat.S_ISREG(state.st_mode) and state.st_size > 0:
+                found.append((path, state.st_size))
+    return found
 
 
 @contextlib.contextmanager

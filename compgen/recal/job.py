@@ -69,7 +69,8 @@ class MachineJob:
 
     ``measured_with`` says what was active while the machine was measured: the tables that were active then ("active")
     or none ("bare"); a measurement file may say otherwise for itself. ``tolerances`` are those of the drift, mm or rad,
-    by error or "volume". ``others`` are the inboxes of the other machines.
+    by error or "volume". ``others`` are the machines whose
+    inbox is the same, or holds a file of this one's as well (:func:`compgen.recal.inbox.with_twins`).
     """
 
     name: str
@@ -177,11 +178,12 @@ def _job_of(root: Section, path: Path) -> Job:
         _options(_Keys(Section({}, path=path), defaults), folder, "")
     root.finish()
     _check_folders(every, machines)
-    inboxes = [OtherInbox(name, machine.inbox, machine.patterns) for name, machine in machines.items()]
-    machines = {
-        name: replace(machine, others=tuple(item for item in inboxes if item.name != name))
-        for name, machine in machines.items()
-    }
+    shared: dict[str, list[OtherInbox]] = {}
+    for name, machine in machines.items():
+        shared.setdefault(os.path.realpath(machine.inbox), []).append(OtherInbox(name, machine.inbox, machine.patterns))
+    for group in shared.values():
+        for own in group if len(group) > 1 else ():
+            machines[own.name] = replace(machines[own.name], others=tuple(item for item in group if item != own))
     return Job(path, store if "://" in store else f"sqlite:///{folder / store}", machines)
 
 

@@ -101,6 +101,7 @@ def run_jobs(
         if the store cannot be reached at all.
     """
     chosen = [job.machine(name) for name in names] if names else list(job.machines.values())
+    chosen = inbox.with_twins(chosen, job.machines.values())
     open_store(job.store).close()
     work = partial(run_machine, url=job.store, clock=clock)
     if mapper is map:
