@@ -257,10 +257,14 @@ def test_watch_works_on_it_and_goes_on_when_the_server_comes_back(site, server, 
 def test_two_runners_process_each_of_many_measurements_once_and_in_order(site, opened):
     path = site.folder / "recal.toml"
     own = path.read_text()[path.read_text().index("[machines.mill]") :]
-    path.write_text(path.read_text() + own.replace("machines.mill", "machines.saw").replace('"out"', '"out2"'))
+    other = own.replace("machines.mill", "machines.saw").replace('"out"', '"out2"').replace('"inbox"', '"inbox2"')
+    path.write_text(path.read_text() + other)
     site.job = faults.read_job(path)
     for _ in range(5):
         site.measure()
+    (site.folder / "inbox2").mkdir()
+    for file in site.inbox.iterdir():  # not the same bytes, which would be held
+        (site.folder / "inbox2" / file.name).write_text(f"# of = saw\n{file.read_text()}")
     assert [exit_of(child) for child in [site.start(), site.start()]] == [0, 0]
     store = opened(site.job.store)
     attempts, versions = store.attempts(), store.tables()
