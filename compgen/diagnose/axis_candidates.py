@@ -73,6 +73,8 @@ def _slow(session: AxisSession) -> list[Candidate]:
 
 
 def _steps(session: AxisSession) -> list[Candidate]:
+    if not _in_runs(session):
+        return []
     step = catalogue()["step_between_runs"]
     at = (np.flatnonzero(np.diff(session.leg)) + 1).tolist()
     found = [
@@ -86,6 +88,11 @@ def _leg_end(session: AxisSession, first: int) -> int:
     return int(np.flatnonzero(session.leg == session.leg[first])[-1])
 
 
+def _in_runs(session: AxisSession) -> bool:
+    """Whether the session goes run by run; one that goes target by target has no runs that may be bad or stepped."""
+    return len(session) >= 2.5 * (int(session.leg.max()) + 1)
+
+
 def _runs(session: AxisSession) -> float:
     """Positions that count for a step or a bad run; equal, so that the first run off and a step after it weigh the same."""
     return float(session.leg.max()) + 1.0
@@ -94,10 +101,9 @@ def _runs(session: AxisSession) -> float:
 def _disturbed(session: AxisSession) -> list[Candidate]:
     """One run (or one way of it) that is off, and shorter bursts."""
     bad, burst = catalogue()["bad_run"], catalogue()["disturbed_readings"]
-    runs = {_ends(session.leg == k) for k in range(int(session.leg.max()) + 1)}
-    runs |= {_ends(session.cycle == k) for k in range(int(session.cycle.max()) + 1)}
-    if len(runs) < 2:
-        return []
+    runs = set() if not _in_runs(session) else {_ends(session.leg == k) for k in range(int(session.leg.max()) + 1)}
+    runs |= {_ends(session.cycle == k) for k in range(int(session.cycle.max()) + 1)} if runs else set()
+    runs = runs if len(runs) > 1 else set()
     found = []
     for first, last in sorted(runs):
         chosen = bad.with_settings({"first": float(first), "last": float(last)})
@@ -107,7 +113,7 @@ def _disturbed(session: AxisSession) -> list[Candidate]:
         columns = np.zeros((len(session), last - first + 1))
         columns[np.arange(first, last + 1), np.arange(last - first + 1)] = 1.0
         found.append(_free(item, columns))
-    n, longest = len(session), int(np.bincount(session.leg).max()) - 1
+    n, longest = len(session), max(int(np.bincount(session.leg).max()), len(session) // 10) - 1
     windows = [(k, k + size - 1) for size in BURSTS if size <= longest for k in range(n - size + 1)]
     windows = windows[:: max(1, len(windows) // MOST_WINDOWS)] if len(windows) > MOST_WINDOWS else windows
     windows = [window for window in windows if window not in runs]
@@ -189,10 +195,10 @@ def _generic(session: AxisSession) -> list[Candidate]:
         own = own - own.mean(axis=1, keepdims=True)
         add("each target drifts in its own way", ("time", "x"), shape[:, None] * own, 3)
     cycles, legs = _indicators(session.cycle), _indicators(session.leg)
-    if cycles.shape[1] > 2:
+    if cycles.shape[1] > 2 and _in_runs(session):
         add("every run has a level of its own", ("run",), cycles[:, 1:], handicap=RUN_HANDICAP)
         add("every run has a slope of its own", ("run", "x"), cycles * s[:, None])
-    if legs.shape[1] > cycles.shape[1]:
+    if legs.shape[1] > cycles.shape[1] and _in_runs(session):
         add("every way of every run has a level of its own", ("run", "approach"), legs[:, 1:], handicap=RUN_HANDICAP)
     inside = [k for k in range(1, len(session)) if session.leg[k] == session.leg[k - 1]]
     for k in inside:

@@ -43,16 +43,25 @@ SHOWN = ("B", "M", "E", "R", "A")
 LEAST_FREEDOM, LEAST_REPEATS = 20, 8
 #: p-value of backlash, and of a reversal that varies along the axis.
 REVERSAL_P = 2e-3
+#: A reversal within this many standard uncertainties of zero at an end of the axis begins there.
+ZERO_AT_END = 2.5
 #: The smooth part must explain this share of a reversal that varies, else its law is not known.
 SMOOTH_SHARE = 0.7
 #: Names within this of the best criterion are reported as alternatives (99 %).
 ALIAS = 9.2
 #: A name that explains less than this share of what has no name is tentative.
 LEAST_SHARE = 0.5
+#: Chi-square that a reversal needs beside something without a name.
+LEAST_BESIDE = 40.0
 #: An effect must not depend on position, direction or time by more than this share of itself.
 UNEVEN_SHARE, UNEVEN_P = 0.05, 1e-3
 #: A warm-up with a time constant beyond this share of the session has hardly begun to level off.
 HARDLY_LEVELS = 1.5
+#: Excess kurtosis of what is left, freed from its memory, and memory, beyond which that is no noise (in 200 sessions with
+#: noise of a memory up to 0.85 the largest were 2.0 and 0.90).
+JUMPS, WANDERS = 3.0, 0.94
+#: Memory from which a note says that the scatter has one.
+MEMORY = 0.5
 #: Effects whose readings are left out of the figures; all other changes are taken off.
 LEFT_OUT = ("bad_run", "disturbed_readings")
 #: Effects of the machine that a machine file keeps; a warm-up of one session is not among them.
@@ -210,16 +219,15 @@ def _findings(
     if len(members) >= most > 0 and search.criteria(members)[1].max() >= LEAST_GAIN:
         unknown.append(AxisUnknown(f"more than {most} changes: the session does not repeat", ("time", "run"), np.nan))
     effects = [_change(changes, k, generic) for k in members if k not in generic]
-    bad = [item for item in effects if item.name == "bad_run"]
-    if len(bad) > 1:
-        effects = [
-            _doubted(item, "more than one run is off, so the runs do not repeat") if item.name == "bad_run" else item
-            for item in effects
-        ]
-        unknown.append(AxisUnknown("the runs do not repeat: more than one of them is off", ("run",), np.nan, "bad_run"))
+    for name in ("bad_run", "step_between_runs"):
+        if sum(item.name == name for item in effects) > 1:
+            effects = [_doubted(item, "the runs do not repeat") for item in effects]
+            text = "the runs do not repeat: more than one of them is off, or steps between more than two of them"
+            unknown.append(AxisUnknown(text, ("run",), np.nan, name))
+    if repeated and not unknown:
+        unknown += _restless(changes)
     static, irregular = reversal.found(names, add, source)
-    if any({"time", "approach"} <= set(item.covariates) for item in unknown):
-        static = [_doubted(item, "the reversal changes with time") for item in static]
+    static = [_beside_unknown(item, unknown) for item in static]
     unknown += irregular
     effects = [*sorted(effects, key=lambda item: -item.gain), *static]
     if unknown:
@@ -240,6 +248,15 @@ def _findings(
 
 def _doubted(item: AxisEffect, reason: str) -> AxisEffect:
     return replace(item, grade="tentative", reasons=(*item.reasons, reason))
+
+
+def _beside_unknown(item: AxisEffect, unknown: Sequence[AxisUnknown]) -> AxisEffect:
+    """A reversal is doubtful where it changes with time, and a small one where anything else has no name."""
+    if any({"time", "approach"} <= set(other.covariates) for other in unknown):
+        return _doubted(item, "the reversal changes with time")
+    if unknown and item.gain < LEAST_BESIDE:
+        return _doubted(item, "small beside what has no name")
+    return item
 
 
 def _added(search: Search, members: list[int], add: Sequence[str]) -> list[int]:
@@ -286,6 +303,28 @@ class _Changes:
             total.append((weight, fitted))
         square += sum(w * np.outer(f - value, f - value) for w, f in total)
         return value, square
+
+
+def _restless(changes: _Changes) -> list[AxisUnknown]:
+    """What is left jumps or wanders more than noise does."""
+    session, point = changes.session, int(np.argmax(changes.weights))
+    design = np.hstack([changes.grid.cells, changes.columns])
+    inverse = changes.grid.inverse[point]
+    value = np.linalg.pinv(design.T @ inverse @ design, rcond=1e-10, hermitian=True) @ (
+        design.T @ inverse @ changes.search.y
+    )
+    left = changes.search.y - design @ value
+    white = np.linalg.cholesky(inverse).T @ left
+    scale = float(np.sqrt(np.mean(white**2)))
+    rms = float(np.sqrt(np.mean(left**2)))
+    if scale <= LEAST_MM or len(session) < 30:
+        return []
+    if float(np.mean(white**4)) / scale**4 - 3.0 > JUMPS:
+        text = "the readings jump now and then by more than they scatter, and do not repeat"
+        return [AxisUnknown(text, ("time",), rms)]
+    if changes.phi > WANDERS:
+        return [AxisUnknown("the readings wander from one to the next and do not repeat", ("time",), rms)]
+    return []
 
 
 def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffect:
@@ -369,13 +408,16 @@ def _text(
         cycles = tau / session.cycle_span
         unit = f"{tau:.3g} s" if session.timed else f"{tau:.3g} readings"
         inside = size * -np.expm1(-span / tau)
-        text = (
-            f"the readings {'rise' if size > 0 else 'fall'} by {abs(inside):.3g} um during the session and level off: "
-            f"{size:+.3g} um in the end, time constant {unit} ({cycles:.2g} runs there and back); machine or sensor"
-        )
+        moved = f"the readings {'rise' if size > 0 else 'fall'} by {abs(inside):.3g} um during the session"
         if tau > HARDLY_LEVELS * span:
-            text += "; it has hardly begun to level off, so that its end is extrapolated"
-        return text
+            return (
+                f"{moved}, nearly at a constant rate: a warm-up of machine or sensor whose time constant is longer than the "
+                f"session (by this fit {cycles:.2g} runs there and back), or a drift"
+            )
+        return (
+            f"{moved} and level off: {size:+.3g} um in the end, time constant {unit} ({cycles:.2g} runs there and back); "
+            "machine or sensor"
+        )
     if item.name == "linear_drift":
         return (
             f"the readings drift by {size:+.3g} um from the first to the last; machine or sensor cannot be told apart"
@@ -470,7 +512,7 @@ class _Reversal:
         count = len(self.targets)
         inverse = np.linalg.pinv(self.covariance, rcond=1e-10, hermitian=True)
         everything = float(self.half @ inverse @ self.half)
-        constant, _, left_0 = self._fit(self._shapes(0))
+        constant, of_constant, left_0 = self._fit(self._shapes(0))
         smooth, covariance, left_2 = self._fit(self._shapes(2))
         varies = min(self._p(left_0 - left_2, len(smooth) - 1), self._p(left_0, count - 1)) < 0.5 * REVERSAL_P
         irregular = count > 3 and self._p(left_2, count - len(smooth)) < 0.5 * REVERSAL_P
@@ -490,12 +532,21 @@ class _Reversal:
             self._constant(varies, smooth, covariance, everything - left_0, irregular)
             and (not only or backlash in only)
         ) or (backlash in add):
-            mean = smooth[:1] if varies else constant
-            effects.append(self._backlash(backlash, mean, covariance[:1, :1], everything - left_0, reasons))
+            mean, square = (smooth[:1], covariance[:1, :1]) if varies else (constant, of_constant)
+            item = self._backlash(backlash, mean, square, everything - left_0, reasons)
+            effects.append(item if varies else replace(item, alias=self._alias(backlash, lost, left_0)))
         return effects, unknown
 
+    def _alias(self, backlash: str, lost: str, left: float) -> tuple[tuple[str, float], ...]:
+        """Backlash, and lost motion where one that begins at zero at an end (or both) explains the readings nearly as well."""
+        shapes = (0.5 * (1.0 + self.s), 0.5 * (1.0 - self.s), 1.0 - self.s**2)
+        other = min(self._fit(shape[:, None])[2] for shape in shapes)
+        weight = 1.0 / (1.0 + np.exp(np.clip(0.5 * (left - other), -50.0, 50.0)))
+        found = [(backlash, float(weight)), (lost, float(1.0 - weight))]
+        return tuple(entry for entry in found if entry[0] == backlash or entry[1] >= 0.01)
+
     def _constant(self, varies: bool, smooth: FloatArray, covariance: FloatArray, gain: float, irregular: bool) -> bool:
-        """Whether there is a backlash: a reversal of one sign that is not the mean of one that begins at zero at an end."""
+        """Whether there is a backlash: a mean reversal that is not that of one which begins at zero at an end."""
         if irregular:  # then the scatter from target to target is the noise of the mean
             spread = self.half.std(ddof=1) / np.sqrt(len(self.half))
             p = 2.0 * float(stats.t.sf(abs(self.half.mean()) / max(spread, 1e-12), len(self.half) - 1))
@@ -508,9 +559,7 @@ class _Reversal:
         ends = np.polynomial.legendre.legvander(np.array([-1.0, 1.0]), len(smooth) - 1)
         at = ends @ smooth
         u = np.sqrt(np.einsum("ij,jk,ik->i", ends, covariance, ends))
-        return bool(np.all(np.abs(at) > 2.5 * u)) and bool(
-            np.prod(np.sign(at)) > 0 or abs(smooth[0]) > np.abs(at).min()
-        )
+        return bool(np.all(np.abs(at) > ZERO_AT_END * u))
 
     def _backlash(
         self, name: str, mean: FloatArray, covariance: FloatArray, gain: float, reasons: tuple[str, ...]
@@ -795,6 +844,12 @@ class AxisDiagnosis:
             letter = part.session.letter
             found.append(f"{letter}: order of time by {ORDER_TEXTS[part.session.order]}")
             found += [f"{letter}: {text}" for text in part.notes]
+            if part.phi > MEMORY and part.noise_source == "repeats":
+                found.append(
+                    f"{letter}: the scatter has a memory (neighbouring readings correlate by {part.phi:.2f}, "
+                    f"{part.sigma_mm / MM_PER_UM:.3g} um): repeats do not agree, and no name explains it; look at clamping, "
+                    "sensor and air before the tables"
+                )
             if any(item.name in ("warmup_drift", "linear_drift") for item in part.effects):
                 found.append(f"{letter}: {WARM_UP_NOTE}")
             grown = [key for key, pair in part.figures.items() if pair["after"] > pair["before"] * 1.001]

@@ -114,7 +114,7 @@ class AxisSession:
         """Say in words which readings ``first`` ... ``last`` are: a run, a way of it, or readings from .. to .."""
         rows = np.arange(first, last + 1)
         legs = np.unique(self.leg[rows])
-        if len(rows) == np.count_nonzero(np.isin(self.leg, legs)):
+        if 1 < len(rows) == np.count_nonzero(np.isin(self.leg, legs)):
             if len(legs) == 1:
                 return f"run {self.run[first]} {'up' if self.direction[first] > 0 else 'down'}"
             if len(np.unique(self.run[rows])) == 1:
