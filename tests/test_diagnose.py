@@ -312,3 +312,58 @@ def test_too_few_readings_and_unknown_names_are_refused(gantry):
         diagnose(gantry, session(15, lines=1, repeats=1))
     with pytest.raises(InputError, match="cannot be added"):
         diagnose(gantry, axis_runs(4, 0.0), DiagnoseOptions(add=("no_such_effect",)))
+
+
+def gust(lengths, *, stops=5, um=8.0):
+    """A pulse in all lengths of some stops in the middle of the session."""
+    times = np.unique(lengths.covariates["time_s"])
+    at = np.searchsorted(times, lengths.covariates["time_s"]) - len(times) // 2
+    pulse = np.where((at >= 0) & (at < stops), np.sin(np.pi * (at + 1) / (stops + 1)), 0.0)
+    return replace(lengths, length_mm=lengths.length_mm + um * MICROMETRE * pulse), times[len(times) // 2 :][:stops]
+
+
+def test_a_gust_is_named_with_its_time_and_may_be_left_out(gantry):
+    disturbed, times = gust(session(31, lines=40))
+    data = diagnose(gantry, disturbed).to_dict()
+    (item,) = data["effects"]
+    assert item["name"] == "disturbed_readings"
+    assert f"from time {times[0]:g} s to {times[-1]:g} s" in item["text"]
+    assert "--leave-out-disturbed" in item["text"]
+    without = diagnose(gantry, disturbed, DiagnoseOptions(leave_out_disturbed=True)).to_dict()
+    assert [item["name"] for item in without["effects"]] == ["disturbed_readings"]
+    assert "left out" in without["effects"][0]["text"]
+    assert without["gap"]["train"]["after_rms_um"] < 0.85 * data["gap"]["train"]["after_rms_um"]
+
+
+def test_what_has_no_name_says_which_name_it_resembles(gantry):
+    def swelling(q, approach, time):
+        """A backlash that grows with the square of time: no name, but nearest to that of a backlash."""
+        moved = np.zeros_like(q)
+        moved[:, 1] = 1.2 * MICROMETRE * approach[:, 1] * (0.3 + 2.0 * (time / time.max()) ** 3)
+        return moved
+
+    data = diagnose(gantry, session(32, displaced=swelling)).to_dict()
+    said = [item["resembles"] for item in data["unknown"]] + [item["name"] for item in data["effects"]]
+    assert "backlash_Y" in said
+    assert all("resembles" in item for item in data["unknown"])
+    for item in data["effects"]:
+        assert item["what_to_do"]
+
+
+def test_what_is_left_of_a_runout_of_another_law_is_its_inexact_shape(gantry):
+    from compgen.diagnose.verdict import _owner
+
+    class Group:
+        def __init__(self, name, covariates):
+            self.name, self.covariates = name, covariates
+
+    groups = [
+        Group("tracer_runout_A", ("station",)),
+        Group("beam elevation of A", ("elevation", "station_A")),
+        Group("beam elevation of B", ("elevation", "station_B")),
+    ]
+    evidence = type("Evidence", (), {"chi2": {0: 1800.0, 1: 45.0, 2: 45.0}})
+    analysis = type("Analysis", (), {"scene": type("Scene", (), {"groups": groups}), "evidence": evidence})
+    assert _owner(analysis, 1, [0]) == 0
+    assert _owner(analysis, 2, [0]) is None
+    assert _owner(analysis, 1, [0], 400.0) is None

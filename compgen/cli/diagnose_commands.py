@@ -44,6 +44,9 @@ from compgen.errors import InputError
     help="Order of axis runs in time: time_s or the column order, else run by run, up then down (auto); or as named. "
     "The order of rows counts with 'rows' only.",
 )
+@click.option(
+    "--leave-out-disturbed", is_flag=True, help="Leave out short bursts of disturbed readings once they are found."
+)
 @click.option("--each", is_flag=True, help="Every measurement by itself, into a folder of --out by its name.")
 @fleet_options
 @json_option
@@ -58,6 +61,7 @@ def diagnose_command(
     u_um: float | None,
     against: Path | None,
     order: Order,
+    leave_out_disturbed: bool,
     each: bool,
     workers: int,
     cluster: str | None,
@@ -81,7 +85,7 @@ def diagnose_command(
     OutputFolder(out)
     names = tuple(name.strip() for name in effects.split(",") if name.strip()) if effects else ()
     predicted = None if against is None else read_error_file(against)
-    options = DiagnoseOptions(max_effects, names, added, u_um, predicted, order)
+    options = DiagnoseOptions(max_effects, names, added, u_um, predicted, order, leave_out_disturbed)
     asked = Asked(machine, options, instrument)
     if each:
         return diagnose_each(asked, measurements, out, (workers, cluster), as_json=as_json)

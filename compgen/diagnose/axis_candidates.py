@@ -16,8 +16,8 @@ from compgen.effects import Effect, catalogue
 #: Number of positions that count for the time constant of a warm-up (the columns are nearly alike), and for a drift at a
 #: constant rate: as slow as these sessions are, most drifts are the beginning or the end of a warm-up.
 WARMUP_SCANS, LINEAR_SCANS = 2.0, 4.0
-#: Periods of a wave in time, as shares of the session.
-PERIODS = (2.0, 1.0, 2 / 3, 1 / 2, 1 / 3, 1 / 4)
+#: Waves in the session that are tried, and what they count as (neighbours are nearly alike).
+WAVES, WAVE_SCANS = np.arange(0.5, 4.1, 0.25), 6.0
 #: Windows of disturbed readings are looked for in sessions up to this size; beyond it, one reading in several begins one.
 MOST_WINDOWS = 1500
 #: Numbers of readings in a burst that are tried; those up to LONGEST_FREE may each have a value of their own.
@@ -183,10 +183,10 @@ def _generic(session: AxisSession) -> list[Candidate]:
 
     add("the readings wander smoothly with time", ("time",), np.column_stack([t, t**2, t**3]))
     add("the readings wander smoothly with time", ("time",), np.column_stack([t, t**2]))
-    for period in PERIODS:
-        angle = 2 * np.pi * (t + 1) / 2 / period
-        text = f"the readings swing with time, period {period:.2g} of the session"
-        add(text, ("time",), np.column_stack([np.sin(angle), np.cos(angle)]), len(PERIODS))
+    for waves in WAVES.tolist():
+        angle = np.pi * (t + 1) * waves
+        text = f"the readings swing with time, about {waves:.3g} waves in the session"
+        add(text, ("time",), np.column_stack([np.sin(angle), np.cos(angle)]), WAVE_SCANS)
     saturating = [-np.expm1(-(t + 1) / 2 / tau) for tau in (0.2, 0.6)]
     for shape in (t, *saturating):
         add("the scale of the axis changes with time", ("time", "x"), shape * s, 3)

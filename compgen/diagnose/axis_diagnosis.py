@@ -42,7 +42,7 @@ SHOWN = ("B", "M", "E", "R", "A")
 #: Readings beside the means of the targets, and beside those of the cells, below which nothing is said.
 LEAST_FREEDOM, LEAST_REPEATS = 20, 8
 #: p-value of backlash, and of a reversal that varies along the axis.
-REVERSAL_P = 2e-3
+REVERSAL_P = 1.5e-3
 #: A reversal within this many standard uncertainties of zero at an end of the axis begins there.
 ZERO_AT_END = 2.5
 #: The smooth part must explain this share of a reversal that varies, else its law is not known.
@@ -51,8 +51,8 @@ SMOOTH_SHARE = 0.7
 ALIAS = 9.2
 #: A name that explains less than this share of what has no name is tentative.
 LEAST_SHARE = 0.5
-#: Chi-square that a reversal needs beside something without a name.
-LEAST_BESIDE = 40.0
+#: Chi-square that a reversal needs beside something without a name, and beside runs that do not repeat.
+LEAST_BESIDE, LEAST_BESIDE_RUNS = 40.0, 200.0
 #: An effect must not depend on position, direction or time by more than this share of itself.
 UNEVEN_SHARE, UNEVEN_P = 0.05, 1e-3
 #: A warm-up with a time constant beyond this share of the session has hardly begun to level off.
@@ -254,7 +254,8 @@ def _beside_unknown(item: AxisEffect, unknown: Sequence[AxisUnknown]) -> AxisEff
     """A reversal is doubtful where it changes with time, and a small one where anything else has no name."""
     if any({"time", "approach"} <= set(other.covariates) for other in unknown):
         return _doubted(item, "the reversal changes with time")
-    if unknown and item.gain < LEAST_BESIDE:
+    least = LEAST_BESIDE_RUNS if any("run" in other.covariates for other in unknown) else LEAST_BESIDE
+    if unknown and item.gain < least:
         return _doubted(item, "small beside what has no name")
     return item
 

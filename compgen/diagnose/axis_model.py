@@ -35,7 +35,7 @@ LAMBDA = np.array([2.0, 20.0, 200.0, 2000.0])
 #: Smallest share of a column that must be left beside the means and the other members.
 LEAST_SEEN = 1e-3
 #: Improvement of the criterion that a member must bring.
-LEAST_GAIN = 5.0
+LEAST_GAIN = 5.5
 #: What a smooth term without a name must bring beyond a name.
 GENERIC_HANDICAP = 8.0
 #: The same for levels of whole runs, which two names together (a warm-up and a bad run) explain nearly as well.

@@ -6,6 +6,9 @@ of the readings, so that an effect does not pass for an outlier.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from compgen.core.csvio import FloatArray
@@ -25,6 +28,13 @@ MOST_GROSS = 0.03
 NEIGHBOURS = 5
 #: A gross reading moves the fit, and by it others: the largest are taken out first, and the fit is repeated.
 ROUNDS = 8
+#: Numbers of stops in a burst that are tried, and the largest share of the session that is one.
+BURSTS, LONGEST_BURST = (2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48), 0.03
+#: Mean square in a burst beyond the median of all windows of its length, in robust standard deviations of these. Noise
+#: that wanders alike at all stations has one degree of freedom in a window: 30 is beyond one window in 50,000 then.
+LOUD = 30.0
+#: Most bursts, and rounds in which the fit is repeated without them.
+MOST_BURSTS = 3
 #: Deviate of the slope of the variance against time that counts as a trend.
 TREND_Z = 6.0
 #: Share of readings that must lie on a grid of the step, and the least step over the noise.
@@ -66,6 +76,85 @@ def _apart(layout: Layout, left: FloatArray) -> FloatArray:
     if len(moved) < NEIGHBOURS * NEIGHBOURS:
         return np.zeros(len(left))
     return np.asarray(np.abs(apart) / (1.4826 * float(np.median(moved))))
+
+
+@dataclass(frozen=True)
+class Burst:
+    """Readings ``rows`` that are far off for a short time, from ``first`` to ``last`` (s, or numbers of the stops)."""
+
+    rows: IntArray
+    first: float
+    last: float
+    rms_mm: float
+    timed: bool
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        unit = " s" if self.timed else ""
+        what = "time" if self.timed else "stop"
+        return (
+            f"disturbed readings from {what} {self.first:g}{unit} to {self.last:g}{unit}: {len(self.rows)} readings, "
+            f"{self.rms_mm / MM_PER_UM:.2f} um rms beside everything that was found"
+        )
+
+
+def disturbed_readings(analysis: Analysis) -> list[Burst]:
+    """Short bursts in time in which the readings of all channels are far off (a gust, somebody at the machine).
+
+    What is left of the readings is compared between windows of equal length, so that noise of any size, and slow noise,
+    sets its own scale; the fit is repeated without each burst, since a burst pulls it.
+    """
+    fit, scene = analysis.fit, analysis.scene
+    layout = fit.observed.layout
+    added = [scene.groups[g].columns @ scene.maps[g] for g in analysis.chosen.members]
+    design = np.hstack([fit.jacobian, *added])
+    kept = np.ones(len(design), dtype=bool)
+    found: list[Burst] = []
+    for _ in range(MOST_BURSTS):
+        left = fit.residual_mm - design @ least_norm(design[kept], fit.residual_mm[kept])
+        window = _loudest(layout, (left / analysis.noise.scale) ** 2 * kept)
+        if window is None:
+            break
+        rows = np.flatnonzero((layout.stop >= window[0]) & (layout.stop <= window[1]) & kept)
+        kept[rows] = False
+        left = fit.residual_mm - design @ least_norm(design[kept], fit.residual_mm[kept])
+        first, last = (float(layout.time[stop]) for stop in window)
+        found.append(Burst(rows, first, last, float(np.sqrt(np.mean(left[rows] ** 2))), layout.timed))
+    return found
+
+
+def _loudest(layout: Layout, square: FloatArray) -> tuple[int, int] | None:
+    """First and last stop of the loudest window, None if none is loud; ``square`` (n,) is zero where left out."""
+    count = np.bincount(layout.stop, minlength=layout.stops)
+    power = np.bincount(layout.stop, square, layout.stops) / np.maximum(count, 1)
+    best: tuple[float, tuple[int, int]] | None = None
+    for length in BURSTS:
+        if length > max(LONGEST_BURST * layout.stops, 2) or layout.stops < 20 * length:
+            break
+        mean = np.convolve(power, np.ones(length) / length, "valid")
+        middle = float(np.median(mean))
+        spread = 1.4826 * float(np.median(np.abs(mean - middle)))
+        start = int(np.argmax(mean))
+        ratio = float(mean[start]) / middle if middle > 0.0 else 0.0
+        gain = length * (ratio - 1.0 - np.log(max(ratio, 1.0)))
+        if mean[start] - middle > LOUD * spread > 0.0 and (best is None or gain > best[0]):
+            best = (gain, (start, start + length - 1))
+    return None if best is None else best[1]
+
+
+def disturbed_class(bursts: Sequence[Burst], *, left_out: bool) -> list[Classed]:
+    """Bursts as they are reported."""
+    end = "left out" if left_out else "--leave-out-disturbed leaves them out"
+    return [
+        Classed(
+            "disturbed_readings",
+            {"first": b.first, "last": b.last, "count": float(len(b.rows)), "rms_um": b.rms_mm / MM_PER_UM},
+            1.0,
+            f"{b.text}; {end}",
+        )
+        for b in bursts
+    ]
 
 
 def _outliers(removed: int) -> list[Classed]:

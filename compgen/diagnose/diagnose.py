@@ -22,7 +22,7 @@ from compgen.diagnose.axis_diagnosis import AxisDiagnosis, findings_of
 from compgen.diagnose.axis_session import Order
 from compgen.diagnose.base import BaseFit
 from compgen.diagnose.base_choice import fit_smooth
-from compgen.diagnose.classes import classes_of, gross_readings
+from compgen.diagnose.classes import classes_of, disturbed_class, disturbed_readings, gross_readings
 from compgen.diagnose.gap import gap_of
 from compgen.diagnose.gross import correction_of, looks_gross
 from compgen.diagnose.measurement import Measurement
@@ -50,6 +50,7 @@ class DiagnoseOptions:
     add : names that are added whether they were found or not.
     u_um : standard uncertainty of a reading in um, if it is known; used without repeats.
     against : predicted errors that the measurement is compared with.
+    leave_out_disturbed : leave out bursts of disturbed readings (lengths and deviations) once they are found.
     order : order of axis runs in time: as logged, else run by run, up then down; or what the user says.
     """
 
@@ -59,6 +60,7 @@ class DiagnoseOptions:
     u_um: float | None = None
     against: ErrorTable | None = None
     order: Order = "auto"
+    leave_out_disturbed: bool = False
 
 
 def diagnose(
@@ -120,6 +122,13 @@ def diagnose(
             plain = before is analysis.fit
             analysis = _analysed(measurement, observed, _base(observed), chosen, show)
             before = analysis.fit if plain else before
+        bursts = disturbed_readings(analysis)
+        classed += disturbed_class(bursts, left_out=chosen.leave_out_disturbed)
+        if bursts and chosen.leave_out_disturbed:
+            show("leaving out disturbed readings")
+            loud = np.concatenate([burst.rows for burst in bursts])
+            observed = observed.part(np.setdiff1d(np.arange(len(observed)), loud))
+            analysis = _analysed(measurement, observed, _base(observed), chosen, show)
         return _completed(machine, analysis, chosen, show, before, classed, len(gross))
 
 

@@ -162,6 +162,7 @@ def _unknown(item: Unknown) -> dict[str, Any]:
         "direction": item.direction,
         "rms_um": item.rms_mm / MM_PER_UM if np.isfinite(item.rms_mm) else None,
         "text": item.text,
+        "resembles": item.resembles or None,
     }
 
 

@@ -12,7 +12,7 @@ from compgen.diagnose.alternatives import Alternative, alternatives
 from compgen.diagnose.analysis import Analysis
 from compgen.diagnose.evidence import HOMOGENEITY_P, contribution
 from compgen.diagnose.groups import Group
-from compgen.diagnose.search import plain_covariates
+from compgen.diagnose.search import beside, gains, plain_covariates
 from compgen.effects import catalogue
 
 Grade = Literal["confirmed", "beside_unknown", "tentative"]
@@ -32,6 +32,9 @@ SLIGHTLY_UNEVEN = 0.03
 SECONDARY_SHARE = 0.005
 #: A generic group in the covariates of a name, with less than this share of its chi-square, is its inexact shape.
 SHAPE_SHARE = 0.1
+RUNOUT = "tracer_runout_"
+#: A name that explains this share of what has no name resembles it.
+RESEMBLES = 0.3
 #: What is visible of an effect below this counts as invisible.
 INVISIBLE = 0.05
 #: Names of what the readings' scale does, which any misfit can be reshaped into.
@@ -56,13 +59,17 @@ class Named:
 
 @dataclass(frozen=True)
 class Unknown:
-    """Something without a name: what it depends on, how it acts, its RMS in mm (nan if unknown), in words."""
+    """Something without a name: what it depends on, how it acts, its RMS in mm (nan if unknown), in words.
+
+    ``resembles`` is the name that explains most of it in its place, if one explains enough.
+    """
 
     covariates: tuple[str, ...]
     direction: str
     rms_mm: float
     text: str
     group: int | None = None
+    resembles: str = ""
 
 
 @dataclass(frozen=True)
@@ -150,6 +157,8 @@ def _owner(analysis: Analysis, generic: int, names: list[int], gain: float | Non
     own = plain_covariates(scene.groups[generic].covariates) - {"x", "y", "z"}
     for g in names:
         covariates = plain_covariates(scene.groups[g].covariates)
+        if scene.groups[g].name.startswith(RUNOUT):  # a runout of any law is a matter of the angles of its own beam
+            covariates |= {"azimuth", "elevation", f"station_{scene.groups[g].name.removeprefix(RUNOUT)}"}
         if own and own <= covariates and gain < SHAPE_SHARE * evidence.chi2[g]:
             return g
     return None
@@ -214,7 +223,8 @@ def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: li
     if not found and directed:
         for item in directed[:3]:
             group = scene.groups[item.group]
-            found.append(Unknown(group.covariates, group.direction, float("nan"), group.name, item.group))
+            nearest = _nearest(analysis, item.group, item.evidence)
+            found.append(Unknown(group.covariates, group.direction, float("nan"), group.name, item.group, nearest))
     if not found and evidence.lack_of_fit_z > 3.0 and not shaped:
         found.append(Unknown((), "", float("nan"), "lines disagree with the model by more than their repeats do"))
     if evidence.changes_between_runs:
@@ -225,13 +235,30 @@ def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: li
 def _of_group(analysis: Analysis, g: int) -> Unknown:
     group: Group = analysis.scene.groups[g]
     shape = contribution(analysis.scene, analysis.chosen, g)[2]
-    return Unknown(group.covariates, group.direction, float(np.sqrt(np.mean(shape**2))), group.name, g)
+    nearest = _nearest(analysis, g, analysis.evidence.chi2[g])
+    return Unknown(group.covariates, group.direction, float(np.sqrt(np.mean(shape**2))), group.name, g, nearest)
+
+
+def _nearest(analysis: Analysis, generic: int, chi2: float) -> str:
+    """Name that explains most in the place of a generic group; none if it explains too little or is there already."""
+    scene = analysis.scene
+    rest = [g for g in analysis.chosen.members if g != generic]
+    present = {scene.groups[g].name for g in rest}
+    named = [
+        g for g, group in enumerate(scene.groups)
+        if group.tier == "named" and scene.size(g) and group.name not in present
+    ]  # fmt: skip
+    if not named:
+        return ""
+    own = gains(scene, beside(scene, rest), named)
+    best = int(np.argmax(own))
+    return scene.groups[named[best]].name if own[best] > RESEMBLES * chi2 else ""
 
 
 def _resembling(analysis: Analysis, item: Named) -> Unknown:
     group = analysis.scene.groups[item.group]
     text = f"resembles {item.name} but {item.reasons[0] if item.reasons else 'is not certain'}"
-    return Unknown(tuple(sorted(plain_covariates(group.covariates))), "", float("nan"), text, None)
+    return Unknown(tuple(sorted(plain_covariates(group.covariates))), "", float("nan"), text, None, item.name)
 
 
 def _invisible(analysis: Analysis) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 #: Names that describe noise or a gross error, not an effect.
-NOISE_NAMES = ("outliers", "variance_trend", "autocorrelated_noise", "quantisation")
+NOISE_NAMES = ("outliers", "variance_trend", "autocorrelated_noise", "quantisation", "disturbed_readings")
 #: Effects outside the lists for which a name is right all the same.
 RIGHT_NAMES = {"table_jump": "machine_jump"}
 NORMAL_95 = 1.959964
