@@ -33,6 +33,8 @@ BURSTS, LONGEST_BURST = (2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48), 0.03
 #: Mean square in a burst beyond the median of all windows of its length, in robust standard deviations of these. Noise
 #: that wanders alike at all stations has one degree of freedom in a window: 30 is beyond one window in 50,000 then.
 LOUD = 30.0
+#: Stops at the ends of a burst below this many times the median mean square do not belong to it.
+QUIET = 5.0
 #: Most bursts, and rounds in which the fit is repeated without them.
 MOST_BURSTS = 3
 #: Deviate of the slope of the variance against time that counts as a trend.
@@ -140,7 +142,15 @@ def _loudest(layout: Layout, square: FloatArray) -> tuple[int, int] | None:
         gain = length * (ratio - 1.0 - np.log(max(ratio, 1.0)))
         if mean[start] - middle > LOUD * spread > 0.0 and (best is None or gain > best[0]):
             best = (gain, (start, start + length - 1))
-    return None if best is None else best[1]
+    if best is None:
+        return None
+    first, last = best[1]
+    quiet = QUIET * float(np.median(power))
+    while first < last and power[first] < quiet:
+        first += 1
+    while first < last and power[last] < quiet:
+        last -= 1
+    return first, last
 
 
 def disturbed_class(bursts: Sequence[Burst], *, left_out: bool) -> list[Classed]:
