@@ -17,7 +17,6 @@ from compgen.core.files import OutputFolder
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, error_named
-from compgen.core.text import one_line
 from compgen.errors import InputError
 from compgen.imports import Imported, ImportOptions, import_file, own_kind
 from compgen.imports.result import KINDS
@@ -26,7 +25,7 @@ _HELP = {
     "kind": "What the file holds; default: told by its columns.",
     "map": "FIELD=COLUMN: position, actual, deviation, correction, direction, run, axis; x, y, z, length, station, point; "
     "dx, dy, dz, xa, ya, za; error, value; temperature, temp_NAME, time, date, feed, load, tool_x, approach_x, repeat, line, "
-    "block, setup, pose, u_value. May be given several times.",
+    "block, setup, pose, u_value; run1+, run1-, run2 (a column of one run). May be given several times.",
     "unit": "FIELD=UNIT, e.g. deviation=um, position=mm, or UNIT alone for the values; linear=, angle= of "
     "errors. um, mm, nm, m, in; urad, mrad, arcsec, "
     "rad, deg; temp_NAME=degC, K, degF; time=s, ms, min, h; feed=mm/min; load=kg.",
@@ -38,6 +37,7 @@ _HELP = {
     "dates": "Order of dates such as 03/04/2025 (never guessed): day, month, year.",
     "decimal": "Decimal mark of a table; the other one parts thousands (asked for where 1,000 may be either).",
     "zero_runs": "Laser runs that are zero at every target: not made (drop) or measured (keep).",
+    "ignore": "Column, or sheet of a workbook, that is left out though it holds numbers (may be given several times).",
     "machine": "Machine whose travel the positions are held against.",
     "machines": "Further folder with machine files (may be given several times).",
     "out": "Folder for the contract file; without it nothing is written.",
@@ -71,6 +71,7 @@ def _pairs(given: Sequence[str], option: str, alone: str | None = None) -> dict[
 @click.option("--dates", type=click.Choice(("dmy", "mdy", "ymd")), help=_HELP["dates"])
 @click.option("--decimal", type=click.Choice(("comma", "point")), help=_HELP["decimal"])
 @click.option("--zero-runs", type=click.Choice(("drop", "keep")), help=_HELP["zero_runs"])
+@click.option("--ignore", metavar="NAME", multiple=True, help=_HELP["ignore"])
 @click.option("--machine", metavar="MACHINE", help=_HELP["machine"])
 @click.option("--machines", multiple=True, type=click.Path(path_type=Path), help=_HELP["machines"])
 @click.option("--out", metavar="DIR", type=click.Path(path_type=Path), help=_HELP["out"])
@@ -151,11 +152,11 @@ def _show(summary: Mapping[str, Any]) -> None:
     for line in _lines(summary["understood"]):
         stdout.print(f"  {line}", soft_wrap=True)
     for text in summary["notes"]:
-        stdout.print(f"note: {one_line(text)}", soft_wrap=True)
+        stdout.print(f"note: {_printable(text)}", soft_wrap=True)
     for text in (summary["machine"] or {}).get("outside", []):
         stdout.print(f"outside: {text}", style="red", soft_wrap=True)
     for text in summary["doubts"]:
-        stdout.print(f"open: {one_line(text)}", style="yellow", soft_wrap=True)
+        stdout.print(f"open: {_printable(text)}", style="yellow", soft_wrap=True)
     for path in summary["files"]:
         stdout.print(f"  {path}", soft_wrap=True)
     if summary["doubts"]:

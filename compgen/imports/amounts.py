@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
 from compgen.errors import InputError
-from compgen.imports.columns import MM_PER_LENGTH, Column, quantity_of, way
+from compgen.imports.columns import MM_PER_LENGTH, Column, quantity_of
 from compgen.imports.findings import Findings
+from compgen.imports.run_names import way
 from compgen.imports.source import parse_number, shown
 from compgen.imports.units import CELSIUS, Quantity, further_unit, units_of
 

@@ -42,13 +42,19 @@ _UNIT_WORDS = {
 FIELDS: Mapping[str, tuple[str, ...]] = {
     "position": ("position", "pos", "target", "targetposition", "nominal", "nominalposition", "soll", "sollposition",
                  "sollwert", "command", "commanded", "cmd", "setpoint", "targets", "zielposition", "axisposition",
-                 "posizione", "posicion", "cible", "consigne",
-                 "\u4f4d\u7f6e", "\u76ee\u6807\u4f4d\u7f6e"),
+                 "sollpos", "zielpos", "targetpos", "nominalpos", "sollpositionen", "positionen", "positions", "messposition",
+                 "messpunkt", "stutzpunkt", "posizione", "posizionenominale", "quota", "posicion", "posicionnominal", "cota",
+                 "positionnominale", "positioncible", "positioncommandee", "cible", "consigne", "cote", "objetivo",
+                 "\u4f4d\u7f6e", "\u76ee\u6807\u4f4d\u7f6e", "\u6307\u4ee4\u4f4d\u7f6e", "\u5750\u6807",
+                 "\u540d\u4e49\u4f4d\u7f6e", "\u7406\u8bba\u4f4d\u7f6e", "\u76ee\u6807"),
     "actual": ("actual", "actualposition", "measured", "measuredposition", "ist", "istposition", "istwert", "reading",
-               "laserreading", "laserposition", "measurement", "mesure", "misura", "medida"),
+               "laserreading", "laserposition", "measurement", "mesure", "misura", "medida", "positionmesuree",
+               "posizionemisurata", "posicionmedida", "gemessen", "messwert", "\u5b9e\u6d4b", "\u5b9e\u6d4b\u503c",
+               "\u5b9e\u9645\u4f4d\u7f6e"),
     "deviation": ("deviation", "dev", "error", "err", "abweichung", "positionsabweichung", "fehler", "diff", "difference",
                   "delta", "poserror", "positionerror", "positioningerror", "positiondeviation", "ecart", "erreur", "scarto",
-                  "scostamento", "errore", "desviacion", "\u504f\u5dee", "\u8bef\u5dee"),
+                  "scostamento", "errore", "desviacion", "abw", "positionsfehler", "positionierabweichung", "abweichungen",
+                  "\u504f\u5dee", "\u8bef\u5dee"),
     "correction": ("correction", "compensation", "comp", "korrektur", "korrekturwert", "compensationvalue",
                    "correzione", "correccion"),
     "direction": ("direction", "dir", "richtung", "approach", "fahrtrichtung", "way", "anfahrrichtung",
@@ -60,19 +66,28 @@ FIELDS: Mapping[str, tuple[str, ...]] = {
     "point": ("point", "pointid", "pt", "punkt", "pointno", "pointname", "target id", "id", "no", "nr"),
     "length": ("length", "displacement", "distance", "laenge", "lange", "laserlength", "laser", "range", "abstand",
                "longueur", "lunghezza", "longitud", "distanza"),
-    "x": ("x", "xcmd", "xcommanded", "xnom", "xnominal", "xsoll", "xpos", "xposition", "commandedx", "nominalx", "xtarget"),
-    "y": ("y", "ycmd", "ycommanded", "ynom", "ynominal", "ysoll", "ypos", "yposition", "commandedy", "nominaly", "ytarget"),
-    "z": ("z", "zcmd", "zcommanded", "znom", "znominal", "zsoll", "zpos", "zposition", "commandedz", "nominalz", "ztarget"),
-    "dx": ("dx", "xdev", "xerror", "xdeviation", "deltax", "errorx", "ex", "devx", "xabweichung"),
-    "dy": ("dy", "ydev", "yerror", "ydeviation", "deltay", "errory", "ey", "devy", "yabweichung"),
-    "dz": ("dz", "zdev", "zerror", "zdeviation", "deltaz", "errorz", "ez", "devz", "zabweichung"),
+    "x": ("x", "xcmd", "xcommanded", "xnom", "xnominal", "xsoll", "xpos", "xposition", "commandedx", "nominalx", "xtarget",
+          "xachse", "xaxis", "axex", "assex", "ejex", "positionx"),
+    "y": ("y", "ycmd", "ycommanded", "ynom", "ynominal", "ysoll", "ypos", "yposition", "commandedy", "nominaly", "ytarget",
+          "yachse", "yaxis", "axey", "assey", "ejey", "positiony"),
+    "z": ("z", "zcmd", "zcommanded", "znom", "znominal", "zsoll", "zpos", "zposition", "commandedz", "nominalz", "ztarget",
+          "zachse", "zaxis", "axez", "assez", "ejez", "positionz"),
+    "dx": ("dx", "xdev", "xerror", "xdeviation", "deltax", "errorx", "ex", "devx", "xabweichung",
+           "abweichungx", "deviationx", "positionsabweichungx",
+           "fehlerx", "xfehler"),
+    "dy": ("dy", "ydev", "yerror", "ydeviation", "deltay", "errory", "ey", "devy", "yabweichung",
+           "abweichungy", "deviationy", "positionsabweichungy",
+           "fehlery", "yfehler"),
+    "dz": ("dz", "zdev", "zerror", "zdeviation", "deltaz", "errorz", "ez", "devz", "zabweichung",
+           "abweichungz", "deviationz", "positionsabweichungz",
+           "fehlerz", "zfehler"),
     "xa": ("xactual", "xmeasured", "xmeas", "xist", "actualx", "measuredx", "xact"),
     "ya": ("yactual", "ymeasured", "ymeas", "yist", "actualy", "measuredy", "yact"),
     "za": ("zactual", "zmeasured", "zmeas", "zist", "actualz", "measuredz", "zact"),
     "error": ("errorname", "parameter", "component", "parametername"),
     "value": ("value", "wert"),
     "u_value": ("uvalue", "ulength", "udeviation", "standarduncertainty", "standardunsicherheit"),
-    "date": ("date", "datum", "messdatum", "measurementdate", "testdate", "fecha"),
+    "date": ("date", "datum", "messdatum", "measurementdate", "testdate", "fecha", "\u65e5\u671f"),
     "time": ("time", "zeit", "times", "timestamp", "elapsed", "datetime", "dateandtime", "datumzeit", "datumuhrzeit",
              "zeitstempel", "uhrzeit", "messzeit", "temps", "heure", "tempo", "ora", "tiempo", "hora"),
     "tool_x": ("toolx", "tooloffsetx", "xtool", "xtooloffset", "werkzeugx", "werkzeugversatzx"),
@@ -93,33 +108,11 @@ FIELDS: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 #: A channel of temperature that the user names by --map temp_NAME=COLUMN.
 CHANNEL = re.compile(r"temp_[a-z0-9_]{1,30}")
+#: A column of one run that the user names by --map run3-=COLUMN: number, and direction if one is given.
+RUN_FIELD = re.compile(r"run(\d{1,3})([+\-]?)")
 _TEMPERATURE = re.compile(r"(?<!at)temp(?!o|late|s$)")
 _BRACKETS = re.compile(r"\s*[\[(<{]\s*([^\])>}]{1,20}?)\s*[\])>}]\s*")
 _SUFFIX = re.compile(r"^(.*?\w)[\s_/,]+([a-zA-Z\u00b0\u00b5\u03bc\"']{1,12}|um/m|mm/m|m{1,2}/min|m{1,2}/s)$")
-_WAYS_UP = (
-    "+",
-    "+1",
-    "1",
-    "1.0",
-    "up",
-    "u",
-    "fwd",
-    "forward",
-    "positive",
-    "pos",
-    "plus",
-    "vor",
-    "vorwarts",
-    "\u2191",
-    "\u2192",
-    ">",
-)
-_WAYS_DOWN = ("-", "-1", "-1.0", "down", "d", "bwd", "backward", "back", "reverse", "rev", "negative", "neg", "minus", "ruck",
-              "ruckwarts", "zuruck", "\u2193", "\u2190", "<")  # fmt: skip
-_RUN_COLUMN = re.compile(
-    r"(?:(?P<before>[a-z+\-]{1,10}?)[\s_]*)??(?:run|lauf|cycle|messung|messreihe|measurement|pass|r|m|n)?[\s_#.]*"
-    r"(?P<number>\d{1,3})[\s_]*(?P<after>[a-z]{1,10}|[+\-\u2191\u2193\u2190\u2192<>])?"
-)
 
 
 @dataclass(frozen=True)
@@ -129,15 +122,6 @@ class Column:
     name: str
     word: str
     unit: str | None
-
-
-@dataclass(frozen=True)
-class RunColumn:
-    """A column of readings of one run: its name, number, and direction (0: not in the name)."""
-
-    name: str
-    number: int
-    direction: int
 
 
 def known_unit(text: str) -> str | None:
@@ -188,15 +172,16 @@ def quantity_of(word: str) -> Quantity | None:
 
 
 def _word(text: str) -> str:
-    return re.sub(r"[^a-z0-9\u4e00-\u9fff]", "", unicodedata.normalize("NFKD", text).lower())
+    flat = unicodedata.normalize("NFKD", text).lower().replace("x\u0304", "mean")  # x with a bar is no coordinate
+    return re.sub(r"[^a-z0-9\u4e00-\u9fff]", "", flat)
 
 
-def fields_of(header: Sequence[str], given: Mapping[str, str]) -> dict[str, Column]:
-    """Return the column of each field: those that the user gave, then those whose name says so.
+def fields_of(header: Sequence[str], given: Mapping[str, str], ignored: Sequence[str] = ()) -> dict[str, Column]:
+    """Return the column of each field: those that the user gave, then those whose name says so, but none of ``ignored``.
 
     Raises InputError for a field or column that does not exist.
     """
-    columns = [split_name(name) for name in header]
+    columns = [split_name(name) for name in header if name not in ignored]
     found: dict[str, Column] = {}
     for key, name in given.items():
         check_field(key, "--map")
@@ -216,44 +201,12 @@ def fields_of(header: Sequence[str], given: Mapping[str, str]) -> dict[str, Colu
 
 def check_field(key: str, option: str) -> None:
     """Raise InputError for a name that is no field of a table."""
-    if key not in FIELDS and key != "temperature" and not CHANNEL.fullmatch(key):
-        raise InputError(f"{key!r} is no field; {nearest(key, [*FIELDS, 'temperature', 'temp_NAME'])}", field=option)
+    if key not in FIELDS and key != "temperature" and not CHANNEL.fullmatch(key) and not RUN_FIELD.fullmatch(key):
+        known = [*FIELDS, "temperature", "temp_NAME", "run1+", "run1-"]
+        raise InputError(f"{key!r} is no field; {nearest(key, known)}", field=option)
 
 
 def error_columns(header: Sequence[str]) -> dict[str, Column]:
     """Return the columns that are called like the errors of ISO 230-1."""
     columns = [split_name(name) for name in header]
     return {column.word.upper(): column for column in columns if column.word.upper() in ERROR_NAMES}
-
-
-def way(text: str) -> int | None:
-    """Return the direction that a cell names, +1 or -1; None if it names none.
-
-    >>> way("forward"), way("-"), way("1"), way("x")
-    (1, -1, 1, None)
-    """
-    flat = unicodedata.normalize("NFKD", text.strip().lower())
-    word = "".join(char for char in flat if not unicodedata.combining(char))
-    if word in _WAYS_UP:
-        return 1
-    return -1 if word in _WAYS_DOWN else None
-
-
-def run_columns(header: Sequence[str], taken: Sequence[str]) -> list[RunColumn]:
-    """Return the columns that hold one run each, such as ``Run 1 +``, ``fwd2``, ``r3``.
-
-    >>> run_columns(["target", "Run 1+", "Run 1-", "bwd 2"], ["target"])[1:]
-    [RunColumn(name='Run 1-', number=1, direction=-1), RunColumn(name='bwd 2', number=2, direction=-1)]
-    """
-    found = []
-    for name in header:
-        if name in taken:
-            continue
-        bare = _BRACKETS.sub(" ", name).strip().lower()
-        match = _RUN_COLUMN.fullmatch(bare)
-        if match:
-            parts = [part for part in (match.group("before"), match.group("after")) if part]
-            ways = [way(part) for part in parts if part not in FIELDS["deviation"]]
-            if None not in ways:
-                found.append(RunColumn(name, int(match.group("number")), next((one for one in ways if one), 0)))
-    return found

@@ -14,7 +14,7 @@ from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, Column, known_
 from compgen.imports.grid import Table
 from compgen.imports.hypotheses import ABSURD_DECADES, Verdict, decades_off, unit_of_deviations, unit_of_positions
 from compgen.imports.result import ImportOptions
-from compgen.imports.source import shown
+from compgen.imports.source import parse_number, shown
 
 #: Units that are weighed when a file says none.
 _LENGTHS = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "nm", "in")}
@@ -23,7 +23,10 @@ _ANGLES = {name: RAD_PER_ANGLE[name] for name in ("urad", "mrad", "arcsec", "deg
 
 @dataclass
 class Findings:
-    """One table being read; ``fields`` holds its columns by field, ``used`` the names of columns that gave values."""
+    """One table being read; ``fields`` holds its columns by field, ``used`` the names of columns that gave values.
+
+    ``checked_sign`` says that a second column has shown the sign of the values.
+    """
 
     table: Table
     fields: Mapping[str, Column]
@@ -32,10 +35,16 @@ class Findings:
     doubts: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
+    checked_sign: bool = False
 
     def numbers(self, key: str) -> FloatArray:
         """Return the column of a field as it stands (rows,)."""
         return np.array(self.table.numbers(self.fields[key].name))
+
+    def is_numeric(self, name: str) -> bool:
+        """Whether at least half of the filled cells of a column are numbers; False for an empty one."""
+        filled = [cell for cell in self.table.column(name) if cell]
+        return bool(filled) and 2 * sum(parse_number(cell) is not None for cell in filled) >= len(filled)
 
     def given_unit(self, key: str, *, value: bool = False) -> str | None:
         """Return the unit that the user gave for a field (``value``: also by the word value), or None."""

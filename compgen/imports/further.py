@@ -5,6 +5,7 @@ A column that has a place in the contract file is taken along; every other one i
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -29,7 +30,27 @@ from compgen.imports.columns import CHANNEL, Column, split_name
 from compgen.imports.findings import Findings
 from compgen.imports.moments import date_in_header, times_of
 from compgen.imports.result import Kind
-from compgen.imports.units import KG_PER_MASS, MM_MIN_PER_FEED, Quantity
+from compgen.imports.source import shown
+from compgen.imports.units import KG_PER_MASS, MM_MIN_PER_FEED, Quantity, further_unit
+
+#: Why a column is not used that the user left out.
+LEFT_OUT = "left out by --ignore"
+#: Parts of names of columns that hold no reading, in the languages of FIELDS; such columns may be left out.
+_HARMLESS = (
+    "deadpath", "totstrecke", "totweg", "pressure", "druck", "pression", "presion", "humid", "feuchte", "umidita", "humedad",
+    "wavelength", "wellenlange", "refractive", "brechung", "intensity", "intensitat", "signal", "quality", "strength", "beam",
+    "snr", "power", "leistung", "torque", "expansion", "ausdehnung", "voltage", "spannung",
+    "status", "flag", "uncertainty", "unsicherheit", "remark", "comment", "bemerkung", "kommentar", "note", "nota",
+    "remarque", "osservazioni", "operator", "bediener", "serial", "dwell",
+)  # fmt: skip
+#: Fields of readings: one that is left over may be what was meant.
+_READINGS = ("actual", "deviation", "correction", "value", "length", "x", "y", "z", "dx", "dy", "dz", "xa", "ya", "za")
+#: Names of columns that count the rows.
+_INDEX = ("i", "no", "nr", "n", "index", "count", "number", "nummer", "lfdnr", "posnr", "point", "pointno", "punkt", "punktnr",
+          "zielnr", "targetno", "targetnumber", "step", "schritt", "sample", "row", "zeile", "numero", "num", "id",
+          "\u5e8f\u53f7", "\u7f16\u53f7")  # fmt: skip
+#: Units in brackets that are neither a length nor an angle.
+_OTHER_UNIT = re.compile(r"(?i)[\[(]\s*(%|%\s?rh|rh|[hkm]?pa|m?bar|mmhg|ppm|m?v|m?a|k?w|k?n|hz|rpm|1/min|db)\s*[\])]")
 
 _LABELS = ("run", "repeat", "line", "block", "setup", "pose")
 _MAIN: Mapping[str, tuple[str, ...]] = {
@@ -214,19 +235,46 @@ class _Reader:
 
     def report(self, *, once: bool) -> None:
         """Name the columns that were not used."""
-        left = [name for name in self.findings.table.header if name not in self.used]
         why = "it has no place in the contract file" if once else "it stands once beside several runs"
-        unused = {name: self.reasons.get(name, why) for name in left}
-        for name, reason in list(unused.items()):
+        unused = {}
+        for name in self.findings.table.header:
             column = split_name(name)
-            blank = not any(self.findings.table.column(name))
-            if blank and name.startswith("column "):
-                del unused[name]
+            if name in self.used or (name.startswith("column ") and not any(self.findings.table.column(name))):
+                continue
+            reason = self.reasons.get(name, why)
+            if name in self.findings.options.ignore:
+                reason = LEFT_OUT
             elif name not in self.reasons and column.word in ("uncertainty", "unsicherheit", "u"):
-                unused[name] = f"{reason}; a standard uncertainty (k = 1) of lengths is named by --map u_value=..."
+                reason = f"{reason}; a standard uncertainty (k = 1) of lengths is named by --map u_value=..."
+            elif name not in self.reasons and not self._has_known_name(column) and self.findings.is_numeric(name):
+                reason = self._not_understood(column)
+            unused[name] = reason
         if unused:
             self.findings.understood["not_used"] = unused
             self.findings.notes.append(f"not used: {', '.join(unused)}")
+
+    def _has_known_name(self, column: Column) -> bool:
+        """Whether the name of a column says what it holds, and that it is no reading: so it may be left out."""
+        words = re.sub(r"[^a-z]", "", column.word)
+        known = [field for key, field in self.findings.fields.items() if key not in _READINGS]
+        return (
+            column in known
+            or is_temperature(column)
+            or further_unit(column.unit or "") is not None
+            or any(word in words for word in _HARMLESS)
+            or column.word in _INDEX
+            or _OTHER_UNIT.search(column.name) is not None
+        )
+
+    def _not_understood(self, column: Column) -> str:
+        """Ask about a column of numbers: what looks like data is never left out without a word of the user."""
+        run = " --map run1-=... (a run and its direction)," if self.kind == "axis" else ""
+        name = shown(column.name)
+        self.findings.doubts.append(
+            f"column {name} holds numbers and is not understood; say what it is, --map FIELD={column.name},{run} or leave it "
+            f"out: --ignore {name}"
+        )
+        return "it is not understood"
 
 
 def metadata_of(findings: Findings, further: Further) -> dict[str, str]:

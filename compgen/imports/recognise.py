@@ -45,6 +45,7 @@ _FLAGS = {
     "dates": "--dates",
     "decimal": "--decimal",
     "zero_runs": "--zero-runs",
+    "ignore": "--ignore",
 }
 _ONE_AXIS = ("axis", "error", "sign", "directions", "dates")
 #: What each format leaves to the user.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -45,6 +45,7 @@ class ImportOptions:
     decimal : decimal mark of a table, where its numbers do not show it.
     zero_runs : what becomes of laser runs that are zero at every target.
     dates : order of day, month and year where the file writes them as numbers.
+    ignore : columns, or sheets of a workbook, that are left out though they hold numbers.
     """
 
     kind: Kind | None = None
@@ -58,6 +59,7 @@ class ImportOptions:
     dates: Order | None = None
     decimal: Literal["comma", "point"] | None = None
     zero_runs: Literal["drop", "keep"] | None = None
+    ignore: Sequence[str] = ()
 
 
 @dataclass(frozen=True)

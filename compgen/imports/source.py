@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from compgen.core.files import read_bytes
-from compgen.core.text import one_line
 from compgen.errors import InputError
 
 MEGABYTE = 1_000_000
@@ -157,6 +156,6 @@ def parse_number(word: str) -> float | None:
     return value if abs(value) < LARGEST else None
 
 
-def shown(word: object) -> str:
-    """Return a cell of a user's file for a message: one line, short, printable."""
-    return repr(one_line(word)[:40])
+def shown(word: object, most: int = 40) -> str:
+    """Return a cell of a user's file for a message: one line, short, in its own script; repr escapes what is not printable."""
+    return repr(" ".join(str(word).split())[:most])

@@ -9,15 +9,19 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.core.names import AXES
+from compgen.errors import InputError
 from compgen.identify.axis_runs import SAME_TARGET_MM
 from compgen.imports.amounts import labels_of
-from compgen.imports.columns import FIELDS, MM_PER_LENGTH, RunColumn, run_columns, split_name, way
+from compgen.imports.columns import FIELDS, MM_PER_LENGTH, RUN_FIELD, split_name
 from compgen.imports.findings import Findings
 from compgen.imports.further import Further, further_of
 from compgen.imports.hypotheses import USUAL_URAD, slope_of, usual_deviation_mm
 from compgen.imports.one_axis import IntArray, OneAxis, axis_in, cycles, motion, remarks
-from compgen.imports.source import shown
+from compgen.imports.run_names import RunColumn, run_columns, run_in, statistic_in, unaccented, way
+from compgen.imports.source import parse_number, shown
 
+#: Units that are tried for deviations without one, mm.
+_LIKELY = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "in", "nm")}
 #: A column without a telling name holds readings, not deviations, if it follows the targets so closely.
 FOLLOWS = 1e-2
 _TELLING = (
@@ -30,6 +34,12 @@ _TELLING = (
     "scarto",
     "errore",
     "desviac",
+    "accuracy",
+    "genauigkeit",
+    "precision",
+    "precisione",
+    "3441",
+    "\u7cbe\u5ea6",
     "\u504f\u5dee",
     "\u8bef\u5dee",
 )
@@ -69,22 +79,29 @@ def axis_readings(findings: Findings, *, angular: bool = False) -> tuple[dict[st
 
 def _rows(findings: Findings) -> _Rows:
     fields, header = findings.fields, findings.table.header
+    taken = [*(column.name for column in fields.values()), *findings.options.ignore]
+    given = [(RUN_FIELD.fullmatch(key), column.name) for key, column in fields.items()]
+    said = [RunColumn(name, int(key[1]), {"+": 1, "-": -1, "": 0}[key[2]]) for key, name in given if key]
+    wide = [*said, *run_columns(header, taken)]
     key = next((name for name in ("actual", "deviation", "correction", "value") if name in fields), None)
-    wide = run_columns(header, [column.name for column in fields.values()])
+    if key is not None and said:
+        raise InputError(f"columns of runs are named, and {fields[key].name!r} holds {key}s: leave it out with --ignore",
+                         file=findings.table.grid.path, field="--map")  # fmt: skip
     if key is None and not wide:
         raise findings.table.grid.fail(
-            f"has positions but no deviations or readings; the header has {shown(', '.join(header))}; "
-            "give --map deviation=COLUMN",
+            f"has positions but no deviations or readings; the header has {shown(', '.join(header), 200)}; "
+            "give --map deviation=COLUMN, or --map run1+=COLUMN, run1-=COLUMN ... for a column each run",
             findings.table.header_line,
         )
-    labels = _labels(findings)
-    findings.used |= {fields[key].name} if key else {column.name for column in wide}
     if key is None:
-        return _wide(findings, wide, labels)
+        return _wide(findings, wide)
+    key = _compared(findings, key)
+    findings.used.add(fields[key].name)
     values = findings.numbers(key)
-    run = np.zeros(len(values), dtype=np.int64)
+    run, labels = np.zeros(len(values), dtype=np.int64), _labels(findings)
     if "run" in fields:
-        run = labels_of(findings, fields["run"])
+        run, ways = _runs_in_cells(findings)
+        labels = ways if ways is not None and not labels.any() else labels
         gaps = sorted(set(range(1, min(int(run.max()), 10_000) + 1)) - set(run.tolist()))
         if 0 < len(gaps) <= len(np.unique(run)):
             findings.notes.append(f"there is no run {', '.join(map(str, gaps[:8]))}")
@@ -93,7 +110,14 @@ def _rows(findings: Findings) -> _Rows:
 
 
 def _labels(findings: Findings) -> IntArray:
+    """Directions as a column names them (rows,), 0 without such a column; signs of the axis count too (X+, X-)."""
     rows = len(findings.table.rows)
+    signed = "axis" in findings.fields and "direction" not in findings.fields
+    if signed:
+        cells = findings.table.column(findings.fields["axis"].name)
+        signs = [(cell.strip()[:1] + cell.strip()[-1:]).replace("\u2212", "-") for cell in cells]
+        if all("+" in sign or "-" in sign for sign in signs):
+            return np.array([1 if "+" in sign else -1 for sign in signs], dtype=np.int64)
     if "direction" not in findings.fields:
         return np.zeros(rows, dtype=np.int64)
     name = findings.fields["direction"].name
@@ -102,22 +126,159 @@ def _labels(findings: Findings) -> IntArray:
         one = way(cell)
         if one is None:
             empty = findings.table.grid.empty if not cell else ""
-            raise findings.table.grid.fail(f"{shown(cell)} is no direction{empty}; +1 or -1 is due", line, name)
+            raise findings.table.grid.fail(
+                f"{shown(cell)} is no direction{empty}; write + or -, +1 or -1, forward or backward (known in several "
+                "languages)",
+                line,
+                name,
+            )
         ways.append(one)
     return np.array(ways, dtype=np.int64)
 
 
-def _wide(findings: Findings, columns: Sequence[RunColumn], labels: IntArray) -> _Rows:
+def _runs_in_cells(findings: Findings) -> tuple[IntArray, IntArray | None]:
+    """Return numbers of runs, and directions where every cell of that column names one as well (1+, 1-, Lauf 2 vor)."""
+    column = findings.fields["run"]
+    cells = findings.table.column(column.name)
+    read = {cell: run_in(cell) for cell in dict.fromkeys(cells)}
+    named = [item for item in read.values() if item is not None and item.direction and parse_number(item.name) is None]
+    if not named:
+        return labels_of(findings, column), None
+    unknown = next((k for k, cell in enumerate(cells) if (item := read[cell]) is None or not item.direction), None)
+    if unknown is not None:
+        message = f"{shown(cells[unknown])} names no direction, other cells of this column do ({shown(named[0].name)})"
+        raise findings.table.grid.fail(message, findings.table.lines[unknown], column.name)
+    runs = [item for cell in cells if (item := read[cell]) is not None]
+    number = np.array([item.number for item in runs], dtype=np.int64)
+    return number, np.array([item.direction for item in runs], dtype=np.int64)
+
+
+def _compared(findings: Findings, key: str) -> str:
+    """Hold deviations or corrections that are printed beside the readings against them; return the field that counts.
+
+    The finer one counts where both agree; where they do not, or differ in sign, the user is asked.
+    """
+    for other, sign in (("deviation", 1.0), ("correction", -1.0)):
+        if other not in findings.fields or other == key or key not in ("actual", "deviation"):
+            continue
+        name, counting = findings.fields[other].name, findings.fields[key].name
+        if not findings.is_numeric(name):
+            continue
+        held, held_mm, digit = _reference(findings, key)
+        if held is None:
+            continue
+        values, own_digit = np.array(findings.table.numbers(name, empty=True)), _last_digit(findings, name)
+        declared = findings.given_unit(other, value=True) or findings.fields[other].unit
+        one = MM_PER_LENGTH.get(declared or "")
+        scales = list(_LIKELY.values()) if one is None else [one]
+        found = set()
+        for scale, turned in ((scale / held_mm, turned) for scale in scales for turned in (1.0, -1.0)):
+            away = np.abs(np.nan_to_num(turned * sign * values * scale - held))
+            if away.max() <= 0.55 * (2.0 * digit + own_digit * scale) + 1e-12:
+                found.add(turned)
+        findings.used.add(name)
+        if 1.0 in found:
+            findings.notes.append(f"{name!r} agrees with {counting!r}")
+            findings.checked_sign |= found == {1.0}
+            if key == "actual" and other == "deviation" and declared and own_digit * scales[0] / held_mm < digit:
+                findings.used.add(counting)
+                findings.notes.append(f"{name!r} has more digits and is taken")
+                return other
+            continue
+        what = "has the opposite sign of" if found else "disagrees with"
+        pair = f"{counting!r} minus target" if key == "actual" else repr(counting)
+        findings.doubts.append(f"{name!r} {what} {pair}; leave out the wrong one: --ignore COLUMN")
+    return key
+
+
+def _reference(findings: Findings, key: str) -> tuple[FloatArray | None, float, float]:
+    """Return the deviations by which others are judged, mm per unit of them, and the value of their last digit.
+
+    None where readings do not follow the targets in a known unit; that is asked for elsewhere.
+    """
+    values, digit = findings.numbers(key), _last_digit(findings, findings.fields[key].name)
+    unit = findings.given_unit(key, value=key == "deviation") or findings.fields[key].unit
+    if key == "deviation":
+        return (values if unit in MM_PER_LENGTH else None), MM_PER_LENGTH.get(unit or "", 1.0), digit
+    target = findings.numbers("position")
+    position_unit = findings.given_unit("position") or findings.fields["position"].unit or "mm"
+    ratio = slope_of(target, values).unit_ratio
+    if ratio is None or position_unit not in MM_PER_LENGTH:
+        return None, 1.0, digit
+    return values / ratio - target, MM_PER_LENGTH[position_unit], digit / ratio
+
+
+def _last_digit(findings: Findings, name: str) -> float:
+    """Return the value of the last digit that a column is written with."""
+    decimals = [len(cell.partition(".")[2]) for cell in findings.table.column(name) if "e" not in cell.lower()]
+    return float(10.0 ** -max(decimals, default=0))
+
+
+def _wide(findings: Findings, columns: Sequence[RunColumn]) -> _Rows:
     """Columns of runs, one after the other; an empty cell is a reading that was not taken."""
+    labels = _labels(findings)
+    _check_wide(findings, columns)
+    findings.used |= {column.name for column in columns}
     parts = []
     for column in columns:
         values = np.array(findings.table.numbers(column.name, empty=True))
         row = np.flatnonzero(np.isfinite(values)).astype(np.int64)
         label = np.full(len(row), column.direction) if column.direction else labels[row]
         parts.append((row, np.full(len(row), column.number), label, values[row]))
+        if not len(row):
+            findings.notes.append(f"{column.name!r} is empty")
+    _statistics(findings, columns)
     row, run, label, value = (np.concatenate([part[k] for part in parts]) for k in range(4))
     first = columns[0]
     return _Rows(row, run.astype(np.int64), label.astype(np.int64), value, "deviation", first.name)
+
+
+def _check_wide(findings: Findings, columns: Sequence[RunColumn]) -> None:
+    """Refuse two columns for one run in one direction, and runs in different units."""
+    seen: dict[tuple[int, int], str] = {}
+    for column in columns:
+        earlier = seen.setdefault((column.number, column.direction), column.name)
+        if earlier != column.name:
+            message = f"{shown(earlier)} and {shown(column.name)} are the same run and direction; say which is which: "
+            raise findings.table.grid.fail(message + "--map run1+=COLUMN, run1-=COLUMN ...", findings.table.header_line)
+    units = {column.name: split_name(column.name).unit for column in columns}
+    if len(set(units.values())) > 1 and findings.given_unit("deviation", value=True) is None:
+        text = ", ".join(f"{shown(name)} {unit or 'none'}" for name, unit in units.items())
+        message = f"the runs have different units ({text}); if all have one, say it with --unit deviation=UNIT"
+        raise findings.table.grid.fail(message, findings.table.header_line)
+    numbers = {way: {column.number for column in columns if column.direction == way} for way in (1, -1)}
+    if numbers[1] and numbers[-1] and numbers[1] != numbers[-1]:
+        lonely = ", ".join(str(number) for number in sorted(numbers[1] ^ numbers[-1])[:8])
+        findings.notes.append(f"run {lonely} has one direction only")
+
+
+def _statistics(findings: Findings, columns: Sequence[RunColumn]) -> None:
+    """Keep means and other statistics beside the runs out of the runs; a mean must be that of the runs."""
+    mm = MM_PER_LENGTH.get(split_name(columns[0].name).unit or "")
+    taken = {*findings.used, *(column.name for column in findings.fields.values()), *findings.options.ignore}
+    for name in findings.table.header:
+        found = statistic_in(name)
+        if name in taken or found is None:
+            continue
+        kind, way_of = found
+        findings.used.add(name)
+        findings.notes.append(f"{name!r} is a statistic over the runs, no run")
+        own = [column for column in columns if way_of in (0, column.direction)]
+        if kind != "mean" or not own or not findings.is_numeric(name):
+            continue
+        printed = np.array(findings.table.numbers(name, empty=True))
+        scale = MM_PER_LENGTH.get(split_name(name).unit or "", mm) / mm if mm else 1.0
+        runs = np.column_stack([findings.table.numbers(column.name, empty=True) for column in own])
+        known = np.isfinite(printed) & np.isfinite(runs).all(axis=1)
+        allowed = 0.55 * (_last_digit(findings, name) * scale + _last_digit(findings, own[0].name)) + 1e-9
+        away = np.where(known, np.abs(printed * scale - runs.mean(axis=1)), 0.0)
+        if away.max(initial=0.0) > allowed:
+            k = int(np.argmax(away))
+            findings.doubts.append(
+                f"{name!r} says {printed[k]:g} in line {findings.table.lines[k]}, the mean of "
+                f"{', '.join(repr(column.name) for column in own[:6])} is {runs[k].mean() / scale:.6g}: is a run missing, or one "
+                f"named wrongly? If the runs are right, --ignore {shown(name)}"
+            )
 
 
 def _deviations(findings: Findings, rows: _Rows, target: FloatArray, *, angular: bool) -> FloatArray:
@@ -142,9 +303,14 @@ def _signed(findings: Findings, key: str, values: FloatArray) -> FloatArray:
         chosen = "correction"
         findings.notes.append("the column is called a correction: its sign is turned round")
     if chosen is None:
-        words = " ".join([*findings.table.header, *findings.table.metadata, *findings.table.metadata.values()]).lower()
-        if not any(word in words for word in (*_TELLING, *FIELDS["deviation"][:1])):
-            findings.doubts.append("nothing says whether the values are errors or corrections; give --sign")
+        words = unaccented(
+            " ".join([*findings.table.header, *findings.table.metadata, *findings.table.metadata.values()])
+        )
+        if not findings.checked_sign and not any(word in words for word in (*_TELLING, *FIELDS["deviation"][:1])):
+            findings.doubts.append(
+                "nothing says whether the values are errors (measured minus target) or corrections; give --sign error or "
+                "correction"
+            )
         chosen = "error"
     findings.understood["sign"] = (
         "measured minus target" if chosen == "error" else "target minus measured, turned round"
@@ -214,7 +380,11 @@ def _directions(findings: Findings, target: FloatArray, run: IntArray, label: In
         direction = motion(target, one_way)
         findings.understood.setdefault("directions_from", "the order of the rows")
         if not direction.all():
-            findings.doubts.append("the direction of travel is not known everywhere; give --map direction=COLUMN")
+            header = shown(", ".join(findings.table.header), 200)
+            findings.doubts.append(
+                f"there is no column of directions (the header has {header}), and the order of the rows does not tell them "
+                "everywhere; give --map direction=COLUMN, or --directions alternate (odd runs up, even runs down)"
+            )
         return direction, cycles(direction, one_way)
     if not label.all():
         findings.doubts.append("some columns name a direction and some do not; give --directions alternate or motion")

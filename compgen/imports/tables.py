@@ -32,7 +32,7 @@ _MOST_HEADER = 12
 def import_table(grid: Grid, options: ImportOptions, form: str = "table") -> Imported:
     """Import one table; InputError if it is none or lacks what its kind needs."""
     table = find_table(grid, options.decimal)
-    findings = Findings(table, fields_of(table.header, options.columns), options)
+    findings = Findings(table, fields_of(table.header, options.columns, options.ignore), options)
     findings.notes.extend(table.grid.notes)
     kind = options.kind or _kind(findings)
     findings.understood["columns"] = {key: column.name for key, column in findings.fields.items()}

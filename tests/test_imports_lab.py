@@ -1,0 +1,189 @@
+"""Sheets of laboratories: names of runs in several languages, statistics beside the runs, and what is never left out."""
+
+import numpy as np
+import pytest
+
+from compgen.errors import InputError
+from compgen.imports import ImportOptions, import_file
+from compgen.imports.run_names import run_columns, statistic_in, way
+
+#: One axis, worked by hand: deviations at three targets in two runs each way, um.
+TARGETS_MM = (-800.0, -400.0, 0.0)
+RUNS_UM = {(1, 1): (1.0, 2.0, 5.0), (1, -1): (3.0, 4.5, 7.5), (2, 1): (1.2, 2.1, 5.2), (2, -1): (3.1, 4.4, 7.6)}
+ROUNDING_MM = 1e-12
+
+
+def written(tmp_path, text, name="x.csv", encoding="utf-8"):
+    path = tmp_path / name
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+def assert_is_the_example(data, runs_um=RUNS_UM, axis=0):
+    """Every reading with its sign, unit, run and direction, and none else."""
+    assert set(data.axis.tolist()) == {axis}
+    found = {
+        (run, way_of, target): value
+        for run, way_of, target, value in zip(
+            data.run.tolist(),
+            data.direction.tolist(),
+            data.position_mm.tolist(),
+            data.deviation_mm.tolist(),
+            strict=True,
+        )
+    }
+    expected = {(*key, t): 1e-3 * v for key, values in runs_um.items() for t, v in zip(TARGETS_MM, values, strict=True)}
+    assert len(data) == len(expected)
+    assert found == pytest.approx(expected, abs=ROUNDING_MM)
+
+
+def sheet(names, *, before="", after="", extra=(), separator=";", decimal=",", position="Position [mm]"):
+    """Return a table with a column for each run; ``extra`` holds a name and one cell for each target."""
+    lines = [separator.join([position, *names, *(name for name, _ in extra)])]
+    for k, target in enumerate(TARGETS_MM):
+        cells = [f"{target:g}", *(f"{values[k]:.1f}" for values in RUNS_UM.values()), *(cell[k] for _, cell in extra)]
+        lines.append(separator.join(cell.replace(".", decimal) for cell in cells))
+    return before + "\n".join(lines) + "\n" + after
+
+
+#: The four runs as laboratories of several countries call them: run 1 forth and back, run 2 forth and back.
+NAMES = {
+    "german": ("Lauf 1 vor [µm]", "Lauf 1 zurück [µm]", "Lauf 2 vor [µm]", "Lauf 2 zurück [µm]"),
+    "german ways": ("vorwärts 1", "rückwärts 1", "vorwärts 2", "rückwärts 2"),
+    "hin und rück": ("1. Hinweg (µm)", "1. Rückweg (µm)", "2. Hinweg (µm)", "2. Rückweg (µm)"),
+    "auf ab": ("M1 auf", "M1 ab", "M2 auf", "M2 ab"),
+    "letters": ("V1", "R1", "V2", "R2"),
+    "umlauts written out": (
+        "Lauf_1_vorwaerts_um",
+        "Lauf_1_rueckwaerts_um",
+        "Lauf_2_vorwaerts_um",
+        "Lauf_2_rueckwaerts_um",
+    ),
+    "english": ("Run 1 forward (um)", "Run 1 backward (um)", "Run 2 forward (um)", "Run 2 backward (um)"),
+    "short": ("fwd1", "bwd1", "fwd2", "bwd2"),
+    "up down": ("Run-1-up", "Run-1-down", "Run-2-up", "Run-2-down"),
+    "signs": ("Run 1 +", "Run 1 \u2212", "Run 2 +", "Run 2 \u2212"),
+    "positive": ("1 positive", "1 negative", "2 positive", "2 negative"),
+    "arrows": ("j=1 \u2191", "j=1 \u2193", "j=2 \u2191", "j=2 \u2193"),
+    "french": ("Aller n°1 (µm)", "Retour n°1 (µm)", "Aller n°2 (µm)", "Retour n°2 (µm)"),
+    "italian": ("Andata 1", "Ritorno 1", "Andata 2", "Ritorno 2"),
+    "spanish": ("Ida 1 [µm]", "Vuelta 1 [µm]", "Ida 2 [µm]", "Vuelta 2 [µm]"),
+    "chinese": ("正向第1次(μm)", "反向第1次(μm)", "正向第2次(μm)", "反向第2次(μm)"),
+}
+
+
+@pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
+def test_runs_are_known_by_their_names_in_six_languages(tmp_path, names):
+    options = ImportOptions(axis="X", sign="error", units={"deviation": "um"})
+    item = import_file(written(tmp_path, sheet(names)), options)
+    assert item.doubts == ()
+    assert "not_used" not in item.understood
+    assert_is_the_example(item.data)
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        ("Messung Nord [µm]", ("1,0", "2,0", "5,0")),
+        ("Lauf 3 quer", ("1", "2", "5")),
+        ("Kontrolle", ("1", "", "")),
+        ("mean run 1", ("1", "2", "3")),
+    ],
+)
+def test_no_column_of_numbers_is_left_out_without_a_word_of_the_user(tmp_path, extra):
+    path = written(tmp_path, sheet(NAMES["german"], extra=[extra]))
+    item = import_file(path, ImportOptions(axis="X", sign="error"))
+    (doubt,) = item.doubts
+    assert extra[0] in doubt
+    assert f"--ignore {extra[0]!r}" in doubt
+    assert "--map run1-=" in doubt
+    left_out = import_file(path, ImportOptions(axis="X", sign="error", ignore=[extra[0]]))
+    assert left_out.doubts == ()
+    assert left_out.understood["not_used"] == {extra[0]: "left out by --ignore"}
+    assert_is_the_example(left_out.data)
+
+
+def test_runs_whose_names_nobody_knows_are_said_by_the_user(tmp_path):
+    path = written(tmp_path, sheet(("Messung Süd", "Messung Nord", "Süd zum zweiten", "Nord zum zweiten")))
+    with pytest.raises(InputError, match=r"Messung Süd, Messung Nord.*--map run1\+=COLUMN"):
+        import_file(path, ImportOptions(axis="X", sign="error"))
+    columns = {"run1+": "Messung Süd", "run1-": "Messung Nord", "run2+": "Süd zum zweiten", "run2-": "Nord zum zweiten"}
+    item = import_file(path, ImportOptions(axis="X", columns=columns, sign="error", units={"value": "um"}))
+    assert item.doubts == ()
+    assert_is_the_example(item.data)
+    del columns["run2-"]
+    assert (
+        "'Nord zum zweiten' holds numbers"
+        in import_file(path, ImportOptions(axis="X", columns=columns, sign="error")).doubts[0]
+    )
+
+
+def test_means_beside_the_runs_are_no_runs_and_are_held_against_them(tmp_path):
+    means = [
+        ("Mittel vor", ("1,10", "2,05", "5,10")),
+        ("Mittel zurück", ("3,05", "4,45", "7,55")),
+        ("s vor", ("0,14", "0,07", "0,14")),
+        ("Umkehrspanne B", ("-1,95", "-2,40", "-2,45")),
+        ("x\u0304 [mm]", ("0,0021", "0,0033", "0,0063")),
+    ]
+    options = ImportOptions(axis="X", sign="error")
+    item = import_file(written(tmp_path, sheet(NAMES["german"], extra=means)), options)
+    assert item.doubts == ()
+    assert_is_the_example(item.data)
+    assert sum("is a statistic over the runs" in note for note in item.notes) == 5
+    wrong = [("Mittel zurück", ("3,05", "4,95", "7,55"))]
+    item = import_file(written(tmp_path, sheet(NAMES["german"], extra=wrong)), options)
+    assert "'Mittel zurück' says 4.95 in line 3" in item.doubts[0]
+    assert "is 4.45: is a run missing" in item.doubts[0]
+
+
+def test_two_columns_of_one_run_and_different_units_are_refused(tmp_path):
+    twice = sheet(("Lauf 1 vor", "Run 1 fwd", "Lauf 2 vor", "Lauf 2 zurück"))
+    with pytest.raises(InputError, match="'Lauf 1 vor' and 'Run 1 fwd' are the same run and direction"):
+        import_file(written(tmp_path, twice))
+    units = sheet(("Lauf 1 vor [µm]", "Lauf 1 zurück [mm]", "Lauf 2 vor", "Lauf 2 zurück"))
+    with pytest.raises(InputError, match="different units.*'Lauf 1 zurück .mm.' mm"):
+        import_file(written(tmp_path, units))
+
+
+@pytest.mark.parametrize(
+    ("header", "doubt"),
+    [
+        ("Soll [mm];Ist [mm];Abweichung [µm]", None),
+        ("Soll [mm];Ist [mm];Korrektur [µm]", "'Korrektur [µm]' has the opposite sign of 'Ist [mm]' minus target"),
+        ("Soll [mm];Ist [inch];Abweichung [µm]", "says in"),
+    ],
+)
+def test_deviations_beside_readings_are_held_against_them(tmp_path, header, doubt):
+    rows = "0;0,0012;1,23\n100;100,0046;4,56\n200;199,9979;-2,11\n"
+    item = import_file(written(tmp_path, f"{header}\n{rows}"), ImportOptions(axis="X"))
+    assert [text for text in item.doubts if doubt and doubt in text] == list(item.doubts)
+    if doubt is None:
+        np.testing.assert_allclose(item.data.deviation_mm, [1.23e-3, 4.56e-3, -2.11e-3], rtol=0, atol=ROUNDING_MM)
+    wrong = rows.replace("-2,11", "-3,11")
+    assert any(
+        "disagrees" in text
+        for text in import_file(written(tmp_path, f"{header}\n{wrong}"), ImportOptions(axis="X")).doubts
+    )
+
+
+def test_directions_may_be_part_of_the_number_of_the_run_or_of_the_axis(tmp_path):
+    rows = [(t, v, n, w) for (n, w), values in RUNS_UM.items() for t, v in zip(TARGETS_MM, values, strict=True)]
+    for name, cell in (("Lauf", "{n} vor|{n} zurück"), ("Run", "{n}+|{n}-")):
+        ways = cell.split("|")
+        lines = [f"{t},{v},{ways[w < 0].format(n=n)},X" for t, v, n, w in rows]
+        text = f"Position [mm],Abweichung [µm],{name},axis\n" + "\n".join(lines) + "\n"
+        item = import_file(written(tmp_path, text))
+        assert item.doubts == ()
+        assert_is_the_example(item.data)
+        with pytest.raises(InputError, match="'2x' names no direction"):
+            import_file(written(tmp_path, text.replace(f",{ways[1].format(n=2)},", ",2x,")))
+    lines = [f"{t},{v},{n},X{'+' if w > 0 else '-'}" for t, v, n, w in rows]
+    item = import_file(written(tmp_path, "Position [mm],Abweichung [µm],run,axis\n" + "\n".join(lines) + "\n"))
+    assert_is_the_example(item.data)
+
+
+def test_names_with_a_word_that_is_not_known_are_neither_runs_nor_statistics_nor_directions():
+    assert run_columns(["Dead path 1", "x1", "Force 2", "auf/ab", "Run 1 2"], []) == []
+    assert [statistic_in(text) for text in ("mean run 1", "Xylophon", "X-Y")] == [None] * 3
+    assert [way(text) for text in ("2", "0", "sideways", "mean +", "auf/ab", "")] == [None] * 6
