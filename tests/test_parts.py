@@ -274,7 +274,7 @@ def test_measured_coordinates_in_inches_are_refused(mill, tmp_path):
 
 def test_too_few_features_are_undetermined(mill, tmp_path):
     points = np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]])
-    path = part(tmp_path / "p.part.csv", points, points)
+    path = part(tmp_path / "p.part.csv", points, displaced(*points.T))
     with pytest.raises(UndeterminedError):
         identify_measurement(mill, read_measurement([path]))
 
@@ -291,3 +291,13 @@ def test_the_command_line_goes_from_a_plate_to_tables(tmp_path, capsys):
     assert run_command(cli, list(map(str, words))) == 0
     assert json.loads(capsys.readouterr().out)
     assert json.loads(Path(tmp_path / "out" / "identify.json").read_text())["deviations"]["poses"][0]["setup"] == 0
+
+
+def test_a_slip_in_the_fixture_halfway_is_found_in_the_residuals(mill, tmp_path):
+    """The second half of the features was measured after the part had moved by 30 um, in one set-up by the labels."""
+    points, rng = drilled(11)
+    made = displaced(*points.T) + rng.normal(0, 1e-3, points.shape)
+    made[len(made) // 2 :, 0] += 0.03
+    path = part(tmp_path / "p.part.csv", points, made)
+    found = identify_measurement(mill, read_measurement([path]), IdentifyOptions(u_deviation_um=1.0, reject=False))
+    assert found.misfit.summary()["causes"]

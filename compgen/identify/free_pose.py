@@ -30,6 +30,7 @@ from compgen.core.machine import Axis, Machine
 from compgen.core.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.core.parts import PART, aligned, setups_of
 from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.identify.misfit import Series, labels_of, misfit_of
 from compgen.identify.noise import IdentifyOptions
 from compgen.identify.outliers import Rejected, accepted_readings
 from compgen.identify.parameters import ErrorParameters, error_parameters
@@ -482,6 +483,26 @@ def _result(
             },
             "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.tied.items()},
         },
+        misfit=misfit_of(
+            chi_square, freedom, u_scale, source, lambda: _series(deviations, readings, solution.residual_mm, accepted)
+        ),
+    )
+
+
+def _series(
+    deviations: Deviations, readings: _Readings, residual_mm: FloatArray, accepted: NDArray[np.bool_]
+) -> Series:
+    """Residuals of the components that were used, with what may explain them; a set-up has a pose of its own already."""
+    row = readings.row[accepted]
+    labels = labels_of(deviations.labels, deviations.origin, deviations.position_mm)
+    time = deviations.covariates.get("time_s")
+    return Series(
+        residual_um=residual_mm[accepted] / MM_PER_UM,
+        bare_um=None,
+        sigma_um=readings.sigma_mm[accepted] / MM_PER_UM,
+        group=readings.component[accepted],
+        labels={name: label[row] for name, label in labels.items() if name != "setup"},
+        time_s=None if time is None or not np.isfinite(time).all() else time[row],
     )
 
 

@@ -111,7 +111,8 @@ def _explained(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> 
     """Say what makes readings fit that no optimum was found for; empty if nothing simple does."""
     for name, label in labels_of(lengths.labels, lengths.origin, lengths.position_mm, lengths.station).items():
         if label.min() < label.max() and _split_by(machine, lengths, options, label) is not None:
-            return f"; with dead lengths of its own for each {name} the readings fit: there is a step between {name}s"
+            found = f"with dead lengths of its own for each {name} the readings fit: there is a step between {name}s"
+            return f"; {found}; `compgen diagnose` shows it"
     return "; `compgen diagnose` looks for what the model lacks"
 
 

@@ -119,7 +119,8 @@ def draw_space(grid: Grid, number: int) -> Picture:
     _polylines(axes, lines + after_scale * after, "c3", 0.8, "own")
     _name_axes(axes, grid)
     axes.autoscale_view()
-    title = f"The working volume, errors enlarged {before_scale:g} times: before and after; after once more {after_scale:g} times"
+    often, more = (f"{scale:,.0f}".replace(",", " ") for scale in (before_scale, after_scale))
+    title = f"The working volume, errors enlarged {often} times: before and after; after once more {more} times"
     data = {"before_scale": before_scale, "after_scale": after_scale}
     return Picture(f"space-{number}", "The volume in space", to_svg(figure, f"space-{number}", title), data, title)
 
