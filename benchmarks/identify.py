@@ -8,13 +8,16 @@ arrays in hand: checks, start, rank, outliers, covariance and tables included. T
 from __future__ import annotations
 
 import argparse
+import os
 import time
+from unittest.mock import patch
 
 import numpy as np
 import timing
 from scipy.linalg.blas import dsyrk
 from scipy.optimize import least_squares
 
+from compgen.core.kernels import PLAIN, VARIABLE
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Axis, Chain, Machine
 from compgen.identify import identify, joint_covariance, sample_errors
@@ -22,7 +25,7 @@ from compgen.identify.grid_problem import grid_problem
 from compgen.identify.grid_start import start_moments
 from compgen.identify.parameters import ErrorParameters, error_parameters
 from compgen.identify.start import station_start_from_moments
-from compgen.model import modelled_errors
+from compgen.model import load_kernels, modelled_errors
 from compgen.model.exact import exact_columns, tip_position
 
 STATIONS_MM = np.array(  # Zha & Zhang 2024, Table 6
@@ -72,6 +75,11 @@ class Case:
         found = identify(self.machine, self.lengths).errors
         values = [found.curves[curve.error.name].value for curve in self.layout.curves]
         return np.concatenate([*values, [found.squareness[name][0] for name in self.layout.squareness]])
+
+    def ours_plain(self) -> np.ndarray:
+        """The same without compiled loops."""
+        with patch.dict(os.environ, {VARIABLE: PLAIN}):
+            return self.ours()
 
     def peer(self) -> Peer:
         return Peer(self)
@@ -156,9 +164,8 @@ def compare(levels: int, nodes: int, runs: int, methods: tuple[str, ...], clock:
     peer = case.peer()
     reference = peer.solve("trf")
     ready = np.asfortranarray(peer.jacobian(peer.start))
-    for _ in range(2):  # the compiled loops are loaded with the second call
-        case.ours()
-    functions = {"identify": case.ours}
+    case.ours()  # loads the compiled loops
+    functions = {"identify": case.ours, "identify, plain": case.ours_plain}
     functions |= {f"scipy {method}, analytic": (lambda m=method: peer.solve(m)) for method in methods}
     functions["one dsyrk on a ready J"] = lambda: dsyrk(1.0, ready, trans=1)
     comparison = timing.alternate(functions, runs, clock)
@@ -217,6 +224,7 @@ def main() -> None:
     arguments = parser.parse_args()
     clock = time.process_time if arguments.cpu else time.perf_counter
     print(timing.machine_line())
+    print("identify with the compiled loops of COMPGEN_KERNELS=compiled:", load_kernels())
     compare(11, 11, arguments.runs, ("trf", "lm"), clock)
     if not arguments.quick:
         compare(21, 21, arguments.runs, ("trf",), clock)

@@ -34,7 +34,7 @@ import compgen
 from compgen.core.deviations import Deviations, format_deviations
 from compgen.core.machine import Machine, load_machine
 from compgen.core.names import error_named
-from compgen.core.steady import steady
+from compgen.core.threads import one_thread
 from compgen.model.exact import exact_error
 from compgen.model.grid import volume_grid
 from compgen.recal import logs, runner
@@ -132,7 +132,7 @@ def plain_loop(job: Job, count: int, folder: Path) -> tuple[float, float]:
     """Run the chain for the first machines one after another; times of one, s."""
     machine = load_machine(str(job.path.parent / "mill.toml"))
     chosen = list(job.machines.values())[:count]
-    with steady():
+    with one_thread():
         compgen.run(machine, [chosen[0].inbox / "a.deviations.csv"], [CONTROL], folder / "first")
         timer = Timer()
         for item in chosen:

@@ -15,7 +15,7 @@ from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import CHAINS, Axis, Chain, Machine
 from compgen.core.names import ERRORS
 from compgen.errors import InputError
-from compgen.model import evaluate, exact_error, exact_points, kernels, volumetric_error
+from compgen.model import evaluate, exact_error, exact_points, volumetric_error
 from compgen.model.evaluate import load_kernels, volumetric_error_at, volumetric_error_on_grid
 from compgen.model.exact import tip_position
 from compgen.model.exact_points import exact_error_at
@@ -95,7 +95,7 @@ def by_the_whole_chain(machine, errors, position, tool):
 
 @pytest.fixture
 def numpy_only(monkeypatch):
-    monkeypatch.setattr(kernels, "ready", lambda load=False: False)
+    monkeypatch.setenv("COMPGEN_KERNELS", "plain")
 
 
 @pytest.fixture
@@ -103,8 +103,9 @@ def interpreted(monkeypatch):
     """The kernels as plain Python: every chain can be tried without compiling a kernel for it."""
     numba = pytest.importorskip("numba")
     monkeypatch.setattr(numba, "njit", lambda *args, **options: lambda function: function)
+    monkeypatch.setenv("COMPGEN_KERNELS", "compiled")
     before = sys.modules.pop(COMPILED, None)
-    assert load_kernels()
+    importlib.import_module(COMPILED)
     yield
     del sys.modules[COMPILED]
     if before is not None:
@@ -112,8 +113,9 @@ def interpreted(monkeypatch):
 
 
 @pytest.fixture
-def compiled():
+def compiled(monkeypatch):
     pytest.importorskip("numba")
+    monkeypatch.setenv("COMPGEN_KERNELS", "auto")
     assert load_kernels()
 
 

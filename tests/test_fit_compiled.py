@@ -5,13 +5,11 @@ import pytest
 from scipy.linalg import solveh_banded
 
 from compgen.fit.stacked import lower_band
-from compgen.model.evaluate import load_kernels
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 50, 1001])
 def test_the_loop_solves_what_lapack_solves(n):
-    if not load_kernels():
-        pytest.skip("numba is not installed")
+    pytest.importorskip("numba")
     from compgen.fit.compiled import band_solver
 
     rng = np.random.default_rng(n)
@@ -25,8 +23,7 @@ def test_the_loop_solves_what_lapack_solves(n):
 
 
 def test_a_matrix_that_is_not_positive_definite_is_said():
-    if not load_kernels():
-        pytest.skip("numba is not installed")
+    pytest.importorskip("numba")
     from compgen.fit.compiled import band_solver
 
     band = lower_band(3)

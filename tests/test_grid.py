@@ -8,7 +8,7 @@ from scipy.linalg import LinAlgError
 
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Axis, Chain, Machine
-from compgen.identify import identify, kernels
+from compgen.identify import identify
 from compgen.identify.grid_problem import grid_problem
 from compgen.identify.grid_readings import MOST_LEVELS, levels_of
 from compgen.identify.grid_start import start_moments
@@ -24,14 +24,12 @@ DEAD_MM = np.array([400.0, 500.0, 600.0, 700.0])
 
 
 @pytest.fixture(params=[False, True], ids=["numpy", "compiled"])
-def compiled(request):
-    """Whether the compiled loops serve; they are switched on again afterwards."""
+def compiled(request, monkeypatch):
+    """Whether the compiled loops serve."""
     if request.param:
         pytest.importorskip("numba", reason="the compiled loops are an optional extra")
-    kernels.allow(request.param)
-    kernels.compiled_loops(kernels.LARGE)
-    yield request.param
-    kernels.allow(True)
+    monkeypatch.setenv("COMPGEN_KERNELS", "compiled" if request.param else "plain")
+    return request.param
 
 
 def machine_of(chain="WFYXZT", counts=(5, 4, 3), **options):
@@ -88,8 +86,7 @@ def test_grid_and_points_pose_the_same_problem(chain, curves, tools):
     assert np.max(np.abs(matrix - fast_matrix) / root / root[:, None]) < 1e-12
 
 
-@pytest.mark.usefixtures("compiled")
-def test_a_missing_reading_at_a_station_that_stands_on_a_grid_point_disturbs_nothing():
+def test_a_missing_reading_at_a_station_that_stands_on_a_grid_point_disturbs_nothing(compiled):
     machine = machine_of()
     lengths = readings_on(machine, repeats=1)
     inside = np.array([lengths.position_mm[:, axis].mean() for axis in range(3)])
@@ -107,12 +104,12 @@ def test_a_missing_reading_at_a_station_that_stands_on_a_grid_point_disturbs_not
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # the numpy path meets 0/0 there
         values, matrix = fast.evaluate(state)[1], fast.normal_matrix(state)
-    if kernels.compiled_loops() is not None:
+    assert fast.compiled == compiled
+    if compiled:
         assert np.allclose(values, plain.evaluate(state)[1], rtol=1e-9, atol=1e-9 * np.abs(values).max())
         assert np.isfinite(matrix).all()
 
 
-@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize(
     "values",
     [
@@ -124,10 +121,10 @@ def test_a_missing_reading_at_a_station_that_stands_on_a_grid_point_disturbs_not
     ],
     ids=["few", "one", "zeros", "shuffled", "very many"],
 )
-def test_levels_are_the_distinct_positions_in_order(values):
+def test_levels_are_the_distinct_positions_in_order(compiled, values):
     column = np.column_stack([values, values, values])[:, 1]
     for position in (column, np.ascontiguousarray(column)):
-        levels, index = levels_of(position)
+        levels, index = levels_of(position, compiled=compiled)
         expected, inverse = np.unique(position, return_inverse=True)
         assert np.array_equal(levels, expected)
         assert np.array_equal(index, inverse)
@@ -155,16 +152,14 @@ def test_start_moments_are_sums_over_the_readings():
     assert np.allclose(offset, mean, rtol=1e-13)
 
 
-def test_compiled_loops_and_numpy_identify_the_same_errors():
+def test_compiled_loops_and_numpy_identify_the_same_errors(monkeypatch):
     pytest.importorskip("numba", reason="the compiled loops are an optional extra")
     machine = machine_of()
     lengths = readings_on(machine, levels=(7, 6, 5), repeats=1)
     found = []
-    for compiled in (False, True):
-        kernels.allow(compiled)
-        kernels.compiled_loops(kernels.LARGE)
+    for form in ("plain", "compiled"):
+        monkeypatch.setenv("COMPGEN_KERNELS", form)
         found.append(identify(machine, lengths, IdentifyOptions(u_length_um=1.0)))
-    kernels.allow(True)
     slow, fast = found
     for name, curve in slow.errors.curves.items():
         unit = 1e-3 if name[1] in "XYZ" else 1e-6

@@ -11,7 +11,7 @@ from compgen.core.lengths import Lengths
 from compgen.core.machine import CHAINS, Axis, Chain, Machine
 from compgen.core.names import CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
-from compgen.identify import IdentifyOptions, identify, kernels
+from compgen.identify import IdentifyOptions, identify
 from compgen.identify.grid_problem import GridProblem, grid_problem
 from compgen.identify.parameters import error_parameters
 from compgen.identify.problem import length_problem
@@ -389,26 +389,24 @@ def test_the_input_is_not_changed():
 
 
 @pytest.mark.parametrize("chain", ["WFYXZT", "WXYFZT", "WZYXFT"])
-def test_compiled_loops_and_numpy_agree(chain):
+def test_compiled_loops_and_numpy_agree(chain, monkeypatch):
     pytest.importorskip("numba", reason="the compiled loops are an optional extra")
     machine = machine_of(chain, tool_offset_mm=(10.0, -20.0, -150.0))
     lengths = measured(machine, truth_of(machine), sigma_mm=0.2 * MICROMETRE, keep=0.8)
-    problem = grid_problem(
-        error_parameters(machine, modelled_errors(machine)),
-        lengths.position_mm,
-        np.array(machine.tool_offset_mm),
-        lengths.station,
-        lengths.station,
-        lengths.length_mm,
-    )
-    state = State(np.random.default_rng(4).normal(0, 1e-4, problem.parameters.size), STATIONS, DEAD_MM)
     results = []
-    for compiled in (False, True):
-        kernels.allow(compiled)
-        kernels.compiled_loops(kernels.LARGE)
-        assert (kernels.compiled_loops() is not None) == compiled
+    for form in ("plain", "compiled"):
+        monkeypatch.setenv("COMPGEN_KERNELS", form)
+        problem = grid_problem(
+            error_parameters(machine, modelled_errors(machine)),
+            lengths.position_mm,
+            np.array(machine.tool_offset_mm),
+            lengths.station,
+            lengths.station,
+            lengths.length_mm,
+        )
+        assert problem.compiled == (form == "compiled")
+        state = State(np.random.default_rng(4).normal(0, 1e-4, problem.parameters.size), STATIONS, DEAD_MM)
         results.append((*problem.evaluate(state), problem.normal_matrix(state)))
-    kernels.allow(True)
     (cost, gradient, matrix), (fast_cost, fast_gradient, fast_matrix) = results
     assert fast_cost == pytest.approx(cost, rel=1e-13)
     assert np.max(np.abs(fast_gradient - gradient)) < 1e-12 * np.max(np.abs(gradient))

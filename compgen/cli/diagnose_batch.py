@@ -11,7 +11,7 @@ from compgen.cli.common import print_json, stdout
 from compgen.cli.parallel_options import mapper
 from compgen.core.files import OutputFolder
 from compgen.core.machine import Machine
-from compgen.core.steady import steady
+from compgen.core.threads import one_thread
 from compgen.diagnose import AxisDiagnosis, DiagnoseOptions, Diagnosis, diagnose
 from compgen.diagnose.files import diagnosis_files, json_text
 from compgen.diagnose.measurement import read_diagnosed
@@ -34,7 +34,7 @@ class Asked:
     def __call__(self, path: Path) -> Found:
         """Diagnose one measurement; what cannot be used becomes part of what was found."""
         try:
-            with steady():
+            with one_thread():
                 found, contents = diagnosed(self, (path,), lambda _: None)
         except CompgenError as error:
             return Found({}, {"error": str(error)}, acceptable=False)

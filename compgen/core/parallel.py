@@ -1,7 +1,7 @@
 """One function for many items: in processes of this machine or on a cluster; the same results in the same order.
 
 A function and its items are pickled, whatever decides about a result stands in the item (a seed too), and every item is
-computed steadily (:mod:`compgen.core.steady`); so it does not matter where that happens.
+computed on one thread; so it does not matter where that happens.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.context import BaseContext
 from typing import Any, Protocol, TypeVar
 
-from compgen.core.steady import steady
+from compgen.core.threads import one_thread
 from compgen.errors import CompgenError, CompgenWarning
 
 Item = TypeVar("Item")
@@ -119,7 +119,7 @@ def _unpacked(content: bytes) -> Any:
 
 def perform(function: Packed, item: Packed) -> Answer:
     """Compute one item in this process, one at a time, and return what came of it."""
-    with _BUSY, steady(), warnings.catch_warnings(record=True) as caught:
+    with _BUSY, one_thread(), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
         try:

@@ -1,4 +1,4 @@
-"""Compiled solution of the banded systems of smooth curves. Needs numba; used where compiled loops are loaded anyway."""
+"""Compiled solution of the banded systems of smooth curves. Needs numba."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from numba import types
 
-from compgen.model.compiled import compile_for
+from compgen.core.kernels import compile_for
 
 _BAND = types.Array(types.float64, 2, "F")
 _VECTOR = types.float64[::1]

@@ -19,13 +19,15 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbsv, dpbtrs
 
 from compgen.core.csvio import FloatArray
+from compgen.core.kernels import use_compiled
 from compgen.errors import ConvergenceError
 from compgen.fit.bounds import Bounds
-from compgen.model import kernels
 
 _SETTLED, _REFINEMENTS = 1e-12, 6
 #: With the largest diagonal of A below this many of the smallest weights the first solution has 9 digits or more.
 _EASY = 1e6
+#: Nodes from which loading the compiled solution pays for a single fit.
+_LARGE = 10_000_000
 _HELD = np.array([1.0, 0.0, 0.0])
 _TINY = float(np.finfo(float).tiny)
 IntArray = NDArray[np.intp]
@@ -171,7 +173,7 @@ class Stack:
         own = self.weight.copy()
         own[self.held] = 1.0
         height, lowest = float(band[0].max()), float(own.min())
-        if height <= _EASY * lowest and len(own) > 1 and kernels.ready():
+        if height <= _EASY * lowest and len(own) > 1 and use_compiled(len(own), _LARGE):
             return self._solved_at_once(band)
         factor, solved, info = dpbsv(band, self.pull, lower=1, overwrite_ab=1)
         if info:

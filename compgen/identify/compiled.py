@@ -1,4 +1,4 @@
-"""Compiled loops of the fast path (numba, ``pip install compgen[fast]``); import only through ``kernels``."""
+"""Compiled loops of the fast path (numba, ``pip install compgen[fast]``); import only where ``compgen.core.kernels`` says so."""
 
 from compgen.identify.compiled_chain import chain_distances, chain_gradient
 from compgen.identify.compiled_normal import add_pair, add_stations, moment_tables, project

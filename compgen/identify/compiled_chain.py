@@ -6,16 +6,13 @@ Loops over a whole plane write one array each, and divide without checks, so tha
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from compgen.core.csvio import FloatArray
+from compgen.core.kernels import FAST, loop
 from compgen.identify.state import IntArray
 
-#: Sums may be taken in another order, and a*b + c in one step; infinities and nan keep their meaning.
-FAST = {"contract", "reassoc", "arcp"}
 
-
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=False)
 def _rotation(eps: FloatArray, rotation: FloatArray, jacobian: FloatArray) -> None:
     """Rotation matrix and left Jacobian of SO(3), each (3, 3), of a rotation vector (3,) in rad."""
     x, y, z = eps[0], eps[1], eps[2]
@@ -40,7 +37,7 @@ def _rotation(eps: FloatArray, rotation: FloatArray, jacobian: FloatArray) -> No
             jacobian[i, j] = same + second * cross + third * twice
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def carriages(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     chain: IntArray,
     levels: FloatArray,
@@ -70,7 +67,7 @@ def carriages(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     return rotation, jacobian, shift
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def _carry(rotation: FloatArray, shift: FloatArray, tool_side: bool, before: FloatArray, after: FloatArray) -> None:
     """Pass points (3, m) through one body: shift + R x on the tool side, R (x + shift) on the workpiece side."""
     for i in range(3):
@@ -81,7 +78,7 @@ def _carry(rotation: FloatArray, shift: FloatArray, tool_side: bool, before: Flo
             out[m] = constant + (a * x[m] + b * y[m] + c * z[m])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def inner_points(
     chain: IntArray, rotation: FloatArray, shift: FloatArray, tool: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -101,7 +98,7 @@ def inner_points(
     return inner, middle
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def plane_of_tips(
     chain: IntArray, rotation: FloatArray, shift: FloatArray, middle: FloatArray, level: int, tip: FloatArray
 ) -> None:
@@ -111,7 +108,7 @@ def plane_of_tips(
     _carry(rotation[row], shift[row], chain[3, axis] == 1, middle, tip)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def _pull(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     rotation: FloatArray,
     shift: FloatArray,
@@ -156,7 +153,7 @@ def _pull(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     motion[5] += moment_z
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def _forces(
     tip: FloatArray,
     station: FloatArray,
@@ -190,7 +187,7 @@ def _forces(
     return cost, by_x, by_y, by_z, by_dead
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def chain_gradient(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     chain: IntArray,
     levels: FloatArray,
@@ -255,7 +252,7 @@ def chain_gradient(  # noqa: PLR0913 - a compiled loop takes its arrays one by o
     return 0.5 * cost
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def _by_unknowns(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     chain: IntArray,
     levels: FloatArray,
@@ -294,7 +291,7 @@ def _by_unknowns(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
                     gradient[squareness[k]] += along * derivatives[axis, i, k]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def chain_distances(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     chain: IntArray,
     levels: FloatArray,

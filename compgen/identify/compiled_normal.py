@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from compgen.core.csvio import FloatArray
-from compgen.identify.compiled_chain import FAST, carriages, inner_points, plane_of_tips
+from compgen.core.kernels import FAST, loop
+from compgen.identify.compiled_chain import carriages, inner_points, plane_of_tips
 from compgen.identify.state import IntArray
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def _products(tip: FloatArray, station: FloatArray, weight: FloatArray, value: FloatArray) -> None:
     """Fill in w u u^T (xx, yy, zz, xy, xz, yz), w u (x, y, z) and w of one plane: ``value`` (10, m)."""
     tx, ty, tz = tip[0], tip[1], tip[2]
@@ -37,7 +37,7 @@ def _products(tip: FloatArray, station: FloatArray, weight: FloatArray, value: F
         out[m] = weight[m]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def _add_to_pairs(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     total: FloatArray,
     level: int,
@@ -74,7 +74,7 @@ def _add_to_pairs(  # noqa: PLR0913 - a compiled loop takes its arrays one by on
                 sums_2[c] += factor * factor * line[c]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def moment_tables(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     chain: IntArray,
     levels: FloatArray,
@@ -146,7 +146,7 @@ def moment_tables(  # noqa: PLR0913 - a compiled loop takes its arrays one by on
     return (out_mid, out_in, mid_in), (by_out, by_mid, by_in)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def _block(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     tables: FloatArray,
     i: int,
@@ -202,7 +202,7 @@ def _block(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
             )
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def add_pair(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     tables: FloatArray,
     axes: IntArray,
@@ -245,7 +245,7 @@ def add_pair(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
                 _block(tables, i, j, arm_b, levers[b, t], arm_b, levers[b, t], work, same)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def project(rows: IntArray, columns: IntArray, values: FloatArray, matrix: FloatArray, result: FloatArray) -> None:
     """Add T^T M T to ``result``, T (levels * 6, n) given by its entries, M (levels * 6, levels * 6) symmetric."""
     size = len(matrix)
@@ -260,7 +260,7 @@ def project(rows: IntArray, columns: IntArray, values: FloatArray, matrix: Float
             out[columns[k]] += line[rows[k]] * values[k]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def add_stations(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     table: FloatArray,
     axes: IntArray,

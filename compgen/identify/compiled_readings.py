@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from compgen.core.csvio import FloatArray
-from compgen.identify.compiled_chain import FAST
+from compgen.core.kernels import FAST, loop
 from compgen.identify.state import IntArray
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=False, error_model="python")
 def find_levels(position: FloatArray, most: int) -> tuple[FloatArray, IntArray]:
     """Distinct values (k,) of (n,) and the index of each position; no values where there are more than ``most``."""
     levels, names = np.empty(most), np.empty(most, dtype=np.int64)  # ascending, and in the order in which they came
@@ -49,7 +48,7 @@ def find_levels(position: FloatArray, most: int) -> tuple[FloatArray, IntArray]:
     return found, index
 
 
-@njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=False)
 def cell_means(cells: IntArray, weight: FloatArray, reading: FloatArray, total: FloatArray, mean: FloatArray) -> float:
     """Fill in weight and weighted mean (cells,) of the readings of each cell; return their weighted scatter about it."""
     for row in range(len(cells)):
@@ -65,7 +64,7 @@ def cell_means(cells: IntArray, weight: FloatArray, reading: FloatArray, total: 
     return scatter
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def add_sums(weight: FloatArray, reading: FloatArray, count: FloatArray, total: FloatArray) -> None:
     """Add number and sum (groups,) of the readings of each group (groups, n_out, m) that have a weight."""
     for g in range(weight.shape[0]):
@@ -80,7 +79,7 @@ def add_sums(weight: FloatArray, reading: FloatArray, count: FloatArray, total: 
             total[g] += here
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)  # type: ignore[untyped-decorator,unused-ignore]
+@loop(fastmath=FAST)
 def start_sums(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     p_out: FloatArray,
     plane: FloatArray,

@@ -16,6 +16,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.deviations import DEVIATION_COLUMNS, Deviations
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
+from compgen.core.threads import one_thread
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjustment import Adjustment
 from compgen.identify.effects import without_effects
@@ -30,7 +31,6 @@ from compgen.identify.separation import SeparationProblem
 from compgen.identify.solver import Factor, Solution, factorise, solve
 from compgen.identify.state import State
 from compgen.identify.tables import error_table, metadata_of, unobservable
-from compgen.identify.threads import one_thread
 from compgen.identify.travel import check_travel
 
 #: Standard uncertainty of a measured deviation when nothing states one; it is then scaled by the residuals.

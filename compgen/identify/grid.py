@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class Grid:
     motion : from the unknowns to delta and eps at the levels of X, Y, Z in a row.
     tools : the data by tool.
     station_of : station of each group (dead length).
-    memo : what was worked out before and does not depend on the weights; shared by copies with other weights.
+    compiled : whether the compiled loops do the work (:mod:`compgen.core.kernels`), decided once for the problem.
     """
 
     parameters: ErrorParameters
@@ -46,7 +46,7 @@ class Grid:
     motion: MotionMap
     tools: tuple[ToolData, ...]
     station_of: IntArray
-    memo: dict[str, Any] = field(compare=False, repr=False)
+    compiled: bool
 
     @property
     def stations(self) -> int:
@@ -69,23 +69,21 @@ class Grid:
         counts = [len(levels) for levels in self.levels_mm]
         return [0, counts[0], counts[0] + counts[1], sum(counts)]
 
+    @cached_property
     def plan(self) -> tuple[IntArray, FloatArray, IntArray]:
         """Return what the compiled loops want to know about the chain, the levels, and the columns of squareness.
 
         See ``compiled_chain.carriages`` and ``compiled_chain.chain_gradient``.
         """
-        if "plan" not in self.memo:
-            sides = dict(passing_order(self.parameters.machine))
-            counts = [len(levels) for levels in self.levels_mm]
-            side = [int(sides[axis]) for axis in range(3)]
-            chain = np.array([self.order[::-1], self.first_rows[:3], counts, side], dtype=np.int64)
-            columns = np.full(3, -1, dtype=np.int64)
-            names = self.parameters.squareness
-            for k, name in enumerate(names):
-                columns[SQUARENESS_NAMES.index(name)] = self.parameters.size - len(names) + k
-            self.memo["plan"] = (chain, np.concatenate(self.levels_mm), columns)
-        chain, levels, columns = self.memo["plan"]
-        return chain, levels, columns
+        sides = dict(passing_order(self.parameters.machine))
+        counts = [len(levels) for levels in self.levels_mm]
+        side = [int(sides[axis]) for axis in range(3)]
+        chain = np.array([self.order[::-1], self.first_rows[:3], counts, side], dtype=np.int64)
+        columns = np.full(3, -1, dtype=np.int64)
+        names = self.parameters.squareness
+        for k, name in enumerate(names):
+            columns[SQUARENESS_NAMES.index(name)] = self.parameters.size - len(names) + k
+        return chain, np.concatenate(self.levels_mm), columns
 
     def travel(self, state: State) -> tuple[FloatArray, FloatArray]:
         """Directions of travel and their derivatives at the squareness of ``state``, see ``travel_directions``."""

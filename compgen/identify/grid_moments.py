@@ -6,7 +6,6 @@ Every entry of C is linear in the coordinate of each axis, so small tables of mo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 
@@ -35,12 +34,14 @@ class Moments:
     levels: tuple[FloatArray, FloatArray, FloatArray]
 
 
-def compiled_moments(loops: ModuleType, grid: Grid, data: ToolData, state: State) -> Moments:
+def compiled_moments(grid: Grid, data: ToolData, state: State) -> Moments:
     """Moments by the compiled loops."""
-    chain, levels, _ = grid.plan()
+    from compgen.identify.compiled import moment_tables
+
+    chain, levels, _ = grid.plan
     motion = grid.motion
     directions, _ = grid.travel(state)
-    pairs, by_level = loops.moment_tables(
+    pairs, by_level = moment_tables(
         chain,
         levels,
         directions,

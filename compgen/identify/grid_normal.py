@@ -7,8 +7,6 @@ the map of the curves brings them to the unknowns.
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import numpy as np
 from scipy.sparse import csr_array
 
@@ -23,9 +21,7 @@ from compgen.model.exact import cross_matrices
 _ENTRIES = np.array([[0, 3, 4, 6], [3, 1, 5, 7], [4, 5, 2, 8]])
 
 
-def add_normal(
-    grid: Grid, moments: Moments, tool_mm: FloatArray, state: State, matrix: FloatArray, loops: ModuleType | None
-) -> None:
+def add_normal(grid: Grid, moments: Moments, tool_mm: FloatArray, state: State, matrix: FloatArray) -> None:
     """Add the part of one tool to the upper blocks of the normal matrix (size, size).
 
     Parameters
@@ -33,7 +29,6 @@ def add_normal(
     grid : the unknowns and the levels.
     moments, tool_mm : of the readings with this tool, and its offset (3,).
     state : gives the directions of travel.
-    loops : the compiled loops, or None.
     """
     directions, derivatives = grid.travel(state)
     levers = _levers(grid, directions)
@@ -41,10 +36,10 @@ def add_normal(
     first, second = grid.parameters.size, grid.parameters.size + 3 * grid.stations
     by_levels = np.zeros((motion.shape[0], motion.shape[0]))
     by_group = np.zeros((first, grid.groups, 4))
-    if loops is not None:
-        _compiled_pairs(loops, grid, moments, levers, tool_mm, by_levels)
-        loops.project(motion.row, motion.column, motion.value, by_levels, matrix)
-        _compiled_stations(loops, grid, moments, levers, tool_mm, motion, by_group)
+    if grid.compiled:
+        _compiled_pairs(grid, moments, levers, tool_mm, by_levels)
+        _compiled_stations(grid, moments, levers, tool_mm, motion, by_group)
+        _project(motion, by_levels, matrix)
     else:
         to_unknowns = csr_array((motion.value, (motion.column, motion.row)), shape=motion.shape[::-1])
         _pairs(grid, moments, levers, tool_mm, by_levels)
@@ -80,17 +75,22 @@ def _ordered(grid: Grid, moments: Moments) -> list[tuple[IntArray, FloatArray, b
     ]
 
 
-def _compiled_pairs(
-    loops: ModuleType, grid: Grid, moments: Moments, levers: FloatArray, tool_mm: FloatArray, matrix: FloatArray
-) -> None:
+def _project(motion: MotionMap, by_levels: FloatArray, matrix: FloatArray) -> None:
+    from compgen.identify.compiled import project
+
+    project(motion.row, motion.column, motion.value, by_levels, matrix)
+
+
+def _compiled_pairs(grid: Grid, moments: Moments, levers: FloatArray, tool_mm: FloatArray, matrix: FloatArray) -> None:
+    from compgen.identify.compiled import add_pair
+
     rows = np.array(grid.first_rows)
     for axes, table, own_a, own_b in _ordered(grid, moments):
         levels_a, levels_b = grid.levels_mm[axes[0]], grid.levels_mm[axes[1]]
-        loops.add_pair(table, axes, levels_a, levels_b, levers, tool_mm, rows, own_a, own_b, matrix)
+        add_pair(table, axes, levels_a, levels_b, levers, tool_mm, rows, own_a, own_b, matrix)
 
 
 def _compiled_stations(  # noqa: PLR0913 - what a compiled loop asks for
-    loops: ModuleType,
     grid: Grid,
     moments: Moments,
     levers: FloatArray,
@@ -98,11 +98,13 @@ def _compiled_stations(  # noqa: PLR0913 - what a compiled loop asks for
     motion: MotionMap,
     by_group: FloatArray,
 ) -> None:
+    from compgen.identify.compiled import add_stations
+
     rows = np.array(grid.first_rows)
     for axes, table in zip(_with_levers(grid), moments.levels, strict=True):
         levels = grid.levels_mm[axes[0]]
         entries = (motion.row, motion.column, motion.value)
-        loops.add_stations(table, np.array(axes), levels, levers, tool_mm, rows, *entries, by_group)
+        add_stations(table, np.array(axes), levels, levers, tool_mm, rows, *entries, by_group)
 
 
 def _with_levers(grid: Grid) -> list[tuple[int, int, int]]:

@@ -14,17 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import ModuleType
 
 import numpy as np
 
 from compgen.core.csvio import FloatArray
+from compgen.core.kernels import use_compiled
 from compgen.identify.grid import Grid, ToolData
 from compgen.identify.grid_chain import Body, bodies_at, lengths_of, points_along, pull_back
 from compgen.identify.grid_moments import BATCH, compiled_moments, moments
 from compgen.identify.grid_normal import add_normal
 from compgen.identify.grid_readings import levels_of, merge
-from compgen.identify.kernels import compiled_loops
 from compgen.identify.motion import motion_map
 from compgen.identify.parameters import ErrorParameters
 from compgen.identify.state import IntArray, State
@@ -57,15 +56,14 @@ class GridProblem(Grid):
             cells[self.cell[1]] = weight
             tools: tuple[ToolData, ...] = (replace(self.tools[0], weight=cells.reshape(shape)),)
             return replace(self, tools=tools, reading_weight=weight)
-        tools, scatter = merge(self.tools, shape, self.cell, self.reading_mm, weight)
+        tools, scatter = merge(self.tools, shape, self.cell, self.reading_mm, weight, compiled=self.compiled)
         return replace(self, tools=tools, reading_weight=weight, scatter=scatter)
 
     def evaluate(self, state: State) -> tuple[float, FloatArray]:
         """Half the weighted sum of squares with the exact model, and its exact gradient (size,)."""
         gradient = np.zeros(self.size)
-        loops = compiled_loops()
-        if loops is not None:
-            return 0.5 * self.scatter + self._compiled(loops, state, gradient), gradient
+        if self.compiled:
+            return 0.5 * self.scatter + self._compiled(state, gradient), gradient
         cost = 0.5 * self.scatter
         bodies, places = self._geometry(state)
         for data, tips in zip(self.tools, places, strict=True):
@@ -74,14 +72,16 @@ class GridProblem(Grid):
             pull_back(self, bodies, tips, force, gradient)
         return cost, gradient
 
-    def _compiled(self, loops: ModuleType, state: State, gradient: FloatArray) -> float:
+    def _compiled(self, state: State, gradient: FloatArray) -> float:
         """Return the cost and add the gradient, all in one compiled pass."""
-        chain, levels, squareness = self.plan()
+        from compgen.identify.compiled import chain_gradient
+
+        chain, levels, squareness = self.plan
         motion = self.motion
         directions, derivatives = self.travel(state)
         cost = 0.0
         for data in self.tools:
-            cost += loops.chain_gradient(
+            cost += chain_gradient(
                 chain,
                 levels,
                 directions,
@@ -124,29 +124,25 @@ class GridProblem(Grid):
         return cost
 
     def _geometry(self, state: State) -> tuple[list[Body], list[list[FloatArray]]]:
-        """Bodies of the chain, and by tool the points after each body; kept for the next question about ``state``."""
-        if self.memo.get("state") is not state:
-            bodies = bodies_at(self, state)
-            self.memo.update(
-                state=state, geometry=(bodies, [points_along(bodies, data.tool_mm) for data in self.tools])
-            )
-        bodies, places = self.memo["geometry"]
-        return bodies, places
+        """Bodies of the chain, and by tool the points after each body."""
+        bodies = bodies_at(self, state)
+        return bodies, [points_along(bodies, data.tool_mm) for data in self.tools]
 
     def _distances(self, state: State) -> list[FloatArray]:
         """Distances of stations and tips by tool, each (groups, n_out, n_mid * n_in), mm."""
-        loops = compiled_loops()
         found = []
-        if loops is None:
+        if not self.compiled:
             for tips in self._geometry(state)[1]:
                 found.append(lengths_of(tips[-1][None] - state.stations_mm[self.station_of][:, None, :, None]))
             return found
-        chain, levels, _ = self.plan()
+        from compgen.identify.compiled import chain_distances
+
+        chain, levels, _ = self.plan
         motion = self.motion
         directions, _ = self.travel(state)
         for data in self.tools:
             distance = np.empty(data.weight.shape)
-            loops.chain_distances(
+            chain_distances(
                 chain,
                 levels,
                 directions,
@@ -184,19 +180,18 @@ class GridProblem(Grid):
     def normal_matrix(self, state: State) -> FloatArray:
         """J^T W J (size, size) with C in place of the exact derivative."""
         matrix = np.zeros((self.size, self.size))
-        loops = compiled_loops()
+        places = [] if self.compiled else self._geometry(state)[1]
         for k, data in enumerate(self.tools):
-            if loops is not None:
-                sums = compiled_moments(loops, self, data, state)
-            else:
-                sums = moments(self, data, self._geometry(state)[1][k][-1], state)
-            add_normal(self, sums, data.tool_mm, state, matrix, loops)
+            sums = compiled_moments(self, data, state) if self.compiled else moments(self, data, places[k][-1], state)
+            add_normal(self, sums, data.tool_mm, state, matrix)
         first, second = self.parameters.size, self.parameters.size + 3 * self.stations
         matrix[first:, :first] = matrix[:first, first:].T
         matrix[second:, first:second] = matrix[first:second, second:].T
         return matrix
 
 
+#: Readings from which the compiled loops pay for a single identification.
+LARGE = 100_000
 #: A grid is used when at least this share of its cells holds readings.
 LEAST_FILL = 0.1
 
@@ -219,8 +214,8 @@ def grid_problem(
     station, group, reading_mm : of each reading, shape (n,).
     """
     count = len(reading_mm)
-    compiled_loops(count)
-    found = [levels_of(position_mm[:, axis]) for axis in range(3)]
+    compiled = use_compiled(count, LARGE)
+    found = [levels_of(position_mm[:, axis], compiled=compiled) for axis in range(3)]
     levels, at = [item[0] for item in found], [item[1] for item in found]
     if tool_mm.ndim == 1:
         tools, tool = tool_mm[None], np.zeros(count, dtype=np.int64)
@@ -248,7 +243,7 @@ def grid_problem(
     empty = [ToolData(np.array(offset), nothing, nothing) for offset in tools]
     cell = (tool.astype(np.int64, copy=False), index.astype(np.int64, copy=False))
     weight = np.ones(count)
-    merged, scatter = merge(empty, shape, cell, reading_mm, weight)
+    merged, scatter = merge(empty, shape, cell, reading_mm, weight, compiled=compiled)
     return GridProblem(
         parameters=parameters,
         order=order,  # type: ignore[arg-type]
@@ -257,7 +252,7 @@ def grid_problem(
         motion=motion_map(parameters, bases),
         tools=merged,
         station_of=station_of,
-        memo={},
+        compiled=compiled,
         cell=cell,
         reading_mm=reading_mm,
         reading_weight=weight,

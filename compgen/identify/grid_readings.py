@@ -9,18 +9,18 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.identify.grid import ToolData
-from compgen.identify.kernels import compiled_loops
 from compgen.identify.state import IntArray
 
 #: More levels of an axis than this are found by sorting.
 MOST_LEVELS = 2000
 
 
-def levels_of(position_mm: FloatArray) -> tuple[FloatArray, IntArray]:
+def levels_of(position_mm: FloatArray, *, compiled: bool = False) -> tuple[FloatArray, IntArray]:
     """Distinct values (k,) of (n,), ascending, and the index of each position."""
-    loops = compiled_loops()
-    if loops is not None and position_mm.flags.writeable and position_mm.dtype == np.float64:
-        levels, index = loops.find_levels(position_mm, MOST_LEVELS)
+    if compiled and position_mm.flags.writeable and position_mm.dtype == np.float64:
+        from compgen.identify.compiled import find_levels
+
+        levels, index = find_levels(position_mm, MOST_LEVELS)
         if len(levels):
             return levels, index
     position_mm = np.ascontiguousarray(position_mm)
@@ -38,26 +38,29 @@ def merge(
     cell: tuple[IntArray, IntArray],
     reading_mm: FloatArray,
     weight: FloatArray,
+    *,
+    compiled: bool,
 ) -> tuple[tuple[ToolData, ...], float]:
     """Merge the readings of each cell into their weighted mean; also return the scatter about the means."""
     tool, index = cell
     merged, scatter = [], 0.0
     for k, data in enumerate(tools):
         rows = slice(None) if len(tools) == 1 else np.flatnonzero(tool == k)
-        total, mean, square = _cell_means(index[rows], weight[rows], reading_mm[rows], int(np.prod(shape)))
+        total, mean, square = _cell_means(index[rows], weight[rows], reading_mm[rows], int(np.prod(shape)), compiled)
         scatter += square
         merged.append(replace(data, weight=total.reshape(shape), length_mm=mean.reshape(shape)))
     return tuple(merged), scatter
 
 
 def _cell_means(
-    cells: IntArray, weight: FloatArray, reading: FloatArray, count: int
+    cells: IntArray, weight: FloatArray, reading: FloatArray, count: int, compiled: bool
 ) -> tuple[FloatArray, FloatArray, float]:
     """Weight and weighted mean (count,) of the readings of each cell, and their weighted square sum about the means."""
-    loops = compiled_loops()
-    if loops is not None:
+    if compiled:
+        from compgen.identify.compiled import cell_means
+
         sums, mean = np.zeros(count), np.zeros(count)
-        return sums, mean, float(loops.cell_means(cells, _plain(weight), _plain(reading), sums, mean))
+        return sums, mean, float(cell_means(cells, _plain(weight), _plain(reading), sums, mean))
     total = np.bincount(cells, weight, count).astype(np.float64)
     mean = np.bincount(cells, weight * reading, count) / np.where(total > 0, total, 1.0)
     return total, mean, float(np.dot(weight, (reading - mean[cells]) ** 2))

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.identify.grid import Grid, nominal_targets
-from compgen.identify.kernels import compiled_loops
 
 
 def start_moments(grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -23,9 +20,8 @@ def start_moments(grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray, float
     """
     centre = np.array([levels.mean() for levels in grid.levels_mm]) + grid.tools[0].tool_mm
     scale = max(max(float(np.ptp(levels)) for levels in grid.levels_mm), 1.0)
-    loops = compiled_loops()
-    if loops is not None:
-        return *_compiled_moments(loops, grid, centre, scale), centre, scale
+    if grid.compiled:
+        return *_compiled_moments(grid, centre, scale), centre, scale
     readings = np.sum([np.sum(data.length_mm * (data.weight > 0), axis=(1, 2)) for data in grid.tools], axis=0)
     counts = np.sum([np.count_nonzero(data.weight, axis=(1, 2)) for data in grid.tools], axis=0)
     offset = readings / np.maximum(counts, 1) / scale
@@ -44,11 +40,13 @@ def start_moments(grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray, float
     return moments, offset, centre, scale
 
 
-def _compiled_moments(loops: ModuleType, grid: Grid, centre: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:
+def _compiled_moments(grid: Grid, centre: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:
     """Moments (groups, 6, 6) and offsets (groups,) by the compiled loops."""
+    from compgen.identify.compiled import add_sums, start_sums
+
     counts, readings = np.zeros(grid.groups), np.zeros(grid.groups)
     for data in grid.tools:
-        loops.add_sums(data.weight, data.length_mm, counts, readings)
+        add_sums(data.weight, data.length_mm, counts, readings)
     offset = readings / np.maximum(counts, 1.0) / scale
     moments = np.zeros((grid.groups, 6, 6))
     out, mid, inner = grid.order
@@ -57,9 +55,7 @@ def _compiled_moments(loops: ModuleType, grid: Grid, centre: FloatArray, scale: 
         along = [(levels + data.tool_mm[k] - centre[k]) / scale for k, levels in enumerate(grid.levels_mm)]
         plane = np.stack([np.repeat(along[mid], len(along[inner])), np.tile(along[inner], len(along[mid]))])
         for k in range(grid.groups):
-            loops.start_sums(
-                along[out], plane, axes, data.weight[k], data.length_mm[k], scale, float(offset[k]), moments[k]
-            )
+            start_sums(along[out], plane, axes, data.weight[k], data.length_mm[k], scale, float(offset[k]), moments[k])
     moments += moments.swapaxes(1, 2).copy()  # each product was entered once, on one side of the diagonal or on it
     moments[:, np.arange(6), np.arange(6)] *= 0.5
     return moments, offset

@@ -16,12 +16,12 @@ from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
+from compgen.core.threads import one_thread
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify.affine_start import affine_start
 from compgen.identify.covariance import with_systematic
 from compgen.identify.determined import determined, unmirrored, weakness
 from compgen.identify.grid_problem import GridProblem
-from compgen.identify.kernels import count_identification
 from compgen.identify.known_stations import HeldStations, KnownStations, hold, locate_stations, with_known_start
 from compgen.identify.located import TracerReadings
 from compgen.identify.misfit import EXPLAINS, Cause, drift_of_repeats, labels_of, split_labels
@@ -36,7 +36,6 @@ from compgen.identify.robust_start import robust_state
 from compgen.identify.solver import Factor, solve
 from compgen.identify.state import IntArray, State
 from compgen.identify.task import AnyProblem, Task, check_readings, problem_of, start_values, task_of, with_weights
-from compgen.identify.threads import one_thread
 from compgen.identify.two_step import solve_in_two_steps
 
 MIN_STATIONS = 3
@@ -61,7 +60,6 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
         if no optimum is reached.
     """
     chosen = options or IdentifyOptions()
-    count_identification()
     with one_thread():
         try:
             found = _at_reference(machine, lengths, chosen)

@@ -16,7 +16,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.parallel import Map
-from compgen.core.steady import steady
+from compgen.core.threads import one_thread
 from compgen.errors import InputError
 from compgen.identify.covariance import Covariance
 from compgen.identify.identify import identify
@@ -121,7 +121,7 @@ class _Replicate:
     def __call__(self, seed: tuple[int, int]) -> FloatArray:
         noise = np.random.default_rng(seed).standard_normal(len(self.model_mm))
         readings = replace(self.lengths, length_mm=self.model_mm + self.sigma_mm * noise)
-        with steady():
+        with one_thread():
             return _values(identify(self.machine, readings, self.options))
 
 

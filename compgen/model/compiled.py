@@ -1,25 +1,21 @@
 """Compiled kernels: E = C P at points and on grids, and the exact model, each in one pass. Needs numba.
 
 Import through :mod:`compgen.model.kernels`. Rows of a table hold four numbers left of an interval and four steps
-(three components and a zero), so that one vector instruction works on a row. Compiled code is kept in the user's cache
-folder; nothing is written beside the program.
+(three components and a zero), so that one vector instruction works on a row.
 """
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import lru_cache
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 import numpy as np
 from numba import types
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+from compgen.core.kernels import Function, compile_for
+
 Row = tuple[float, float, float, float]
 
 _FLOATS = types.float64[::1]
@@ -30,38 +26,6 @@ _AXIS = types.Tuple(
     (types.float64, types.float64, types.float64, types.uint64) + (types.int64[::1], _FLOATS, _FLOATS, _FLOATS, _FLOATS)
 )
 _AXES = types.UniTuple(_AXIS, 3)
-
-
-def cache_folder() -> Path:
-    """Folder for compiled code, below the user's cache folder."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "compgen" / "numba"
-
-
-@contextmanager
-def _settings() -> Iterator[None]:
-    """Compile with vectors inside a row, and keep the code in :func:`cache_folder` unless numba was told where."""
-    before = numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR
-    numba.config.SLP_VECTORIZE = 1
-    numba.config.CACHE_DIR = before[1] or str(cache_folder())
-    try:
-        yield
-    finally:
-        numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR = before
-
-
-def compile_for(function: Function, signature: object) -> Function:
-    """Compile for one signature; without the cache where no folder can be written."""
-    options = {"error_model": "numpy", "fastmath": {"contract"}}
-    with _settings():
-        try:
-            kernel: Function = numba.njit(signature, cache=True, **options)(function)
-        except (RuntimeError, OSError):
-            kernel = numba.njit(signature, **options)(function)
-    return kernel
 
 
 def _inline(function: Function) -> Function:

@@ -6,7 +6,8 @@ Every entry of C is 1, a coordinate or a tool offset, so with f = (1, x, y, z, t
 
 each table a vector of three, squareness and signs in it (:mod:`compgen.model.tables`). A list of points costs one
 look-up per axis. On a full grid no points are formed: as a matrix of rows (x, y) against columns (z, component) E has
-a rank of at most nine. The kernels of :mod:`compgen.model.kernels` do the same in one pass where numba is installed.
+a rank of at most nine. The kernels of :mod:`compgen.model.kernels` do the same in one pass
+(:mod:`compgen.core.kernels` says when).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
+from compgen.core.kernels import switch_to_compiled, use_compiled
 from compgen.core.machine import Machine
 from compgen.core.threads import one_thread
 from compgen.errors import InputError
@@ -27,7 +29,7 @@ from compgen.model.volumetric import tool_of
 #: Points that are worked on together: their intermediate arrays stay in the cache of one core.
 BLOCK = 16_384
 _GRID_BLOCK = 32_768
-#: From so many points on, loading the kernels (half a second, some seconds for the first time) pays for itself.
+#: From so many points on, loading the kernels (half a second, some seconds for the first time) pays for a single call.
 _POINTS_FOR_KERNELS, _GRID_FOR_KERNELS = 20_000_000, 500_000_000
 
 
@@ -80,7 +82,7 @@ def volumetric_error_at(
     tool = tool_of(machine, tool_mm)
     each = None if tool.ndim == 1 else np.broadcast_to(tool, position.shape)
     tables = field_tables(machine, errors, tool if each is None else None)
-    if kernels.ready(kernels.repeated(len(position)) or len(position) >= _POINTS_FOR_KERNELS):
+    if use_compiled(len(position), _POINTS_FOR_KERNELS):
         kernels.field_at(tables, position, each, result)
         return result
     for part in blocks(len(position)):
@@ -156,7 +158,7 @@ def volumetric_error_on_grid(
     if result.size == 0:
         return result
     at_levels = grid_tables(machine, errors, tool, levels)
-    if kernels.ready(kernels.repeated(result.size // 3) or result.size >= 3 * _GRID_FOR_KERNELS):
+    if use_compiled(result.size // 3, _GRID_FOR_KERNELS):
         kernels.field_on_grid(at_levels, levels, result)
     else:
         _grid_by_rank(at_levels, levels, result)
@@ -210,8 +212,12 @@ def _functions_of_xy(
 
 
 def load_kernels() -> bool:
-    """Compile or load the fast kernels for this process; False if numba (``compgen[fast]``) is not installed."""
-    return kernels.ready(load=True)
+    """Use the compiled kernels for every size from now on, as the environment's ``COMPGEN_KERNELS=compiled`` does.
+
+    This process and those that it starts are switched. False, and nothing is changed, where numba (``compgen[fast]``)
+    is not installed or ``COMPGEN_KERNELS`` is plain.
+    """
+    return switch_to_compiled()
 
 
 __all__ = [

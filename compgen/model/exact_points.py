@@ -16,6 +16,7 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
+from compgen.core.kernels import use_compiled
 from compgen.core.machine import Machine
 from compgen.model import kernels
 from compgen.model.evaluate import blocks, checked_out, checked_points
@@ -23,7 +24,7 @@ from compgen.model.exact import passing_order, travel_directions
 from compgen.model.tables import AxisTable, AxisTables, motion_tables
 from compgen.model.volumetric import tool_of
 
-#: From so many points on, loading the kernels pays for itself.
+#: From so many points on, loading the kernels pays for a single call.
 _POINTS_FOR_KERNELS = 5_000_000
 _SERIES_BELOW = 1e-4  # rad^2: there the next term of the series is below 1e-21
 _SQUARENESS = ("EC0Y", "EB0Z", "EA0Z")
@@ -45,7 +46,7 @@ def exact_error_at(
     tables, order = motion_tables(errors), passing_order(machine)
     squareness = np.array([errors.squareness.get(name, (0.0, 0.0))[0] for name in _SQUARENESS])
     tilt = travel_directions(machine, squareness)[0] - np.eye(3)
-    if kernels.ready(kernels.repeated(len(position)) or len(position) >= _POINTS_FOR_KERNELS):
+    if use_compiled(len(position), _POINTS_FOR_KERNELS):
         kernels.exact_at(tables, order, tilt, position, tool, result)
         return result
     for part in blocks(len(position)):

@@ -1,48 +1,19 @@
-"""Access to the compiled kernels of :mod:`compgen.model.compiled`, which need numba (``pip install compgen[fast]``).
+"""Calls of the compiled kernels of :mod:`compgen.model.compiled`; :mod:`compgen.core.kernels` says when they serve.
 
-Nothing here imports numba before it is asked for: that alone takes half a second.
+Importing this does not import numba: that alone takes a third of a second.
 """
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from compgen.core.csvio import FloatArray
-from compgen.core.steady import is_steady
 from compgen.model.tables import COORDINATES, AxisTable, AxisTables
 
-_COMPILED = "compgen.model.compiled"
-#: From the second evaluation of so many points or more in a process on, the kernels are loaded: more will follow.
-_LARGE = 500_000
-_large_calls: list[int] = []
 _ROW = 8  # numbers per group and interval
-
-
-def ready(load: bool = False) -> bool:
-    """Whether the kernels are loaded; with ``load`` they are loaded first, if numba is installed.
-
-    Never in a steady block, :func:`compgen.core.steady.steady`: that may not depend on what was loaded before.
-    """
-    if is_steady():
-        return False
-    if load and _COMPILED not in sys.modules:
-        try:
-            importlib.import_module(_COMPILED)
-        except ImportError:
-            return False
-    return _COMPILED in sys.modules
-
-
-def repeated(points: int) -> bool:
-    """Whether this is at least the second evaluation of many points in this process; each call counts."""
-    if points >= _LARGE and len(_large_calls) < 2:
-        _large_calls.append(points)
-    return points >= _LARGE and len(_large_calls) > 1
 
 
 def _axis(table: AxisTable, groups: tuple[int, ...]) -> tuple[Any, ...]:

@@ -13,10 +13,10 @@ from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM, error_named
 from compgen.core.points import Points
+from compgen.core.threads import one_thread
 from compgen.identify.covariance import error_values
 from compgen.identify.noise import IdentifyOptions, ReadingNoise, reading_noise
 from compgen.identify.rank import Rank
-from compgen.identify.threads import one_thread
 from compgen.model.grid import volume_grid
 from compgen.plan.planned import Planned, Prediction, planned, planned_rank, predict_unknowns
 from compgen.plan.stations import PlannedStations

@@ -14,10 +14,10 @@ from compgen.core.csvio import FloatArray
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.points import Points
+from compgen.core.threads import one_thread
 from compgen.errors import InputError
 from compgen.identify.noise import ReadingNoise
 from compgen.identify.solver import factorise
-from compgen.identify.threads import one_thread
 from compgen.model.grid import volume_grid
 from compgen.plan.plan import Plan, plan_of
 from compgen.plan.planned import NEAREST_MM, Planned, planned

@@ -14,8 +14,8 @@ from typing import Any
 import sqlalchemy as sa
 
 from compgen.core.parallel import limited
-from compgen.core.steady import steady
 from compgen.core.text import visible
+from compgen.core.threads import one_thread
 from compgen.errors import CompgenError
 from compgen.recal import claims, inbox, logs
 from compgen.recal.claims import Claim, ClaimLostError
@@ -117,7 +117,7 @@ def run_machine(job: MachineJob, url: str, stop: Stop = lambda: False, clock: Cl
     try:
         store = open_store(url, clock=clock)
         try:
-            with steady():
+            with one_thread():
                 outcome = _Pass(store, job, store.add_machine(job.name), stop).run()
         finally:
             store.close()
