@@ -8,6 +8,7 @@ from pathlib import Path
 from compgen.core.axis_runs import AxisRuns, holds_axis_runs, read_axis_runs
 from compgen.core.deviations import Deviations, holds_deviations, read_deviations
 from compgen.core.lengths import Lengths, read_lengths
+from compgen.core.parts import holds_parts
 from compgen.errors import InputError
 from compgen.sixdof.readings import holds_sixdof
 
@@ -30,6 +31,11 @@ def read_diagnosed(paths: Sequence[str | Path]) -> Measurement:
 def _kind(path: str | Path) -> str:
     if holds_sixdof(path):
         message = "holds six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
+        raise InputError(message, file=path)
+    if holds_parts(path):
+        message = (
+            "holds features of a part, which identify and accuracy take; diagnose takes lengths, deviations, axis runs"
+        )
         raise InputError(message, file=path)
     if holds_axis_runs(path):
         return "axis runs"

@@ -45,6 +45,8 @@ IntArray = NDArray[np.int64]
 SHOWS, RCOND = 1e-6, 1e-9
 #: Angles are counted in mm at this lever, so that they compare with translations.
 LEVER_MM = 1000.0
+#: Nodes with less than this share of the readings of the median node are tied to their neighbours.
+WEAK = 0.25
 #: An error counts as identified if readings determine this share of its unknowns, or one direction at least.
 SEEN = 1e-6
 #: Curvature of a curve between neighbouring nodes where too few of them are seen to measure it, um and urad.
@@ -214,7 +216,7 @@ def _readings(machine: Machine, deviations: Deviations, sigma_mm: FloatArray) ->
 class _Solution:
     """Optimum: unknown errors with a factor F of their covariance (F F^T), poses (set-ups, 7), residuals (all readings, k).
 
-    ``tied`` are nodes that no reading reaches, by error; ``left_out`` the errors of which nothing is seen; ``partly`` those
+    ``unreached`` are nodes that no reading reaches, by error; ``left_out`` the errors of which nothing is seen; ``partly`` those
     of which a part is not determined.
     """
 
@@ -225,7 +227,7 @@ class _Solution:
     u_scale: FloatArray
     residual_mm: FloatArray
     rank: int
-    tied: Mapping[str, FloatArray]
+    unreached: Mapping[str, FloatArray]
     left_out: tuple[str, ...]
     partly: tuple[str, ...]
 
@@ -300,9 +302,17 @@ def _solve(
     width = pose.shape[1] // len(np.unique(readings.setup))
     u_poses = np.linalg.norm(inverse[shown.shape[1] :], axis=1).reshape(-1, width)
     return _Solution(
-        layout, unknowns, factor, poses.reshape(-1, width), u_poses[:, 6] if free_scale else np.zeros(len(u_poses)),
-        residual, rank, tied, tuple(name for name in names if name not in kept), partly,
-    )  # fmt: skip
+        layout,
+        unknowns,
+        factor,
+        poses.reshape(-1, width),
+        u_poses[:, 6] if free_scale else np.zeros(len(u_poses)),
+        residual,
+        rank,
+        _unreached(layout, readings.position_mm[accepted]),
+        left_out=tuple(name for name in names if name not in kept),
+        partly=partly,
+    )
 
 
 def _columns_of(layout: ErrorParameters) -> list[tuple[str, slice]]:
@@ -374,6 +384,16 @@ def _range(matrix: FloatArray) -> FloatArray:
     return np.asarray(left[:, values > 1e-9 * max(1.0, float(values.max(initial=0.0)))])
 
 
+def _unreached(layout: ErrorParameters, position_mm: FloatArray) -> dict[str, FloatArray]:
+    """Nodes without a reading in the intervals beside them, by error; ``position_mm`` (k, 3)."""
+    found = {}
+    for curve in layout.curves:
+        near = (hat_matrix(curve.nodes_mm, position_mm[:, curve.error.axis]) > 1e-6).any(axis=0)
+        if not near.all():
+            found[curve.error.name] = curve.nodes_mm[~near]
+    return found
+
+
 def _bends(layout: ErrorParameters, unknowns: FloatArray, tied: Mapping[str, FloatArray]) -> dict[str, float]:
     """Second difference of the tied curves between nodes that readings show, rms, mm and rad; at least what is usual."""
     found = {}
@@ -394,15 +414,20 @@ def _bends(layout: ErrorParameters, unknowns: FloatArray, tied: Mapping[str, Flo
 def _ties(
     layout: ErrorParameters, readings: _Readings, used: FloatArray, bend: Mapping[str, float] | None
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Rows that tie nodes without a reading to their neighbours by small second differences; and those nodes by error."""
+    """Rows that tie nodes with few readings or none to their neighbours by small second differences; those nodes by error.
+
+    A round plate hardly reaches the ends of the travel: without a tie the noise of a few holes there would turn the whole
+    curve, since a straightness is zero at both ends.
+    """
     rows, tied = [], {}
     for curve in layout.curves:
         along = readings.position_mm[used > 0, curve.error.axis]
-        shown: NDArray[np.bool_] = np.any(np.abs(layout.basis(curve.error.axis, along)) > 1e-6, axis=0)
+        weight = (layout.basis(curve.error.axis, along) ** 2).sum(axis=0)
+        shown: NDArray[np.bool_] = weight > WEAK * np.median(weight)
         if shown.all():
             continue
-        near = (hat_matrix(curve.nodes_mm, along) > 1e-6).any(axis=0)
-        tied[curve.error.name] = curve.nodes_mm[~near]
+        near = (hat_matrix(curve.nodes_mm, along) ** 2).sum(axis=0)
+        tied[curve.error.name] = curve.nodes_mm[near <= WEAK * np.median(near)]
         unit = MM_PER_UM if curve.error.kind == "linear" else RAD_PER_URAD
         for k in range(1, len(shown) - 1):
             if not shown[k - 1 : k + 2].all():
@@ -416,9 +441,9 @@ def _ties(
 
 
 def _say_what_is_not_reached(solution: _Solution) -> None:
-    if not solution.tied:
+    texts = [f"{name} at {', '.join(f'{value:g}' for value in nodes)} mm" for name, nodes in solution.unreached.items()]
+    if not texts:
         return
-    texts = [f"{name} at {', '.join(f'{value:g}' for value in nodes)} mm" for name, nodes in solution.tied.items()]
     warnings.warn(
         f"no reading reaches {'; '.join(texts[:6])}{' ...' if len(texts) > 6 else ''}: these nodes are tied to their "
         "neighbours by smoothness, with the uncertainty of an extrapolation; --range from-data keeps to what was measured",
@@ -481,7 +506,7 @@ def _result(
                 letter: [float(column.min()), float(column.max())]
                 for letter, column in zip(AXES, deviations.position_mm.T, strict=True)
             },
-            "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.tied.items()},
+            "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
         },
         misfit=misfit_of(
             chi_square, freedom, u_scale, source, lambda: _series(deviations, readings, solution.residual_mm, accepted)
