@@ -19,7 +19,7 @@ WARMUP_SCANS, LINEAR_SCANS = 2.0, 4.0
 #: Waves in the session that are tried, and what they count as (neighbours are nearly alike).
 WAVES, WAVE_SCANS = np.arange(0.5, 4.1, 0.25), 6.0
 #: Windows of disturbed readings are looked for in sessions up to this size; beyond it, one reading in several begins one.
-MOST_WINDOWS = 1500
+MOST_WINDOWS = 800
 #: Numbers of readings in a burst that are tried; those up to LONGEST_FREE may each have a value of their own.
 BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
 

@@ -32,6 +32,8 @@ WHITE = (0.0, 0.4, 0.8)
 LEAST_MM = 2e-6
 #: Variances over sigma^2 that the coefficients of several columns may have.
 LAMBDA = np.array([2.0, 20.0, 200.0, 2000.0])
+#: Names of slow drifts.
+DRIFTS = ("warmup_drift", "linear_drift")
 #: Smallest share of a column that must be left beside the means and the other members.
 LEAST_SEEN = 1e-3
 #: Improvement of the criterion that a member must bring.
@@ -131,6 +133,7 @@ class Search:
     def __init__(self, session: AxisSession, grid: NoiseGrid, candidates: Sequence[Candidate]) -> None:
         self.session, self.grid, self.candidates = session, grid, list(candidates)
         self.y = session.deviation_mm - session.deviation_mm.mean()
+        self._drifts = np.array([c.name in DRIFTS for c in self.candidates], dtype=bool)
         sizes = np.array([c.columns.shape[1] for c in self.candidates], dtype=np.int64)
         #: Candidates of k columns: their numbers (m,) and columns (n, m, k).
         self._blocks = [
@@ -229,8 +232,15 @@ class Search:
             members = grown
         return members
 
-    def _best(self, members: Sequence[int], allowed: NDArray[np.bool_]) -> tuple[int, float]:
+    def _open(self, members: Sequence[int], allowed: NDArray[np.bool_]) -> FloatArray:
+        """Criteria beside some members; a session has one drift with a name at most."""
         criteria = np.where(allowed, self.criteria(members)[1], -np.inf)
+        if any(self._drifts[k] for k in members):
+            criteria[self._drifts] = -np.inf
+        return criteria
+
+    def _best(self, members: Sequence[int], allowed: NDArray[np.bool_]) -> tuple[int, float]:
+        criteria = self._open(members, allowed)
         best = int(np.argmax(criteria))
         return best, float(criteria[best])
 
@@ -239,7 +249,7 @@ class Search:
             changed = False
             for member in list(members):
                 rest = [k for k in members if k != member]
-                criteria = np.where(allowed, self.criteria(rest)[1], -np.inf)
+                criteria = self._open(rest, allowed)
                 best = int(np.argmax(criteria))
                 if criteria[best] < LEAST_GAIN:
                     members, changed = rest, True

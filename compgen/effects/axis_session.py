@@ -16,8 +16,8 @@ from compgen.effects.readings import Readings
 
 #: Number of time constants that are tried.
 STEPS = 64
-#: Shortest and longest time constant that is tried, as shares of the session.
-SHORTEST, LONGEST = 0.06, 4.0
+#: Longest time constant that is tried, as a share of the session, and the shortest, also in readings.
+LONGEST, SHORTEST, SHORTEST_READINGS = 4.0, 0.015, 4.0
 #: Time constants of settling that are tried, s.
 SETTLING_S = (0.3, 0.6, 1.2, 2.5, 5.0, 10.0)
 _WINDOW = (
@@ -64,11 +64,12 @@ class WarmupDrift(Effect):
         )
 
     def positions(self, readings: Readings) -> Sequence[float]:
-        """Time constants from a sixteenth of the measurement to four times its duration."""
+        """Time constants from four readings to four times the duration of the measurement."""
         span = float(np.ptp(time_of(readings))) if len(readings) else 0.0
         if "tau" in self.settings or span == 0.0:
             return ()
-        return list(np.geomspace(SHORTEST * span, LONGEST * span, STEPS))
+        shortest = min(max(SHORTEST, SHORTEST_READINGS / len(readings)), 0.5)
+        return list(np.geomspace(shortest * span, LONGEST * span, STEPS))
 
     def used(self, readings: Readings) -> dict[str, float]:
         """Time constant and start."""
