@@ -106,6 +106,10 @@ FIELDS: Mapping[str, tuple[str, ...]] = {
     "setup": ("setup", "aufstellung", "setupno"),
     "pose": ("pose", "stop", "halt"),
 }  # fmt: skip
+#: Names of columns that count the rows.
+_INDEX = ("i", "no", "nr", "n", "index", "count", "number", "nummer", "lfdnr", "posnr", "point", "pointno", "punkt", "punktnr",
+          "zielnr", "targetno", "targetnumber", "step", "schritt", "sample", "row", "zeile", "numero", "num", "id",
+          "\u5e8f\u53f7", "\u7f16\u53f7")  # fmt: skip
 #: A channel of temperature that the user names by --map temp_NAME=COLUMN.
 CHANNEL = re.compile(r"temp_[a-z0-9_]{1,30}")
 #: A column of one run that the user names by --map run3-=COLUMN: number, and direction if one is given.
@@ -197,6 +201,11 @@ def fields_of(header: Sequence[str], given: Mapping[str, str], ignored: Sequence
             found[key] = min(matching, key=lambda column: words.index(column.word))
             taken.add(found[key].name)
     return found
+
+
+def is_index(name: str) -> bool:
+    """Whether a column with this name counts the rows."""
+    return split_name(name).word in _INDEX
 
 
 def check_field(key: str, option: str) -> None:

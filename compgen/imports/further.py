@@ -26,7 +26,7 @@ from compgen.imports.amounts import (
     tool_of,
     uncertainty_of,
 )
-from compgen.imports.columns import CHANNEL, Column, split_name
+from compgen.imports.columns import CHANNEL, Column, is_index, split_name
 from compgen.imports.findings import Findings
 from compgen.imports.moments import date_in_header, times_of
 from compgen.imports.result import Kind
@@ -45,10 +45,6 @@ _HARMLESS = (
 )  # fmt: skip
 #: Fields of readings: one that is left over may be what was meant.
 _READINGS = ("actual", "deviation", "correction", "value", "length", "x", "y", "z", "dx", "dy", "dz", "xa", "ya", "za")
-#: Names of columns that count the rows.
-_INDEX = ("i", "no", "nr", "n", "index", "count", "number", "nummer", "lfdnr", "posnr", "point", "pointno", "punkt", "punktnr",
-          "zielnr", "targetno", "targetnumber", "step", "schritt", "sample", "row", "zeile", "numero", "num", "id",
-          "\u5e8f\u53f7", "\u7f16\u53f7")  # fmt: skip
 #: Units in brackets that are neither a length nor an angle.
 _OTHER_UNIT = re.compile(r"(?i)[\[(]\s*(%|%\s?rh|rh|[hkm]?pa|m?bar|mmhg|ppm|m?v|m?a|k?w|k?n|hz|rpm|1/min|db)\s*[\])]")
 
@@ -262,7 +258,7 @@ class _Reader:
             or is_temperature(column)
             or further_unit(column.unit or "") is not None
             or any(word in words for word in _HARMLESS)
-            or column.word in _INDEX
+            or is_index(column.name)
             or _OTHER_UNIT.search(column.name) is not None
         )
 

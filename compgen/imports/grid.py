@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 
+import numpy as np
+
 from compgen.errors import InputError
+from compgen.imports.columns import FIELDS, is_index, known_unit, split_name
 from compgen.imports.decimals import plain_decimals
+from compgen.imports.run_names import is_known_name, names_run, run_in, statistic_in, way
 from compgen.imports.source import LARGEST, Text, parse_number, shown
+from compgen.imports.units import further_unit
 
 #: The rows of the largest sheet there is.
 MOST_ROWS, MOST_COLUMNS, MOST_CELL = 1_048_576, 500, 2_000
@@ -18,6 +25,13 @@ MOST_ROWS, MOST_COLUMNS, MOST_CELL = 1_048_576, 500, 2_000
 MOST_CELLS = 10_000_000
 #: So many lines are looked at for the separator, and for the header.
 _SAMPLE_LINES, _HEADER_LINES = 200, 200
+#: So many rows of each table are counted to find the longest.
+_MEASURED_ROWS = 5_000
+_ALL_WORDS = frozenset(word for words in FIELDS.values() for word in words)
+#: What stands in a row of units where there is none.
+_NO_UNIT = ("", "-", "\u2013", "--", "/", "1")
+#: A key and at most so many cells of its value stand in one row above a table.
+_MOST_PAIR = 6
 #: Letters of words that Python takes for numbers (inf, nan), and a comma: a column without them is converted at once.
 _NOT_PLAIN = frozenset("infa,")
 
@@ -39,7 +53,10 @@ class Grid:
 
 @dataclass(frozen=True)
 class Table:
-    """A header and its rows, all of one width; ``metadata`` holds what stands above as ``key: value``."""
+    """A header and its rows, all of one width.
+
+    ``metadata`` holds what stands above as ``key: value``, keys in lower case; ``comments`` the ``# key = value`` as they are.
+    """
 
     grid: Grid
     header: tuple[str, ...]
@@ -47,6 +64,7 @@ class Table:
     rows: Sequence[Sequence[str]]
     lines: Sequence[int]
     metadata: dict[str, str] = field(default_factory=dict)
+    comments: dict[str, str] = field(default_factory=dict)
 
     def column(self, name: str) -> list[str]:
         """Return the cells of a column."""
@@ -123,43 +141,170 @@ def _separator(lines: Sequence[str]) -> str | None:
     return best
 
 
-def find_table(grid: Grid, decimal: str | None = None) -> Table:
-    """Find header and rows: the first row of names that rows of numbers follow; what stands above is metadata.
+@dataclass(frozen=True)
+class _Layout:
+    """Where a table stands in a grid: its rows of names from ``top`` on, rows of numbers from ``first`` to before ``end``.
 
+    ``numbers`` counts its cells with numbers. ``labels`` > 0: each row is a run, and so many cells of it name it; then
+    ``names`` are those of the rows.
+    """
+
+    top: int
+    first: int
+    end: int
+    names: tuple[str, ...]
+    numbers: int
+    labels: int = 0
+
+
+def find_table(grid: Grid, decimal: str | None = None) -> Table:
+    """Find header and rows: the longest block of numbers below a row of names; what stands above is metadata.
+
+    The targets may go down (a row each) or across (a column each); the table that is returned has a row for each.
     ``decimal`` is the decimal mark, "comma" or "point", if the user says it.
 
-    Raises InputError if there is none, and for a row of another width below the header.
+    Raises InputError if there is none, for a row of another width below the header, and for a second block of numbers.
     """
+    grid = _without_margin(grid)
+    best: _Layout | None = None
+    for k in range(min(len(grid.rows), _HEADER_LINES)):
+        found = _across(grid, k) or _down(grid, k)
+        if found is not None and (best is None or found.numbers > best.numbers):
+            best = found
+        if found is not None and found.end == len(grid.rows):
+            break
+    if best is None:
+        raise grid.fail(
+            "holds no table: a header line with the names of the columns, and rows of numbers below it, are due"
+            f"{grid.empty}"
+        )
     metadata: dict[str, str] = {}
-    for k, row in enumerate(grid.rows[:_HEADER_LINES]):
-        if _is_header(grid, k):
-            return _table(grid, k, metadata, decimal)
-        _note(row, metadata)
-    raise grid.fail(
-        f"holds no table: a header line with the names of the columns, and rows of numbers below it, are due{grid.empty}"
-    )
+    comments: dict[str, str] = {}
+    for row in grid.rows[: best.top]:
+        _note(row, metadata, comments)
+    _check_beside(grid, 0, best.top)
+    if not best.labels:
+        return _table(grid, best, metadata, comments, decimal)
+    _check_beside(grid, best.end, len(grid.rows))
+    return _turned(grid, best, metadata, comments, decimal)
+
+
+def _without_margin(grid: Grid) -> Grid:
+    """Return the grid without columns at its left that are empty in every row."""
+    margin = min((next((k for k, cell in enumerate(row) if cell), len(row)) for row in grid.rows), default=0)
+    return replace(grid, rows=[row[margin:] for row in grid.rows]) if margin else grid
 
 
 def _filled(row: Sequence[str]) -> list[str]:
     return [cell for cell in row if cell]
 
 
-def _is_header(grid: Grid, k: int) -> bool:
-    """Whether row k holds names, and numbers stand in the row below, or below a row of units."""
-    names = _filled(grid.rows[k])
-    below = grid.rows[k + 1 : k + 3]
-    if len(names) < 2 or not below or (grid.rows[k][0].startswith("#") and "=" in "".join(grid.rows[k])):
-        return False
+def _down(grid: Grid, k: int) -> _Layout | None:
+    """Return the table whose last row of names is row k, a row of units below it or not; None if there is none."""
+    row = grid.rows[k]
+    names = _filled(row)
+    if len(names) < 2 or len(names) > MOST_COLUMNS or _is_comment(row):
+        return None
+    first = k + 1
+    units: Sequence[str] = ()
+    if first < len(grid.rows) and _are_units(grid.rows[first]):
+        units, first = grid.rows[first], first + 1
+    if first >= len(grid.rows) or not _has_number(grid.rows[first]):
+        return None
     words = sum(parse_number(name) is None for name in names)
-    if 2 * words < len(names) or len(names) > MOST_COLUMNS:
-        return False
-    if len(below) == 2 and not _has_number(below[0]):
-        return len(_filled(below[0])) <= len(names) and _like(names, below[1], len(names))
-    return _like(names, below[0], MOST_COLUMNS)
+    if 2 * words < len(names) and not _numbers_runs(row, grid.rows[first]):
+        return None
+    top, joined = _joined_names(grid, k)
+    width = len(joined) if units else MOST_COLUMNS
+    if not _like(_filled(joined), grid.rows[first], width):
+        return None
+    joined = [
+        f"{name} [{unit}]" if unit else name for name, unit in zip_longest(joined, _units_in(units), fillvalue="")
+    ]
+    end, numbers = first, 0
+    while end < min(len(grid.rows), first + _MEASURED_ROWS) and _as(grid.rows[first], grid.rows[end]):
+        numbers += sum(parse_number(cell) is not None for cell in grid.rows[end])
+        end += 1
+    end = len(grid.rows) if end == first + _MEASURED_ROWS else end
+    return _Layout(top, first, end, tuple(joined), numbers)
+
+
+def _is_comment(row: Sequence[str]) -> bool:
+    return row[0].startswith("#") and "=" in "".join(row)
 
 
 def _has_number(row: Sequence[str]) -> bool:
     return any(parse_number(cell) is not None for cell in row)
+
+
+def _unit_in_cell(cell: str) -> str | None:
+    """Return the text of a unit that a cell holds and nothing else; brackets and "in" do not count."""
+    text = re.sub(r"^in\s+", "", cell.strip("[]() "))
+    return text if known_unit(text) or further_unit(text) or text in _NO_UNIT else None
+
+
+def _are_units(row: Sequence[str]) -> bool:
+    """Whether every filled cell of a row is a unit; in brackets it may be one that is not known."""
+    cells = _filled(row)
+    known = [bool(_unit_in_cell(cell)) for cell in cells]
+    bracketed = [cell[0] in "[(" and cell[-1] in "])" and parse_number(cell[1:-1]) is None for cell in cells]
+    ways = all(way(cell) is not None for cell in cells)
+    return not ways and (any(known) or all(bracketed)) and all(k or b for k, b in zip(known, bracketed, strict=True))
+
+
+def _units_in(row: Sequence[str]) -> list[str]:
+    return ["" if cell in _NO_UNIT else _unit_in_cell(cell) or cell.strip("[]() ") for cell in row]
+
+
+def _is_position(name: str) -> bool:
+    return split_name(name).word in FIELDS["position"]
+
+
+def _numbers_runs(row: Sequence[str], below: Sequence[str]) -> bool:
+    """Whether a header names the positions, and every other column by the number of its run alone."""
+    return _is_position(row[0]) and parse_number(below[0]) is not None and all(c.isdigit() for c in _filled(row[1:]))
+
+
+def _joined_names(grid: Grid, k: int) -> tuple[int, list[str]]:
+    """Return the first row of names above row k, and the names: what stands over several columns belongs to each of them."""
+    names = [name.lstrip("#% ") if n == 0 else name for n, name in enumerate(grid.rows[k])]
+    while (
+        names
+        and not names[-1]
+        and not any(row[len(names) - 1 : len(names)] != [""] for row in grid.rows[k + 1 : k + 3])
+    ):
+        names.pop()
+    top = k
+    while (
+        top > 0 and grid.lines[top] == grid.lines[top - 1] + 1 and _needs_more(names) and _is_group(grid.rows[top - 1])
+    ):
+        top -= 1
+        over, last = grid.rows[top], ""
+        for n in range(1, max(len(names), len(over))):
+            cell = over[n] if n < len(over) else ""
+            last = cell or last
+            own = names[n] if n < len(names) else ""
+            alone = not cell and (statistic_in(own) is not None or split_name(own).word in _ALL_WORDS)
+            joined = own if alone or own == last else f"{last} {own}".strip()
+            names[n:] = [joined, *names[n + 1 :]]
+        if over[0] and not (names[0] and _unit_in_cell(names[0]) is None):
+            names[0] = f"{over[0]} {names[0]}".strip()
+    while names and not names[-1]:
+        names.pop()
+    return top, names
+
+
+def _needs_more(names: Sequence[str]) -> bool:
+    """Whether names leave open which run a column is: empty, the same twice, or nothing but directions, numbers and units."""
+    other = list(names[1:])
+    bare = all(way(name) is not None or name.isdigit() or _unit_in_cell(name) for name in other)
+    return not all(names) or len(set(other)) < len(other) or bare
+
+
+def _is_group(row: Sequence[str]) -> bool:
+    """Whether a row above the names may say what several columns have in common: runs, directions, deviations."""
+    cells = [cell for cell in row[1:] if cell]
+    return bool(cells) and not _has_number(row[:1]) and all(is_known_name(cell) for cell in cells)
 
 
 def _like(names: Sequence[str], row: Sequence[str], most: int) -> bool:
@@ -173,69 +318,203 @@ def _like(names: Sequence[str], row: Sequence[str], most: int) -> bool:
     return numbers >= 1 and fits and 3 * numbers >= len(cells)
 
 
-def _note(row: Sequence[str], metadata: dict[str, str]) -> None:
+def _across(grid: Grid, k: int) -> _Layout | None:
+    """Return the table of which row k is the first and whose targets go across, a row for each run; None if there is none."""
+    row = grid.rows[k]
+    labels = next((n for n, cell in enumerate(row) if parse_number(cell) is not None), 0)
+    numbers = [parse_number(cell) for cell in row[labels:] if cell]
+    if not labels or len(numbers) < 2 or None in numbers[:2] or not row[0] or _is_comment(row):
+        return None
+    end = k + 1
+    while end < len(grid.rows) and _is_run_row(grid, end, labels):
+        end += 1
+    cells = grid.rows[k:end]
+    names = _row_names(cells, labels)
+    count = sum(parse_number(cell) is not None for own in cells for cell in own[labels:])
+    if any(_is_position(name) for name in names[:3]) and len(names) > 1 and _texts(cells[1:]):
+        return _Layout(k, k, end, tuple(names), count, labels)
+    corner = [part for cell in row[:labels] for part in re.split(r"[/\\|]|->", cell)]
+    if len(names) < 2 or not any(names_run(part) for part in corner):
+        return None
+    named = [run_in(name) is not None for name in names[1:]]
+    targets = np.array([parse_number(cell) for cell in row[labels:] if cell], dtype=np.float64)
+    if not any(named) or not (np.all(np.diff(targets) > 0) or np.all(np.diff(targets) < 0)):
+        return None
+    unit = next((split_name(part).unit for part in corner if _is_position(split_name(part).name)), None)
+    names[0] = f"Position [{unit}]" if unit else "Position"
+    return _Layout(k, k, end, tuple(names), count, labels)
+
+
+def _texts(rows: Sequence[Sequence[str]]) -> bool:
+    return all(parse_number(row[0]) is None for row in rows)
+
+
+def _is_run_row(grid: Grid, k: int, labels: int) -> bool:
+    """Whether row k has a label and then numbers, right below the row before."""
+    row = grid.rows[k]
+    follows = grid.lines[k] == grid.lines[k - 1] + 1
+    return follows and bool(_filled(row[:labels])) and _has_number(row[labels:]) and not _is_comment(row)
+
+
+def _row_names(rows: Sequence[Sequence[str]], labels: int) -> list[str]:
+    """Return the names of rows by their first cells; an empty one of several means the same as above, a bare number a run."""
+    names, last = [], [""] * labels
+    for row in rows:
+        last = [
+            cell or (above if n < labels - 1 else "")
+            for n, (cell, above) in enumerate(zip(row[:labels], last, strict=False))
+        ]
+        parts = [f"run {cell}" if re.fullmatch(r"\d{1,3}(\.0)?", cell) else cell for cell in last]
+        names.append(" ".join(part.removesuffix(".0") for part in parts if part))
+    return names
+
+
+def _turned(
+    grid: Grid, layout: _Layout, metadata: dict[str, str], comments: dict[str, str], decimal: str | None
+) -> Table:
+    """Return a table with a row for each target from one with a column for each."""
+    names = _single_names(grid, layout.names, grid.lines[layout.first])
+    below = grid.rows[layout.first : layout.end]
+    width = max(len(_trimmed(row)) for row in below) - layout.labels
+    cells = [[row[layout.labels + n] if layout.labels + n < len(row) else "" for row in below] for n in range(width)]
+    lines = [grid.lines[layout.first]] * width
+    note = "the targets go across: each row of the file is a run"
+    return _finished(
+        replace(grid, notes=(*grid.notes, note)), names, cells, lines, lines[0], metadata, comments, decimal
+    )
+
+
+def _trimmed(row: Sequence[str]) -> Sequence[str]:
+    end = len(row)
+    while end and not row[end - 1]:
+        end -= 1
+    return row[:end]
+
+
+def _check_beside(grid: Grid, start: int, end: int) -> None:
+    """Refuse rows of readings that do not belong to the table; statistics over the runs may stand there."""
+    last, count = 0, 0
+    for k in range(start, end):
+        row = grid.rows[k]
+        label = next(iter(_filled(row)), "")
+        readings = sum(parse_number(cell) is not None for cell in row) >= 2 and statistic_in(label) is None
+        readings = readings and (parse_number(label) is not None or run_in(label) is not None or _is_position(label))
+        count = count + 1 if readings and (not count or k == last + 1) else int(readings)
+        last = k
+        if count >= 2 and not _is_summary(grid, k - 1):
+            message = "rows of numbers stand here that do not belong to the table: put each table into a file or sheet of its own"
+            raise grid.fail(message, grid.lines[k - 1])
+
+
+def _is_summary(grid: Grid, first: int) -> bool:
+    """Whether the rows from ``first`` on are statistics, by the names above them."""
+    for k in range(max(0, first - 2), first):
+        layout = _down(grid, k)
+        if layout is not None and layout.first <= first:
+            return all(statistic_in(name) or _is_position(name) or is_index(name) for name in layout.names if name)
+    return False
+
+
+def _note(row: Sequence[str], metadata: dict[str, str], comments: dict[str, str]) -> None:
+    """Take what stands above a table: ``key = value``, ``key: value``, or a key and its value in the next cells."""
     cells = _filled(row)
     text = cells[0].lstrip("#% ") if cells else ""
+    if cells and _is_comment([*cells]) and text.partition("=")[0].strip():
+        key, _, value = text.partition("=")
+        comments.setdefault(key.strip(), ", ".join(part for part in (value.strip(), *cells[1:]) if part))
+        metadata.setdefault(key.strip().lower(), comments[key.strip()])
+        return
+    pairs = [n for n, cell in enumerate(cells) if cell.endswith(":") and n + 1 < len(cells)]
+    if len(pairs) > 1 and pairs[0] == 0:
+        for start, end in zip(pairs, [*pairs[1:], len(cells)], strict=True):
+            metadata.setdefault(cells[start].rstrip(": ").lower(), " ".join(cells[start + 1 : end]))
+        return
     for mark in ("=", ":"):
         if mark in text:
             key, _, value = text.partition(mark)
-            metadata.setdefault(key.strip().lower(), (value.strip() or " ".join(cells[1:])).strip())
+            metadata.setdefault(key.strip().lower(), " ".join([value.strip(), *cells[1:]]).strip())
             return
-    if len(cells) == 2:
-        metadata.setdefault(text.lower(), cells[1])
+    if 2 <= len(cells) <= _MOST_PAIR:
+        metadata.setdefault(text.lower(), " ".join(cells[1:]))
     elif len(cells) == 1:
-        metadata.setdefault("title", text)
+        metadata.setdefault("title", text) if "title" not in metadata else metadata.setdefault(text.lower(), "")
 
 
-def _table(grid: Grid, k: int, metadata: dict[str, str], decimal: str | None) -> Table:
-    header = [name.lstrip("#% ") for name in grid.rows[k]]
-    while header and not header[-1]:
-        header.pop()
-    first = k + 1
-    if not _has_number(grid.rows[first]):  # a line of units
-        units = [cell.strip("[]() ") for cell in grid.rows[first]]
-        header = [f"{name} [{unit}]" if unit else name for name, unit in zip(header, units, strict=False)]
-        first += 1
-    names = tuple(name or f"column {n}" for n, name in enumerate(header, start=1))
+def _single_names(grid: Grid, header: Sequence[str], line: int) -> tuple[str, ...]:
+    """Return the names of columns, each only once: those of runs without a number are numbered, others refused."""
+    names = [name or f"column {n}" for n, name in enumerate(header, start=1)]
+    count = Counter(names)
+    seen: Counter[str] = Counter()
+    for n, name in enumerate(names):
+        found = run_in(name) if count[name] > 1 else None
+        if found is not None and found.number == 0:
+            seen[name] += 1
+            names[n] = f"{name} {seen[name]}"
     doubled = next((name for name, times in Counter(names).items() if times > 1), None)
     if doubled:
-        raise grid.fail(f"the header names {shown(doubled)} twice; give each column a name of its own", grid.lines[k])
-    rows, lines, below = _rows_below(grid, names, first)
+        raise grid.fail(f"the header names {shown(doubled)} twice; give each column a name of its own", line)
+    return tuple(names)
+
+
+def _table(
+    grid: Grid, layout: _Layout, metadata: dict[str, str], comments: dict[str, str], decimal: str | None
+) -> Table:
+    line = grid.lines[layout.first - 1 if not _are_units(grid.rows[layout.first - 1]) else layout.first - 2]
+    names = _single_names(grid, layout.names, line)
+    rows, lines, notes = _rows_below(grid, names, layout.first)
     if not rows:
-        raise grid.fail("has a header but no rows", grid.lines[k])
-    if below:
-        grid = replace(
-            grid, notes=(*grid.notes, f"what stands from line {below} on is no row of the table and was left out")
-        )
+        raise grid.fail("has a header but no rows", line)
+    return _finished(replace(grid, notes=(*grid.notes, *notes)), names, rows, lines, line, metadata, comments, decimal)
+
+
+def _finished(
+    grid: Grid, names: tuple[str, ...], rows: list[list[str]], lines: list[int], header_line: int,
+    metadata: dict[str, str], comments: dict[str, str], decimal: str | None,
+) -> Table:  # fmt: skip
+    """Return the table with decimal points; a file that says how many rows it has must have them."""
     try:
         plain, commas = plain_decimals(rows, lines, decimal)
     except InputError as error:
         raise grid.fail(error.message, error.line) from error
     if commas:
         grid = replace(grid, notes=(*grid.notes, "decimal commas were read as decimal points"))
-    return Table(grid, names, grid.lines[k], plain, lines, metadata)
+    declared = comments.pop("rows", None)
+    if declared is not None and parse_number(declared) != len(rows):
+        raise grid.fail(f"declares {shown(declared)} rows but holds {len(rows)}: is it cut?")
+    return Table(grid, names, header_line, plain, lines, metadata, comments)
 
 
-def _rows_below(grid: Grid, names: Sequence[str], first: int) -> tuple[list[list[str]], list[int], int]:
-    """Return rows, their lines, and the line (or 0) where remarks below the table begin, after a blank line.
+def _rows_below(grid: Grid, names: Sequence[str], first: int) -> tuple[list[list[str]], list[int], list[str]]:
+    """Return rows, their lines, and remarks on what was left out: statistics, and remarks below the table.
 
     Raises InputError if rows of numbers follow once more below the remarks: there is a second table.
     """
     rows: list[list[str]] = []
     lines: list[int] = []
-    below = 0
-    for row, line in zip(grid.rows[first:], grid.lines[first:], strict=True):
+    notes: list[str] = []
+    for k, (row, line) in enumerate(zip(grid.rows[first:], grid.lines[first:], strict=True), start=first):
         if not any(row) or row[0].startswith("#"):
             continue
-        if below or (rows and line > lines[-1] + 1 and not _as(rows[0], row)):
-            if below and _as(rows[0], row) and len(_filled(row)) >= len(names):
-                message = f"rows of numbers follow again, below line {below} where the table ended: put each table into a file"
-                raise grid.fail(f"{message} or sheet of its own", line)
-            below = below or line
-            continue
+        if rows and not _as(rows[0], row):
+            if line > lines[-1] + 1 + len(notes) or not _has_number(row):
+                _check_below(grid, names, rows[0], k)
+                return rows, lines, [*notes, f"what stands from line {line} on is no row of the table and was left out"]
+            label = next(iter(_filled(row)))
+            if statistic_in(label) is not None and parse_number(rows[0][row.index(label)]) is not None:
+                notes.append(f"line {line}, {label!r}, is a statistic over the rows and was left out")
+                continue
         rows.append(_fitted(grid, names, row, line))
         lines.append(line)
-    return rows, lines, below
+    return rows, lines, notes
+
+
+def _check_below(grid: Grid, names: Sequence[str], first: Sequence[str], end: int) -> None:
+    """Refuse a second table below row ``end``, where the first one ended."""
+    for row, line in zip(grid.rows[end:], grid.lines[end:], strict=True):
+        if any(row) and not row[0].startswith("#") and _as(first, row) and len(_filled(row)) >= len(names):
+            message = f"rows of numbers follow again, below line {grid.lines[end]} where the table ended: put each table into a"
+            raise grid.fail(f"{message} file or sheet of its own", line)
+    _check_beside(grid, end, len(grid.rows))
 
 
 def _as(first: Sequence[str], row: Sequence[str]) -> bool:

@@ -192,6 +192,21 @@ def run_in(text: str, letters: str = "") -> RunColumn | None:
     return RunColumn(text, words.numbers[0] if words.numbers else 0, next(iter(words.ways), 0))
 
 
+def names_run(text: str) -> bool:
+    """Whether a text is about runs or directions and nothing else, such as ``Lauf``, ``Run no.``, ``Richtung``."""
+    words = _read(text)
+    about = words.names_run or any(
+        token in ("direction", "dir", "richtung", "sens", "direzione") for token in _tokens(text)
+    )
+    return about and not (words.unknown or words.statistics)
+
+
+def is_known_name(text: str) -> bool:
+    """Whether every word of a text is one of runs, directions, deviations, statistics or units, and not only a number."""
+    words = _read(text)
+    return not words.unknown and not text.replace(".", "").replace(",", "").lstrip("+-").isdigit()
+
+
 def statistic_in(text: str) -> tuple[str, int] | None:
     """Return the kind of a statistic ("mean", "scatter", "other") that a name names, and its direction (0: of both).
 
