@@ -187,3 +187,134 @@ def test_names_with_a_word_that_is_not_known_are_neither_runs_nor_statistics_nor
     assert run_columns(["Dead path 1", "x1", "Force 2", "auf/ab", "Run 1 2"], []) == []
     assert [statistic_in(text) for text in ("mean run 1", "Xylophon", "X-Y")] == [None] * 3
     assert [way(text) for text in ("2", "0", "sideways", "mean +", "auf/ab", "")] == [None] * 6
+
+
+#: Sheets as people type them; each holds the example, if not said otherwise. First encoding, then text.
+SHEETS = {
+    "temperature above": (
+        "utf-8",
+        "Temperatur [°C];20,4\nPosition [mm];Lauf 1 vor [µm];Lauf 1 zurück [µm];Lauf 2 vor [µm];Lauf 2 zurück [µm]\n"
+        "-800;1,0;3,0;1,2;3,1\n-400;2,0;4,5;2,1;4,4\n0;5,0;7,5;5,2;7,6\n",
+    ),
+    "quoted english header": (
+        "utf-8",
+        '"Machine:","VMC 850"\n"Air temperature (C):","20.84"\n"Operator:","J. Smith"\n"Date:","2024-03-18"\n\n'
+        '"Target (mm)","Deviation (um)","Direction","Run"\n'
+        + "".join(
+            f'"{t}","{v}","{"Forward" if w > 0 else "Reverse"}","{n}"\n'
+            for (n, w), values in RUNS_UM.items()
+            for t, v in zip(TARGETS_MM, values, strict=True)
+        ),
+    ),
+    "two columns, temperature above": (
+        "cp1252",
+        "Prüfprotokoll Positionierabweichung X-Achse\nPrüfer;Müller\nTemperatur [°C];20,4\nLaser Seriennummer;7H-2231\n"
+        "Lauf 1 vor\nPosition;Abweichung [µm]\n-800;1,0\n-400;2,0\n0;5,0\n",
+    ),
+    "two lines of names": (
+        "utf-16",
+        "Positionsabweichung\t\t\t\t\n\tLauf 1\t\tLauf 2\t\n"
+        "Position [mm]\tvor\tzurück\tvor\tzurück\n\tµm\tµm\tµm\tµm\n"
+        "-800,000\t1,0\t3,0\t1,2\t3,1\n-400,000\t2,0\t4,5\t2,1\t4,4\n0,000\t5,0\t7,5\t5,2\t7,6\n",
+    ),
+    "directions over numbers of runs": (
+        "utf-8",
+        "Ecart de position (µm);;;;\n;Aller;;Retour;\nPosition (mm);1;2;1;2\n"
+        "-800;1,0;1,2;3,0;3,1\n-400;2,0;2,1;4,5;4,4\n0;5,0;5,2;7,5;7,6\n",
+    ),
+    "signs under units": (
+        "utf-8",
+        "Deviation,Run 1,,Run 2,\nTarget,+,-,+,-\n"
+        "mm,um,um,um,um\n-800,1.0,3.0,1.2,3.1\n-400,2.0,4.5,2.1,4.4\n0,5.0,7.5,5.2,7.6\n",
+    ),
+    "ways repeated": (
+        "utf-8",
+        "Abweichung in µm\nPosition [mm];vor [µm];zurück [µm];vor [µm];zurück [µm]\n"
+        "-800;1,0;3,0;1,2;3,1\n-400;2,0;4,5;2,1;4,4\n0;5,0;7,5;5,2;7,6\n",
+    ),
+    "targets across, rows of runs": (
+        "utf-8",
+        "Abweichungen [µm]\nPosition [mm];-800;-400;0\nLauf 1 vor;1,0;2,0;5,0\nLauf 1 zurück;3,0;4,5;7,5\n"
+        "Lauf 2 vor;1,2;2,1;5,2\nLauf 2 zurück;3,1;4,4;7,6\n",
+    ),
+    "targets across, run and direction in cells": (
+        "utf-8",
+        "Deviation (um)\nRun,Direction,-800,-400,0\n1,+,1.0,2.0,5.0\n1,-,3.0,4.5,7.5\n2,+,1.2,2.1,5.2\n2,-,3.1,4.4,7.6\n"
+        "Mean,,2.08,3.25,6.33\n",
+    ),
+    "ISO form, arrows": (
+        "utf-8",
+        "ISO 230-2 deviation, um\ni,1,2,3\nTarget position (mm),-800,-400,0\nj=1 ↑,1.0,2.0,5.0\nj=1 ↓,3.0,4.5,7.5\n"
+        "j=2 ↑,1.2,2.1,5.2\nj=2 ↓,3.1,4.4,7.6\nMean ↑,1.10,2.05,5.10\nMean ↓,3.05,4.45,7.55\ns ↑,0.14,0.07,0.14\n",
+    ),
+    "means and remarks below": (
+        "utf-8",
+        "Fehler\nSoll [mm];V1 [µm];R1 [µm];V2 [µm];R2 [µm];Mittelwert\n-800;1,0;3,0;1,2;3,1;2,08\n-400;2,0;4,5;2,1;4,4;3,25\n"
+        "0;5,0;7,5;5,2;7,6;6,33\nMittelwert;2,67;5,00;2,83;5,03;3,88\nMax;5,0;7,5;5,2;7,6;6,33\nMaschine war 2 h warm\n",
+    ),
+    "results below, a table of their own": (
+        "utf-8",
+        "Errore di posizionamento [µm]\nPosizione [mm];Andata 1;Ritorno 1;Andata 2;Ritorno 2\n-800;1,0;3,0;1,2;3,1\n"
+        "-400;2,0;4,5;2,1;4,4\n0;5,0;7,5;5,2;7,6\n\nPosizione [mm];Media andata;Media ritorno;Isteresi\n-800;1,10;3,05;-1,95\n"
+        "-400;2,05;4,45;-2,40\n0;5,10;7,55;-2,45\n\nPrecisione A;9,1\n",
+    ),
+    "empty columns": (
+        "utf-8",
+        ";;;;;;;\n;Error de posición;;;;;;\n;Posición [mm];;Ida 1 [µm];Vuelta 1 [µm];;Ida 2 [µm];Vuelta 2 [µm]\n"
+        ";-800;;1,0;3,0;;1,2;3,1\n;-400;;2,0;4,5;;2,1;4,4\n;0;;5,0;7,5;;5,2;7,6\n",
+    ),
+    "chinese": (
+        "utf-8",
+        "定位误差 (μm)\n目标位置(mm),正向1,反向1,正向2,反向2\n-800,1.0,3.0,1.2,3.1\n-400,2.0,4.5,2.1,4.4\n0,5.0,7.5,5.2,7.6\n",
+    ),
+    "millimetres": (
+        "utf-8",
+        "Position [mm];Run 1 fwd dev [mm];Run 1 bwd dev [mm];Run 2 fwd dev [mm];Run 2 bwd dev [mm]\n"
+        "-800;0,0010;0,0030;0,0012;0,0031\n-400;0,0020;0,0045;0,0021;0,0044\n0;0,0050;0,0075;0,0052;0,0076\n",
+    ),
+    "readings": (
+        "utf-8",
+        "Soll [mm];Ist 1 vor [mm];Ist 1 zurück [mm];Ist 2 vor [mm];Ist 2 zurück [mm]\n"
+        "-800;-799,9990;-799,9970;-799,9988;-799,9969\n-400;-399,9980;-399,9955;-399,9979;-399,9956\n0;0,0050;0,0075;0,0052;0,0076\n",
+    ),
+    "readings and deviations": (
+        "utf-8",
+        "Nr.;Soll [mm];Ist [mm];Abweichung [µm];Richtung;Lauf\n"
+        + "".join(
+            f"{k};{t:g};{t + v / 1000:.4f};{v:.1f};{'vorwärts' if w > 0 else 'rückwärts'};{n}\n"
+            for k, (n, w, t, v) in enumerate(
+                ((n, w, t, v) for (n, w), values in RUNS_UM.items() for t, v in zip(TARGETS_MM, values, strict=True)),
+                start=1,
+            )
+        ).replace(".", ","),
+    ),
+    "start and end of the temperatures": (
+        "utf-8",
+        "Deviation\nAir temperature [°C];20.1;20.3\nMaterial temperature 1 [°C];20.0;20.2\n"
+        "Material temperature 2 [°C];20.0;20.2\nAir pressure [hPa];1012;1013\n"
+        "Position [mm];Run 1 +;Run 1 -;Run 2 +;Run 2 -\n-800;1.0;3.0;1.2;3.1\n-400;2.0;4.5;2.1;4.4\n"
+        "0;5.0;7.5;5.2;7.6\n",
+    ),
+    "one axis by its letter": (
+        "utf-8",
+        "X [mm],dX [um],Direction,Run\n"
+        + "".join(
+            f"{t},{v},{w:+d},{n}\n"
+            for (n, w), values in RUNS_UM.items()
+            for t, v in zip(TARGETS_MM, values, strict=True)
+        ),
+    ),
+}
+ONE_RUN = {(1, 1): RUNS_UM[1, 1]}
+
+
+@pytest.mark.parametrize("name", SHEETS)
+def test_sheets_of_laboratories_come_out_as_a_person_reads_them(tmp_path, name):
+    encoding, text = SHEETS[name]
+    path = written(tmp_path, text, encoding=encoding)
+    item = import_file(
+        path, ImportOptions(axis="X", units={"deviation": "um"} if "unit" not in text and "m" not in text else {})
+    )
+    assert item.doubts == ()
+    one_run = name == "two columns, temperature above"
+    assert_is_the_example(item.data, ONE_RUN if one_run else RUNS_UM)

@@ -25,7 +25,8 @@ _ANGLES = {name: RAD_PER_ANGLE[name] for name in ("urad", "mrad", "arcsec", "deg
 class Findings:
     """One table being read; ``fields`` holds its columns by field, ``used`` the names of columns that gave values.
 
-    ``checked_sign`` says that a second column has shown the sign of the values.
+    ``letter`` is the axis by the names of the columns.
+    ``checked_sign`` says that a second column has shown the sign of the values; ``runs`` are the columns of a run each.
     """
 
     table: Table
@@ -35,7 +36,9 @@ class Findings:
     doubts: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
+    letter: str | None = None
     checked_sign: bool = False
+    runs: list[str] = field(default_factory=list)
 
     def numbers(self, key: str) -> FloatArray:
         """Return the column of a field as it stands (rows,)."""

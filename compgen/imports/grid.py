@@ -128,16 +128,32 @@ def _filled_lines(text: str) -> tuple[list[str], list[int]]:
 
 
 def _separator(lines: Sequence[str]) -> str | None:
-    """The mark that stands equally often, and at least once, in most lines; blanks if there is none."""
+    """Return the mark that parts the most numbers in a block of lines with equally many cells; None for blanks.
+
+    A later mark must be clearly better: decimal commas part numbers too.
+    """
     best, score = None, 0.0
-    for mark in (";", "\t", "|", ","):
-        counts = Counter(line.count(mark) for line in lines if mark in line)
-        if not counts:
-            continue
-        number, times = counts.most_common(1)[0]
-        share = times / len(lines)
-        if number and share > 0.5 and share > score + (0.2 if mark == "," else 0.0):
-            best, score = mark, share
+    for mark, margin in ((";", 1.0), ("\t", 1.0), ("|", 1.0), (",", 1.2), (None, 1.2)):
+        own = _longest_block([_plain_split(line, mark) for line in lines])
+        if own > margin * score:
+            best, score = mark, own
+    return best
+
+
+def _plain_split(line: str, mark: str | None) -> list[str]:
+    return [cell.strip().strip('"') for cell in line.split(mark)]
+
+
+def _longest_block(rows: Sequence[Sequence[str]]) -> float:
+    """Return the most numbers that adjacent rows of one width hold, times their share among the filled cells there."""
+    best, numbers, filled, width = 0.0, 0, 0, -1
+    for row in rows:
+        if len(row) != width:
+            numbers, filled, width = 0, 0, len(row)
+        count = sum(parse_number(cell) is not None for cell in row)
+        numbers, filled = numbers + count, filled + (len(_filled(row)) if count else 0)
+        if width > 1 and numbers:
+            best = max(best, numbers * numbers / filled)
     return best
 
 
@@ -211,6 +227,8 @@ def _down(grid: Grid, k: int) -> _Layout | None:
         units, first = grid.rows[first], first + 1
     if first >= len(grid.rows) or not _has_number(grid.rows[first]):
         return None
+    if first + 1 < len(grid.rows) and _numbers_runs(grid.rows[first], grid.rows[first + 1]) or _across(grid, first):
+        return None  # that row has the names
     words = sum(parse_number(name) is None for name in names)
     if 2 * words < len(names) and not _numbers_runs(row, grid.rows[first]):
         return None

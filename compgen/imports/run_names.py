@@ -46,13 +46,17 @@ _RUN = _words(
     ensayo medida medicion recorrido pasada repeticion carrera
     \u6b21 \u7b2c \u7b2c\u4e00\u6b21 \u6d4b\u91cf \u6d4b\u8bd5 \u5faa\u73af \u7ec4 \u8f6e \u8fd0\u884c \u884c\u7a0b"""
 )
+#: Words for measured minus target.
+_DEVIATIONS = _words(
+    """deviation deviations dev error err errors abweichung abweichungen abw positionsabweichung fehler messabweichung ecart
+    ecarts erreur erreurs scarto scarti scostamento errore errori desviacion desviaciones \u504f\u5dee \u8bef\u5dee"""
+)
 #: Words that say only that readings or deviations follow, or that a direction does.
-_FILLERS = _words(
-    """deviation deviations dev error err abweichung abweichungen abw positionsabweichung fehler messabweichung position
-    positioning positional ecart erreur scarto scostamento errore desviacion actual reading measured laser ist istwert
+_FILLERS = _DEVIATIONS | _words(
+    """position positioning positional actual reading measured laser ist istwert
     istposition mesuree misurato medido lecture lettura lectura
     direction dir richtung sens direzione direccion in im de du di en der den the of and st nd rd th er eme way
-    \u504f\u5dee \u8bef\u5dee \u5b9e\u6d4b \u503c \u65b9\u5411"""
+    \u5b9e\u6d4b \u503c \u65b9\u5411"""
 )
 #: Statistics that laboratories print beside the runs; only those of kind mean and scatter are held against them.
 _STATISTICS = {
@@ -199,6 +203,11 @@ def names_run(text: str) -> bool:
         token in ("direction", "dir", "richtung", "sens", "direzione") for token in _tokens(text)
     )
     return about and not (words.unknown or words.statistics)
+
+
+def is_deviation(text: str) -> bool:
+    """Whether a name speaks of deviations or errors, in one of the languages that are known."""
+    return any(token in _DEVIATIONS for token in _tokens(text))
 
 
 def is_known_name(text: str) -> bool:

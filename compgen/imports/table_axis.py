@@ -17,13 +17,15 @@ from compgen.imports.findings import Findings
 from compgen.imports.further import Further, further_of
 from compgen.imports.hypotheses import USUAL_URAD, slope_of, usual_deviation_mm
 from compgen.imports.one_axis import IntArray, OneAxis, axis_in, cycles, motion, remarks
-from compgen.imports.run_names import RunColumn, run_columns, run_in, statistic_in, unaccented, way
+from compgen.imports.run_names import RunColumn, is_deviation, run_columns, run_in, statistic_in, unaccented, way
 from compgen.imports.source import parse_number, shown
 
 #: Units that are tried for deviations without one, mm.
 _LIKELY = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "in", "nm")}
 #: A column without a telling name holds readings, not deviations, if it follows the targets so closely.
 FOLLOWS = 1e-2
+#: Parts of words that speak of corrections.
+_COUNTER = ("korr", "kompens", "compens", "correc", "correzion", "\u8865\u507f")
 _TELLING = (
     "deviation",
     "abweichung",
@@ -219,6 +221,7 @@ def _wide(findings: Findings, columns: Sequence[RunColumn]) -> _Rows:
     labels = _labels(findings)
     _check_wide(findings, columns)
     findings.used |= {column.name for column in columns}
+    findings.runs = [column.name for column in columns]
     parts = []
     for column in columns:
         values = np.array(findings.table.numbers(column.name, empty=True))
@@ -306,7 +309,11 @@ def _signed(findings: Findings, key: str, values: FloatArray) -> FloatArray:
         words = unaccented(
             " ".join([*findings.table.header, *findings.table.metadata, *findings.table.metadata.values()])
         )
-        if not findings.checked_sign and not any(word in words for word in (*_TELLING, *FIELDS["deviation"][:1])):
+        told = any(word in words for word in (*_TELLING, *FIELDS["deviation"][:1]))
+        told = told or any(is_deviation(name) for name in findings.table.header)
+        if not told and len(findings.runs) > 1 and not any(word in words for word in _COUNTER):
+            findings.notes.append("runs are measured: their values are taken as measured minus target")
+        elif not told and not findings.checked_sign:
             findings.doubts.append(
                 "nothing says whether the values are errors (measured minus target) or corrections; give --sign error or "
                 "correction"
@@ -355,6 +362,8 @@ def _axes(findings: Findings, row: IntArray) -> list[str]:
                 raise findings.table.grid.fail(f"{shown(cell)} is no axis{empty}; X, Y or Z is due", line, column)
             letters.append(letter)
         return [letters[k] for k in row]
+    if findings.letter is not None:
+        return [findings.letter] * len(row)
     metadata = findings.table.metadata
     words = [value for key, value in metadata.items() if key in ("axis", "achse")]
     words += [*findings.table.grid.notes[:1], findings.table.grid.path.stem.replace("_", " ").replace("-", " ")]

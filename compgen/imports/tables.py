@@ -34,6 +34,7 @@ def import_table(grid: Grid, options: ImportOptions, form: str = "table") -> Imp
     table = find_table(grid, options.decimal)
     findings = Findings(table, fields_of(table.header, options.columns, options.ignore), options)
     findings.notes.extend(table.grid.notes)
+    _along_one_axis(findings)
     kind = options.kind or _kind(findings)
     findings.understood["columns"] = {key: column.name for key, column in findings.fields.items()}
     if table.metadata:
@@ -66,6 +67,25 @@ def import_table(grid: Grid, options: ImportOptions, form: str = "table") -> Imp
         tuple(dict.fromkeys(findings.notes)),
         reversal,
     )
+
+
+def _along_one_axis(findings: Findings) -> None:
+    """Take the one coordinate that a table has as position, and its deviation with it: X [mm], dX [um]."""
+    letters = [axis for axis in "xyz" if axis in findings.fields]
+    own = [axis for axis in "xyz" if f"d{axis}" in findings.fields or f"{axis}a" in findings.fields]
+    if "position" in findings.fields:
+        letters = []
+    if len(letters) > 1 or len({*letters, *own}) != 1 or findings.options.kind not in (None, "axis"):
+        return
+    (axis,) = {*letters, *own}
+    names = {axis: "position"} if letters else {}
+    findings.checked_sign = f"d{axis}" in findings.fields
+    names |= {
+        old: new for old, new in ((f"d{axis}", "deviation"), (f"{axis}a", "actual")) if new not in findings.fields
+    }
+    findings.fields = {names.get(key, key): column for key, column in findings.fields.items()}
+    if "axis" not in findings.fields and findings.options.axis is None and findings.options.error is None:
+        findings.letter = axis.upper()
 
 
 def _kind(findings: Findings) -> Kind:
