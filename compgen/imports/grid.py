@@ -24,9 +24,11 @@ MOST_ROWS, MOST_COLUMNS, MOST_CELL = 1_048_576, 500, 2_000
 #: Cells of a table; each takes some sixty bytes of memory.
 MOST_CELLS = 10_000_000
 #: So many lines are looked at for the separator, and for the header.
-_SAMPLE_LINES, _HEADER_LINES = 200, 200
+_SAMPLE_LINES, _SAMPLE_CHARACTERS, _HEADER_LINES = 200, 20_000, 200
 #: So many rows of each table are counted to find the longest.
 _MEASURED_ROWS = 5_000
+#: A number in any way of writing; which one it is turns out later.
+_NUMERAL = re.compile(r"[+\-\u2212]?(\d[\d.,' \u00a0\u202f]*)?[.,]?\d(e[+\-]?\d+)?", re.IGNORECASE)
 _ALL_WORDS = frozenset(word for words in FIELDS.values() for word in words)
 #: What stands in a row of units where there is none.
 _NO_UNIT = ("", "-", "\u2013", "--", "/", "1")
@@ -134,7 +136,7 @@ def _separator(lines: Sequence[str]) -> str | None:
     """
     best, score = None, 0.0
     for mark, margin in ((";", 1.0), ("\t", 1.0), ("|", 1.0), (",", 1.2), (None, 1.2)):
-        own = _longest_block([_plain_split(line, mark) for line in lines])
+        own = _longest_block([_plain_split(line[:_SAMPLE_CHARACTERS], mark) for line in lines])
         if own > margin * score:
             best, score = mark, own
     return best
@@ -150,7 +152,7 @@ def _longest_block(rows: Sequence[Sequence[str]]) -> float:
     for row in rows:
         if len(row) != width:
             numbers, filled, width = 0, 0, len(row)
-        count = sum(parse_number(cell) is not None for cell in row)
+        count = sum(_NUMERAL.fullmatch(cell) is not None for cell in row)
         numbers, filled = numbers + count, filled + (len(_filled(row)) if count else 0)
         if width > 1 and numbers:
             best = max(best, numbers * numbers / filled)
