@@ -294,6 +294,8 @@ def test_the_page_holds_figures_pictures_and_what_to_do(gantry, tmp_path):
 def test_unknown_names_and_orders_of_other_measurements_are_refused(gantry, tmp_path):
     with pytest.raises(InputError, match="cannot be added"):
         diagnose(gantry, session(22), DiagnoseOptions(add=("beam_sag",)))
+    with pytest.raises(InputError, match="not an effect of this measurement.*backlash_X"):
+        diagnose(gantry, session(22), DiagnoseOptions(effects=("backlash_x",)))
     with pytest.raises(InputError, match="above zero"):
         diagnose(gantry, session(22), DiagnoseOptions(u_um=-1.0))
     with pytest.raises(InputError, match="degrees of freedom"):

@@ -14,6 +14,7 @@ from compgen.core.error_table import ErrorTable
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
+from compgen.core.text import nearest
 from compgen.core.threads import one_thread
 from compgen.diagnose.advice import advice_of
 from compgen.diagnose.against import compared
@@ -30,6 +31,7 @@ from compgen.diagnose.observed import Observed, ObservedDeviations, ObservedLeng
 from compgen.diagnose.refit import refit
 from compgen.diagnose.result import Classed, Diagnosis
 from compgen.diagnose.verdict import verdict_of
+from compgen.effects import catalogue
 from compgen.effects.of_machine import active_effects
 from compgen.errors import InputError
 
@@ -85,6 +87,12 @@ def diagnose(
         for names that are no effects, and for too few readings.
     """
     chosen = options or DiagnoseOptions()
+    known = catalogue(measurement.stations if isinstance(measurement, Lengths) else ())
+    for name in chosen.effects:
+        if name not in known:
+            raise InputError(
+                f"{name!r} is not an effect of this measurement; {nearest(name, known)}", field="--effects"
+            )
     if isinstance(measurement, AxisRuns):
         found = findings_of(
             machine, measurement, order=chosen.order, most=chosen.max_effects, only=chosen.effects, add=chosen.add,
