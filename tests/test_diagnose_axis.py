@@ -139,6 +139,9 @@ def test_what_was_removed_can_be_read_and_gives_the_figures(gantry, tmp_path):
         assert float(row["deviation_um"]) - float(row["removed_um"]) == pytest.approx(
             float(row["remaining_um"]), abs=2e-4
         )
+    taken = [float(row["warmup_drift_um"]) for row in rows]
+    assert abs(taken[0] + 39.0) < 2.0  # cold: 40 um (1 - exp(-69 / 21)) below the end of the session
+    assert taken[-1] == 0.0
     # the figures of ISO 230-2 by hand from the remaining readings
     kept = [row for row in rows if row["left_out"] == "0"]
     cells = {}

@@ -23,7 +23,7 @@ from compgen.core.machine import Machine
 from compgen.core.names import AXES, ERROR_NAMES, MM_PER_UM
 from compgen.core.threads import one_thread
 from compgen.diagnose.axis_candidates import candidates_of, invisible_of
-from compgen.diagnose.axis_model import LEAST_GAIN, LEAST_MM, Candidate, NoiseGrid, Search
+from compgen.diagnose.axis_model import DRIFTS, LEAST_GAIN, LEAST_MM, Candidate, NoiseGrid, Search
 from compgen.diagnose.axis_session import ORDER_TEXTS, AxisSession, Order, sessions_of
 from compgen.diagnose.layout import IntArray
 from compgen.effects import Effect, active_effects, catalogue, section_text
@@ -355,6 +355,8 @@ def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffec
         for parameter, v in zip(item.effect.card.parameters, own, strict=False)
     }
     parameters |= {key: (value, None) for key, value in item.effect.used(session.readings).items()}
+    if item.name in DRIFTS:  # what remains is the state at the end of the session, the warm one
+        shift = shift - shift[-1]
     window = np.arange(item.first, item.last + 1) if lost else np.zeros(0, dtype=np.int64)
     return AxisEffect(
         item.name, "tentative" if reasons else "confirmed", _text(session, item, parameters, alias), parameters, alias,
