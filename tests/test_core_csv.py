@@ -1,5 +1,6 @@
 """The CSV dialect: what is refused, what is read, and that written files come back as they were; output folders."""
 
+import csv
 import os
 import warnings
 from pathlib import Path
@@ -407,10 +408,50 @@ def test_reading_a_good_file_warns_of_nothing(saved):
 
 
 def test_no_label_of_the_residuals_is_a_formula_for_a_spreadsheet(small_machine, small_lengths_file, tmp_path):
-    text = small_lengths_file.read_text().replace("\nS1,", "\n=HYPERLINK(1),").replace("\nS2,", "\n@S2,")
+    text = small_lengths_file.read_text().replace("\nS1,", "\n+HYPERLINK(1),").replace("\nS2,", "\n@S2,")
     path = tmp_path / "x.lengths.csv"
     path.write_text(text)
     lengths = compgen.read_lengths(path)
     found = format_residuals(small_machine, lengths, compgen.identify(small_machine, lengths))
+    assert "\n'+HYPERLINK(1)," in found and "\n'@S2," in found
     table = csv_table(tmp_path / "residuals.csv", found, ("station", "residual_um"), ("used", "x_mm", "y_mm", "z_mm"))
-    assert {"'=HYPERLINK(1)", "'@S2", "S3", "S4"} == set(table.text("station"))
+    assert {"+HYPERLINK(1)", "@S2", "S3", "S4"} == set(table.text("station"))
+
+
+LABELS = ["=1+1", "+A", "-A", "@A", "'=1", "''@x", " \t=2", "'quoted", "-5", "+", "-", "-2.5e3", "A-1", "=a,b", "-1_0"]
+
+
+def test_a_label_that_is_a_formula_is_guarded_and_comes_back_as_it_was(tmp_path):
+    text = format_csv({"label": LABELS, "x_mm": np.arange(len(LABELS)) - 5.0})
+    cells = [row[0] for row in csv.reader(line for line in text.splitlines() if not line.startswith("#"))][1:]
+    for cell in cells:  # a number, a lone sign, or nothing that a spreadsheet would work out
+        assert cell[0] not in "=+-@" or cell in ("-5", "+", "-", "-2.5e3")
+    table = csv_table(tmp_path / "labels.csv", text, ("label", "x_mm"))
+    assert table.text("label") == [label.strip() for label in LABELS]
+    assert table.numbers("x_mm")[0] == -5.0
+
+
+def test_a_comment_is_no_formula_after_its_commas(tmp_path):
+    text = format_csv({"x_mm": np.zeros(1)}, {"machine": "mill,=1+1,@SUM(A1);-2", "range_mm": "0, -5"})
+    first = text.splitlines()[0]
+    assert not [cell for line in (first, first.replace(";", ",")) for cell in line.split(",") if cell[0] in "=+-@"]
+    assert csv_table(tmp_path / "x.csv", text, ["x_mm"]).metadata["range_mm"] == "0, -5"
+
+
+def test_an_equals_sign_in_the_name_of_a_station_is_refused(small_lengths_file, tmp_path):
+    path = tmp_path / "x.lengths.csv"
+    path.write_text(small_lengths_file.read_text().replace("\nS2,", "\nS=2,"))
+    with pytest.raises(InputError, match=r"column station: 'S=2' is not a name: '=' is not allowed"):
+        compgen.read_lengths(path)
+
+
+@pytest.mark.parametrize("name", ["=1+1", "mill=1", "+mill", "-mill", "@mill", " @mill"])
+def test_a_machine_with_the_name_of_a_formula_is_refused(name, small_machine_file, tmp_path):
+    text = small_machine_file.read_text()
+    own = next(line for line in text.splitlines() if line.startswith("name"))
+    path = tmp_path / "mill.toml"
+    path.write_text(text.replace(own, f'name = "{name}"'))
+    with pytest.raises(InputError, match="a name without '=' that does not begin with"):
+        compgen.load_machine(path)
+    path.write_text(text.replace(own, 'name = "A-1 + 5 @ 20"'))
+    assert compgen.load_machine(path).name == "A-1 + 5 @ 20"

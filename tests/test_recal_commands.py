@@ -1,5 +1,6 @@
 """The job file, schedules, scheduler files, the commands with their exit codes, watching, and kill -9."""
 
+import io
 import json
 import os
 import shutil
@@ -242,9 +243,9 @@ def test_the_whole_way_by_commands_with_their_exit_codes(site, small_machine, sm
     code, run = said("run")
     assert (code, run["machines"][0]["waiting"]) == (0, [1])
     assert said("status")[1]["machines"][0]["state"] == "waiting"
-    code, decision = said("approve", "mill", "--actor", "ada", "--reason", "checked")
+    code, decision = said("approve", "mill", "1", "--actor", "ada", "--reason", "checked")
     assert (code, decision["active"], decision["decision"]["kind"]) == (0, 1, "approve")
-    code, again = said("approve", "mill")
+    code, again = said("approve", "mill")  # without a version
     assert (code, again["exit_code"]) == (2, 2)
     assert "nothing waits" in again["error"]
     write_measurement(site.folder / "inbox/b.deviations.csv", small_machine, small_errors, 2, 2)
@@ -270,6 +271,67 @@ def test_the_whole_way_by_commands_with_their_exit_codes(site, small_machine, sm
     for words in (["status"], ["history"], ["run"]):  # the same for people
         assert site.call(*words) == 0
         assert "mill" in capsys.readouterr().out
+
+
+@pytest.fixture
+def waiting(site, small_machine, small_errors, monkeypatch):
+    """Version 1 waits; ``terminal(stdin=..., stderr=...)`` says what is one, ``answer`` what the person types."""
+    write_measurement(site.folder / "inbox/a.deviations.csv", small_machine, small_errors, 1, 1)
+    assert site.call("run") == 0
+
+    def terminal(answer="", *, stdin=True, stderr=True):
+        typed = io.StringIO(answer)
+        typed.isatty = lambda: stdin
+        monkeypatch.setattr(sys, "stdin", typed)
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: stderr, raising=False)
+
+    site.terminal = terminal
+    site.decided = lambda: [item.kind for item in _decisions(site)]
+    return site
+
+
+def _decisions(site):
+    store = open_store(read_job(site.job).store)
+    try:
+        return store.decisions()
+    finally:
+        store.close()
+
+
+@pytest.mark.parametrize(("stdin", "stderr", "more"), [(False, True, ()), (True, False, ()), (True, True, ("--json",))])
+def test_without_a_version_nothing_is_approved_where_nobody_is_shown_it(waiting, capsys, stdin, stderr, more):
+    waiting.terminal("y\n", stdin=stdin, stderr=stderr)
+    assert waiting.call("approve", "mill", *more) == 2
+    said = capsys.readouterr()
+    assert "version 1 (pending) from a.deviations.csv, measured 2" in said.err + said.out
+    assert "compgen recal approve mill 1" in said.err + said.out
+    assert waiting.decided() == ["propose"]
+
+
+def test_a_terminal_shows_the_version_that_waits_and_asks(waiting, capsys):
+    waiting.terminal("n\n")
+    assert waiting.call("approve", "mill") == 130
+    said = capsys.readouterr().err
+    assert "mill: version 1 (pending) from a.deviations.csv, measured 2" in said
+    assert "active now: no tables" in said and "Make it active? [y/N]" in said
+    assert waiting.decided() == ["propose"]
+    waiting.terminal("y\n")
+    assert waiting.call("approve", "mill") == 0
+    assert waiting.decided() == ["propose", "approve"]
+
+
+def test_what_changed_while_a_person_was_asked_is_not_approved(
+    waiting, small_machine, small_errors, monkeypatch, capsys
+):
+    def meanwhile(*words, **options):
+        write_measurement(waiting.folder / "inbox/b.deviations.csv", small_machine, small_errors, 2, 2)
+        assert waiting.call("run") == 0
+
+    waiting.terminal()
+    monkeypatch.setattr("click.confirm", meanwhile)
+    assert waiting.call("approve", "mill") == 2
+    assert "version 1 is superseded" in capsys.readouterr().err
+    assert "approve" not in waiting.decided()
 
 
 @pytest.mark.parametrize(

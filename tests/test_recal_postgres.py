@@ -204,7 +204,7 @@ def test_the_whole_way_by_commands(site, monkeypatch, capsys):
     assert said("status")[1]["machines"][0]["state"] == "new"
     site.measure()
     assert said("run")[1]["machines"][0]["waiting"] == [1]
-    assert said("approve", "mill", "--actor", "ada")[1]["active"] == 1
+    assert said("approve", "mill", "1", "--actor", "ada")[1]["active"] == 1
     site.measure()
     assert said("run")[0] == 0
     assert said("reject", "mill", "2", "--reason", "sun on the table")[0] == 0

@@ -23,7 +23,7 @@ from compgen.core.files import sha256_of
 from compgen.core.names import ERROR_INDEX
 from compgen.errors import InputError
 from compgen.model.gauge import gauge_directions
-from compgen.recal import actions, change, claims, database, decisions, exclude, notify, overview, results, schema
+from compgen.recal import change, claims, database, decisions, exclude, notify, overview, results, schema
 from compgen.recal.backup import backup, restore
 from compgen.recal.database import StoreError
 from compgen.recal.records import NewMeasurement, NewResult, TableFile
@@ -492,7 +492,17 @@ def test_the_version_of_a_store_changes_with_everything_that_is_added(store):
 
 
 @pytest.mark.parametrize(
-    "actor", ["automatic", " Automatic ", "AUTOMATIC", "ada\x1b[2J", "ada\nrollback by ben", "a\u202eb"]
+    "actor",
+    [
+        "automatic",
+        " Automatic ",
+        "AUTOMATIC",
+        "ada\x1b[2J",
+        "ada\nrollback by ben",
+        "a\u202eb",
+        "auto\u200bmatic",
+        "\uff41utomatic\xa0",
+    ],
 )
 @pytest.mark.parametrize("kind", ["approve", "reject", "rollback"])
 def test_nobody_signs_as_the_program_or_with_what_a_terminal_obeys(store, actor, kind):
@@ -508,16 +518,14 @@ def test_nobody_signs_as_the_program_or_with_what_a_terminal_obeys(store, actor,
     assert store.decisions(machine) == before
 
 
-def test_without_a_version_nothing_is_approved_that_replaced_what_somebody_may_have_seen(store):
+def test_without_a_version_the_only_one_that_waits_is_meant(store):
     machine = store.add_machine("mill")
+    with pytest.raises(decisions.DecisionError, match="nothing waits"):
+        decisions.only_pending(store, machine)
     processed(store, machine, 1)
-    assert actions.waiting_version(store, machine) == 1
-    processed(store, machine, 2)
-    with pytest.raises(decisions.DecisionError, match="version 2 took the place of version 1"):
-        actions.waiting_version(store, machine)
-    decisions.reject(store, machine, 2, "ada", "why")
-    processed(store, machine, 3)
-    assert actions.waiting_version(store, machine) == 3
-    processed(store, machine, 4, hold=("late",))
-    with pytest.raises(decisions.DecisionError, match="versions 3 .pending., 4 .held. wait"):
-        actions.waiting_version(store, machine)
+    assert decisions.only_pending(store, machine).version == 1
+    processed(store, machine, 2)  # takes the place of version 1
+    assert decisions.only_pending(store, machine).version == 2
+    processed(store, machine, 3, hold=("late",))
+    with pytest.raises(decisions.DecisionError, match="versions 2 .pending., 3 .held. wait"):
+        decisions.only_pending(store, machine)

@@ -39,7 +39,7 @@ def recal() -> None:
       compgen recal add mill-1 --machine mill-1.toml --inbox inbox/mill-1 --controller siemens-cec \\
                     --out tables/mill-1 --measured-with active
       compgen recal run
-      compgen recal approve mill-1
+      compgen recal approve mill-1 1
     """
 
 

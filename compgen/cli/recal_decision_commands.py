@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from compgen.cli.common import Command, json_option, print_json, stdout
+from compgen.cli.common import Command, json_option, print_json, stderr, stdout
 from compgen.cli.recal_commands import job_option, opened, recal
 from compgen.errors import InputError
 
@@ -51,9 +51,8 @@ def approve_command(
 ) -> int:
     """Make VERSION of MACHINE's tables active.
 
-    Without VERSION the only one that waits is meant: on a terminal it is shown first and asked about; elsewhere it is
-    refused if it took the place of another one that somebody may have looked at. Tables that the round trip did not
-    accept can never be approved.
+    Without VERSION the only one that waits is shown and asked about, on a terminal; elsewhere name the VERSION that you
+    looked at, as another one may wait by now. Tables that the round trip did not accept can never be approved.
 
     \b
     Example:
@@ -61,27 +60,41 @@ def approve_command(
     """
     from compgen.recal.actions import approve
 
+    seen = None
     if version is None:
-        version = opened(job, lambda store: _shown(store, job.machine(machine).name, ask=not as_json))
-    return _decided(job, machine, approve(job, machine, version, actor_of(actor), reason, override=override), as_json)
+        version, seen = opened(job, lambda store: _asked(store, job.machine(machine).name, may_ask=not as_json))
+    done = approve(job, machine, version, actor_of(actor), reason, override=override, seen=seen)
+    return _decided(job, machine, done, as_json)
 
 
-def _shown(store: Store, name: str, *, ask: bool) -> int:
-    """Return the version that waits; on a terminal after a person has seen which one it is."""
-    from compgen.recal import actions, decisions
+def _asked(store: Store, name: str, *, may_ask: bool) -> tuple[int, int]:
+    """Return the version that waits and the active one (0: none), after a person has seen both and said yes.
+
+    Raises
+    ------
+    InputError
+        where nobody can be asked: what waits now need not be what somebody looked at before.
+    """
+    from compgen.core.text import visible
+    from compgen.recal import decisions
 
     machine = store.machine(name)
-    if not (ask and sys.stdin.isatty()):
-        return actions.waiting_version(store, machine)
-    waiting = decisions.pending(store, machine)
-    if len(waiting) != 1:
-        return actions.waiting_version(store, machine)
-    (table,) = waiting
+    table = decisions.only_pending(store, machine)
     measured = store.measurement_behind(table)
-    at = measured.measured_at.isoformat(timespec="minutes")
-    stdout.print(f"{name}: version {table.version} ({table.state}) from {measured.name}, measured {at}", soft_wrap=True)
+    what = f"{name}: version {table.version} ({table.state}) from {visible(measured.name, flat=True)}, measured "
+    what += measured.measured_at.isoformat(timespec="minutes")
+    if not (may_ask and sys.stdin.isatty() and sys.stderr.isatty()):
+        raise InputError(
+            f"{what}, waits; without a terminal say which version you mean: compgen recal approve {name} {table.version}",
+            field="VERSION",
+        )
+    active = decisions.active_table(store, machine)
+    stderr.print(what, soft_wrap=True)
+    stderr.print("active now: " + ("no tables" if active is None else f"version {active.version}"), soft_wrap=True)
+    for reason in table.reasons:
+        stderr.print(f"  {visible(reason, flat=True)}", soft_wrap=True)
     click.confirm("Make it active?", abort=True, err=True)
-    return table.version
+    return table.version, 0 if active is None else active.version
 
 
 @recal.command("reject")

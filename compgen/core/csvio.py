@@ -23,6 +23,9 @@ from compgen.errors import CompgenWarning, InputError
 FloatArray = NDArray[np.float64]
 _LARGEST_LABEL = 2.0**53
 _ROWS_AT_ONCE = 10_000
+#: A spreadsheet takes a cell that begins so for a formula, and in a comment what follows a comma.
+_FORMULA = re.compile(r"'*[=+\-@]")
+_IN_COMMENT = re.compile(r"(?<=[,;])(?=[=+\-@])")
 #: Columns that a header may have; characters of it that a message shows; columns left out that are named each.
 MOST_COLUMNS, _SHOWN, _NAMED = 10_000, 200, 20
 
@@ -48,12 +51,22 @@ class CsvTable:
         return InputError(message, file=self.path, line=self.lines[row], field=f"column {column}")
 
     def text(self, column: str) -> list[str]:
-        """Return a column of labels; an empty cell is an error."""
+        """Return a column of labels, as :func:`format_csv` was given them; an empty cell is an error."""
         cells = self.columns[column]
         for row, cell in enumerate(cells):
             if not cell:
                 raise self.fail(row, column, "is empty; every row needs a label here")
-        return list(cells)
+        return [cell[1:] if cell[0] == "'" and _FORMULA.match(cell) else cell for cell in cells]
+
+    def names(self, column: str) -> list[str]:
+        """Return a column of names of stations: labels without "=", which separates a name from its value elsewhere."""
+        found = self.text(column)
+        if "=" in "".join(found):
+            row = next(k for k, name in enumerate(found) if "=" in name)
+            raise self.fail(
+                row, column, f"{one_line(found[row])[:40]!r} is not a name: '=' is not allowed; leave it out"
+            )
+        return found
 
     def numbers(self, column: str, *, empty: float | None = None, most: float = LARGEST) -> FloatArray:
         """Return a column as finite numbers up to ``most``, shape (rows,); empty cells become ``empty`` if it is given."""
@@ -227,14 +240,16 @@ def format_csv(
 ) -> str:
     """Return CSV text with ``# key = value`` comments, the number of rows among them, and a final line end.
 
-    Numbers are written with ``decimals`` digits after the point (6 if not given), text as it is.
+    Numbers are written with ``decimals`` digits after the point (6 if not given), text as it is; but a label that a
+    spreadsheet would take for a formula gets an apostrophe before it, which :meth:`CsvTable.text` takes off again.
     """
     digits = decimals or {}
     parts = [_template(values, digits.get(name, 6)) for name, values in columns.items()]
     rows = max((len(cells) for _, cells in parts), default=0)
     if any(len(cells) != rows for _, cells in parts):
         raise ValueError(f"columns differ in length: {', '.join(f'{k} {len(v)}' for k, v in columns.items())}")
-    comments = [f"# {one_line(key)} = {one_line(value)}" for key, value in {**(metadata or {}), "rows": rows}.items()]
+    noted = [f"# {one_line(key)} = {one_line(value)}" for key, value in {**(metadata or {}), "rows": rows}.items()]
+    comments = [_IN_COMMENT.sub(" ", line) for line in noted]
     row = ",".join(template for template, _ in parts) + "\n"
     text = ["\n".join([*comments, ",".join(columns)]), "\n"]
     for start in range(0, rows, _ROWS_AT_ONCE):
@@ -256,17 +271,11 @@ def _template(values: Sequence[str] | FloatArray, digits: int) -> tuple[str, Seq
     return f"%.{digits}f", numbers.tolist()
 
 
-def for_people(cells: Iterable[str]) -> list[str]:
-    """Return labels as a file has them that people open with a spreadsheet: none is taken for a formula.
-
-    >>> for_people(["S1", "=1+1", "-A"])
-    ['S1', "'=1+1", "'-A"]
-    """
-    return [f"'{cell}" if cell[:1] in ("=", "+", "-", "@") else cell for cell in cells]
-
-
 def _quoted(cell: str) -> str:
+    """Return a label as a cell: one line, in quotes where it needs them, and never a formula for a spreadsheet."""
     flat = " ".join(cell.split())
+    if _FORMULA.match(flat) and flat not in ("+", "-") and not _is_number(flat):
+        flat = f"'{flat}"
     return '"' + flat.replace('"', '""') + '"' if any(char in flat for char in ',"#') else flat
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -65,11 +66,12 @@ def read_lengths(paths: str | Path | Sequence[str | Path]) -> Lengths:
         raise InputError("no measurement file was given")
     tables = [_read_table(path) for path in files]
     check_distinct(tables)
-    names = tuple(dict.fromkeys(name for table in tables for name in table.text("station")))
+    labels = [table.names("station") for table in tables]
+    names = tuple(dict.fromkeys(chain.from_iterable(labels)))
     index = {name: k for k, name in enumerate(names)}
     return Lengths(
         stations=names,
-        station=np.concatenate([[index[name] for name in table.text("station")] for table in tables]).astype(np.int64),
+        station=np.array([index[name] for name in chain.from_iterable(labels)], dtype=np.int64),
         point=[point for table in tables for point in table.text("point")],
         position_mm=np.concatenate([vectors_of(table, POSITION_COLUMNS) for table in tables]),
         length_mm=np.concatenate([table.numbers("length_mm") for table in tables]),

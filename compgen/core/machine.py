@@ -151,7 +151,7 @@ class Machine:
 def read_machine(path: str | Path) -> Machine:
     """Read a machine TOML strictly: an unknown key, a wrong unit, a reversed range are errors that say what to do."""
     root = tomlio.read_toml(path)
-    name = root.take("name", tomlio.text)
+    name = root.take("name", _name)
     chain = root.take("chain", Chain)
     reference = root.take("squareness_reference", tomlio.choice("X", "Y"), "X")
     tool_offset_mm = root.take("tool_offset_mm", _offset, (0.0, 0.0, 0.0))
@@ -274,6 +274,14 @@ def _several(name: str, paths: Sequence[Path]) -> str:
     return f"two machines are named {name!r}: {' and '.join(map(str, paths))}; rename one"
 
 
+def _name(value: Any) -> str:
+    """Return the name of a machine, which may be an argument of a command and a cell of a table."""
+    name = tomlio.text(value)
+    if "=" in name or name.lstrip()[0] in "+-@":
+        raise ValueError("a name without '=' that does not begin with '+', '-' or '@' is expected")
+    return name
+
+
 def _declared(folders: tuple[Path, ...]) -> dict[str, list[Path]]:
     """The files that declare each name; a byte-for-byte copy of a machine from another folder counts once."""
     found: dict[str, list[Path]] = {}
@@ -282,7 +290,7 @@ def _declared(folders: tuple[Path, ...]) -> dict[str, list[Path]]:
         for path in sorted([*folder.glob("*.toml"), *folder.glob("*/machine.toml")]):
             try:
                 root = tomlio.read_toml(path)
-                name = root.take("name", tomlio.text) if {"chain", "axes"} & set(root.data) else None
+                name = root.take("name", _name) if {"chain", "axes"} & set(root.data) else None
             except InputError as error:
                 warnings.warn(f"left out of the machines: {error}", CompgenWarning, stacklevel=3)
                 continue

@@ -233,6 +233,13 @@ def text(value: Any) -> str:
     return value
 
 
+def name(value: Any) -> str:
+    """A text without "=", which separates a name from its value in comments and commands."""
+    if "=" in text(value):
+        raise ValueError("a name without '=' is expected")
+    return str(value)
+
+
 def text_of_path(value: Any) -> str:
     """A path as text: not empty, without control characters."""
     if not isinstance(value, str) or not value.strip() or any(ord(char) < 32 for char in value):

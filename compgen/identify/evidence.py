@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from compgen.core.csvio import FloatArray, for_people, format_csv
+from compgen.core.csvio import FloatArray, format_csv
 from compgen.core.error_table import ErrorTable
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
@@ -32,7 +32,7 @@ def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, re
     """
     columns: dict[str, Sequence[str] | FloatArray] = {}
     if isinstance(measurement, Lengths) and len(measurement) == len(result.residual_mm):
-        columns["station"] = for_people(measurement.stations[k] for k in measurement.station.tolist())
+        columns["station"] = [measurement.stations[k] for k in measurement.station.tolist()]
         columns |= {f"{axis}_mm": measurement.position_mm[:, k] for k, axis in enumerate("xyz")}
     columns["residual_um"] = -result.residual_mm / MM_PER_UM
     columns["used"] = result.accepted.astype(np.float64)

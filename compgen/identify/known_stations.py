@@ -57,7 +57,7 @@ def read_stations(path: str | Path) -> KnownStations:
     """
     optional = ("u_mm", *OF_IDENTIFY)
     table = read_csv(path, required=("station", *POSITION_COLUMNS), optional=optional)
-    names = table.text("station")
+    names = table.names("station")
     position_mm = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
     kept: list[int] = []
     for row, name in enumerate(names):

@@ -70,7 +70,7 @@ def read_stations(path: str | Path) -> PlannedStations:
     A station with several set-ups has a row for each, at one place.
     """
     table = read_csv(path, required=("station", *POSITION_COLUMNS), optional=("setup", *_OF_IDENTIFY))
-    names = table.text("station")
+    names = table.names("station")
     where = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
     setup = table.labels("setup") if "setup" in table.columns else np.zeros(len(table), dtype=np.int64)
     known = tuple(dict.fromkeys(names))
@@ -236,7 +236,7 @@ def read_boxes(path: str | Path) -> dict[str, Box]:
     table = read_csv(path, required=("station", *_BOX_COLUMNS))
     values = np.column_stack([table.numbers(name) for name in _BOX_COLUMNS])
     boxes: dict[str, Box] = {}
-    for row, name in enumerate(table.text("station")):
+    for row, name in enumerate(table.names("station")):
         if name in boxes:
             raise table.fail(row, "station", f"{one_line(name)!r} stands here a second time")
         lower, upper = values[row, 0::2], values[row, 1::2]

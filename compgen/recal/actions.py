@@ -10,13 +10,11 @@ from pathlib import Path
 
 from compgen.errors import CompgenError, InputError
 from compgen.recal import decisions
-from compgen.recal.decisions import DecisionError
 from compgen.recal.job import Job, MachineJob
 from compgen.recal.judge import ADOPTED
 from compgen.recal.notify import notify
 from compgen.recal.publish import check_folder, publish, set_aside
 from compgen.recal.records import DecisionRecord, MachineRecord
-from compgen.recal.states import AUTOMATIC
 from compgen.recal.store import Clock, Store, open_store
 
 
@@ -29,7 +27,7 @@ class NotPublishedError(CompgenError):
 def approve(
     job: Job,
     name: str,
-    version: int | None,
+    version: int,
     actor: str,
     reason: str = "",
     *,
@@ -37,15 +35,14 @@ def approve(
     seen: int | None = None,
     clock: Clock | None = None,
 ) -> DecisionRecord:
-    """Approve a version (None: the only one that waits, see :func:`waiting_version`) and make its files the active ones.
+    """Approve a version and make its files the active ones.
 
     Errors as :func:`compgen.recal.decisions.approve` has them, and NotPublishedError if the folder cannot be written.
     ``seen`` is the version that the person saw as the active one.
     """
 
     def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
-        chosen = waiting_version(store, machine) if version is None else version
-        return decisions.approve(store, machine, chosen, actor, reason, override=override, seen=seen)
+        return decisions.approve(store, machine, version, actor, reason, override=override, seen=seen)
 
     return _done(job.machine(name), job.store, decide, clock)
 
@@ -63,7 +60,8 @@ def reject(
     """Reject a version (None: the only one that is open)."""
 
     def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
-        return decisions.reject(store, machine, _chosen(store, machine, version), actor, reason, seen=seen)
+        chosen = decisions.only_pending(store, machine).version if version is None else version
+        return decisions.reject(store, machine, chosen, actor, reason, seen=seen)
 
     return _done(job.machine(name), job.store, decide, clock)
 
@@ -84,29 +82,6 @@ def rollback(
         return decisions.rollback(store, machine, actor, reason, to=to, seen=seen)
 
     return _done(job.machine(name), job.store, decide, clock)
-
-
-def waiting_version(store: Store, machine: MachineRecord) -> int:
-    """Return the version that is meant where somebody names none: what waits, if nothing else can have been shown.
-
-    Raises
-    ------
-    DecisionError
-        if none or several wait, or the one that waits took the place of another since a person last decided: whoever
-        looked before that means the other one.
-    """
-    tables, known = store.together(lambda: (store.tables(machine, figures=False), store.decisions(machine)))
-    version = _chosen(store, machine, None)
-    by_people = [item.sequence for item in known if item.actor != AUTOMATIC]
-    after = by_people[-1] if by_people else 0
-    replaced = {item.table_id for item in known if item.kind == "supersede" and item.sequence > after}
-    others = [str(table.version) for table in tables if table.id in replaced and table.version != version]
-    if others:
-        raise DecisionError(
-            f"{machine.name}: version {version} took the place of version {others[-1]}, which waited before; "
-            f"look at it and name it: compgen recal approve {machine.name} {version}"
-        )
-    return version
 
 
 def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None = None) -> Path | None:
@@ -139,18 +114,6 @@ def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None =
         return moved
     finally:
         store.close()
-
-
-def _chosen(store: Store, machine: MachineRecord, version: int | None) -> int:
-    if version is not None:
-        return version
-    waiting = decisions.pending(store, machine)
-    if len(waiting) != 1:
-        listed = ", ".join(f"{table.version} ({table.state})" for table in waiting)
-        raise DecisionError(
-            f"{machine.name}: {f'versions {listed} wait; name one' if waiting else 'nothing waits for a decision'}"
-        )
-    return waiting[0].version
 
 
 def _done(

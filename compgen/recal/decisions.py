@@ -5,9 +5,10 @@ The files follow the store (:func:`compgen.recal.publish.publish`), so a decisio
 
 from __future__ import annotations
 
+import unicodedata
+
 import sqlalchemy as sa
 
-from compgen.core.text import visible
 from compgen.errors import InputError
 from compgen.recal import schema
 from compgen.recal.records import DecisionKind, DecisionRecord, MachineRecord, TableRecord
@@ -22,6 +23,17 @@ class DecisionError(InputError):
 def pending(store: Store, machine: MachineRecord | None = None) -> list[TableRecord]:
     """Return the sets of tables that wait for a person: proposed ones, and those that the policy holds back."""
     return [table for table in store.tables(machine) if table.state in OPEN]
+
+
+def only_pending(store: Store, machine: MachineRecord) -> TableRecord:
+    """Return the only set of tables of a machine that waits for a person; DecisionError if none or several do."""
+    waiting = pending(store, machine)
+    if len(waiting) != 1:
+        listed = ", ".join(f"{table.version} ({table.state})" for table in waiting)
+        raise DecisionError(
+            f"{machine.name}: {f'versions {listed} wait; name one' if waiting else 'nothing waits for a decision'}"
+        )
+    return waiting[0]
 
 
 def active_table(store: Store, machine: MachineRecord) -> TableRecord | None:
@@ -137,9 +149,11 @@ def check_person(actor: str) -> None:
     """Raise DecisionError unless this can be the name of a person: one line that shows all of itself, not "automatic"."""
     if not actor.strip():
         raise DecisionError("a decision needs the name of who makes it")
-    if visible(actor, flat=True) != actor:
-        raise DecisionError(f"the name of who decides holds control characters: {visible(actor, flat=True)}")
-    if actor.strip().casefold() == AUTOMATIC:
+    plain = unicodedata.normalize("NFKC", actor)  # wide letters, ligatures and hard spaces as the usual ones
+    if not plain.isprintable():
+        shown = actor.encode("unicode_escape").decode("ascii")
+        raise DecisionError(f"the name of who decides holds control characters or ones that do not show: {shown}")
+    if plain.strip().casefold() == AUTOMATIC:
         raise DecisionError(f"{AUTOMATIC!r} is what decisions without a person are signed with; give your own name")
 
 

@@ -107,7 +107,7 @@ def read_laser_tracer(section: tomlio.Section) -> LaserTracer:
 
 def _read_station(entry: tomlio.Section) -> Station:
     station = Station(
-        name=entry.take("name", tomlio.text),
+        name=entry.take("name", tomlio.name),
         position_mm=entry.take("position_mm", tomlio.vector3),
         dead_length_mm=entry.take("dead_length_mm", tomlio.number),
     )
