@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path, PurePosixPath
 
 from compgen.controllers import CONTROLLERS
@@ -46,12 +46,15 @@ def set_aside_superseded(output: OutputFolder, targets: Sequence[str] = ("",)) -
     list of Path
         where the report of the earlier tables is kept.
     """
+    if not output.folder.is_dir():
+        return []
+    names = {spec.name for control in CONTROLLERS for spec in load_format(control).files}
     new = {PurePosixPath(name): content for name, content in output.contents.items()}
     for target in dict.fromkeys(["", *targets, *_other_targets(output, targets)]):
         base = PurePosixPath(target)
         beside = {str(path.relative_to(base)): text for path, text in new.items() if path.is_relative_to(base)}
         if (output.folder / base).is_dir():
-            _set_aside_in(output, base, beside)
+            _set_aside_in(output, base, beside, names)
     report = [
         name for name in (*REPORT_FILES, "dcc.xml") if (output.folder / name).is_file() and name not in output.contents
     ]
@@ -69,11 +72,10 @@ def _other_targets(output: OutputFolder, targets: Sequence[str]) -> list[str]:
     return [path.name for path in found if path.name not in targets and not (path / "identify.json").exists()]
 
 
-def _set_aside_in(output: OutputFolder, base: PurePosixPath, new: Mapping[str, bytes]) -> None:
-    """Sort the tables in one folder, where ``new`` are the files that it gets."""
+def _set_aside_in(output: OutputFolder, base: PurePosixPath, new: Mapping[str, bytes], names: Set[str]) -> None:
+    """Sort the tables in one folder, where ``new`` are the files that it gets; ``names`` are those of all controls' tables."""
     folder = output.folder / base
     known = _known_hashes(folder)
-    names = {spec.name for control in CONTROLLERS for spec in load_format(control).files}
     tables = {*known, *names, *(REJECTED_PREFIX + name for name in names)}
     kept, strangers = [], []
     for path in sorted(path for path in folder.iterdir() if path.name in tables and path.is_file()):
