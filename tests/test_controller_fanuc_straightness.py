@@ -43,6 +43,11 @@ def parse(machine, text, name="STRAIGHT.TXT"):
     return CONTROL.parse(machine, CONTROL.read_settings(machine), [SourceFile(Path(name), text)])
 
 
+def all_texts(made):
+    """Text of all FANUC files of an export."""
+    return "".join(text for name, text in made.files.items() if name.endswith(".TXT"))
+
+
 def added(machine, tables, position_mm):
     return CONTROL.emulate(machine, CONTROL.read_settings(machine), tables, Points(np.array(position_mm, dtype=float)))
 
@@ -73,7 +78,7 @@ def test_a_machine_whose_y_runs_off_gets_the_opposite_and_no_other_axis_moves():
         "fanuc-straightness",
         allow_unverified=True,
     )
-    tables = parse(machine, made.files["STRAIGHT.TXT"])
+    tables = parse(machine, all_texts(made))
     (entry,) = tables.entries
     assert entry.amounts[0] == -5 and entry.amounts[-1] == 3
     result = added(machine, tables, [[-400.0, 0, 0], [0.0, -5, -100], [450.0, 0, 0]])
@@ -85,7 +90,7 @@ def test_squareness_fits_as_a_line(small_machine):
     errors = ErrorTable({}, {"EC0Y": (40e-6, np.nan)})
     machine = small_machine.with_setting("fanuc-straightness", "pairs", ["X(y)"])
     made = export(machine, errors, "fanuc-straightness", allow_unverified=True)
-    tables = parse(machine, made.files["STRAIGHT.TXT"])
+    tables = parse(machine, all_texts(made))
     y_mm = np.linspace(-100.0, 300.0, 41)
     position = np.column_stack([np.zeros(41), y_mm, np.full(41, -40.0)])
     # dX = -Y EC0Y, so the correction is + 40 um over a metre, zero at the reference point Y = 100 mm
@@ -129,7 +134,7 @@ def test_the_text_means_the_best_table_within_half_a_count(small_machine, small_
     machine = small_machine.with_setting("fanuc-straightness", "stores", stores)
     machine = machine.with_setting("fanuc-straightness", "detection_unit_um", 0.5)
     made = export(machine, small_errors, "fanuc-straightness", allow_unverified=True)
-    text = made.files["STRAIGHT.TXT"]
+    text = all_texts(made)
     values = {int(n): int(v) for n, v in re.findall(r"^N0(57\d\d)P(-?\d+)$", text, re.M)}
     grids = {
         int(n): [float(v) for v in re.findall(r"A\dP(-?[\d.]+)", rest)]
@@ -266,6 +271,45 @@ def test_an_entry_that_is_no_longer_used_is_switched_off(tmp_path, small_machine
         allow_unverified=True,
     )
     assert "N05713Q1P0" in made.files["STRAIGHT.TXT"].split()
+
+
+def test_assumed_points_are_in_a_file_of_their_own(small_machine, small_errors):
+    """STRAIGHT.TXT never changes 3620 to 3624 of a control that nobody has looked at: that would shift its pitch table."""
+    made = export(small_machine, small_errors, "fanuc-straightness", allow_unverified=True)
+    assert "N0362" not in made.files["STRAIGHT.TXT"] and "N05711" not in made.files["POINTS-ASSUMED.TXT"]
+    told = made.preflight
+    assert "- NOT written: 3620, 3621, 3622 and 3624 of X, Y, Z, which belong to pitch error compensation" in told
+    assert "Only on a control whose pitch error compensation has no points" in told and "POINTS-ASSUMED.TXT" in told
+    with pytest.raises(InputError, match="3620, 3621, 3622, 3624 is missing for .*; give the file that has it as well"):
+        parse(small_machine, made.files["STRAIGHT.TXT"])
+
+
+@pytest.mark.parametrize("first", [{}, {"X": 300, "Y": 700, "Z": 500}])
+def test_the_points_are_those_that_a_pitch_export_of_the_same_machine_file_gives(
+    small_machine, small_errors, first, tmp_path
+):
+    pitch = {"interval_mm": {"X": 10.0, "Y": 8.0, "Z": 5.0}, "detection_unit_um": 0.5, "first_numbers": first}
+    pitch["axis_numbers"] = {"X": 2, "Y": 1, "Z": 5}
+    machine = small_machine
+    for key, value in pitch.items():
+        machine = machine.with_setting("fanuc-pitch", key, value)
+    made = export(machine, small_errors, "fanuc-straightness", allow_unverified=True)
+    assert "N0362" not in all_texts(made) and "POINTS-ASSUMED.TXT" not in made.files
+    settings = CONTROL.read_settings(machine)
+    assert (settings.detection_unit_um, settings.axis_numbers) == (0.5, (2, 1, 5))
+    punched_pitch = export(machine, small_errors, "fanuc-pitch").files["PITCH.TXT"]
+    alone = parse(machine, made.files["STRAIGHT.TXT"])
+    both = parse(machine, made.files["STRAIGHT.TXT"] + punched_pitch)
+    assert alone == both and len(alone.entries) == 3
+    assert sum("are not in the file; the points" in remark for remark in alone.remarks) == 3
+
+
+def test_the_trial_and_the_way_back_leave_entries_of_other_axes_alone(tmp_path, small_machine, small_errors):
+    path = punched(tmp_path / "PUNCH.TXT", *GRIDS, "N05711Q1P4", "N05721Q1P2", "N05712Q1P0", "N05713Q1P0")
+    machine = small_machine.with_setting("fanuc-straightness", "style_from", path)
+    told = export(machine, small_errors, "fanuc-straightness", allow_unverified=True).preflight
+    assert "Set the amounts 5771 to 5774 to 0, then only parameter 5772" in told
+    assert "To switch these tables off at once: set\n5712, 5713 to 0" in told
 
 
 def test_points_that_differ_from_the_sample_are_refused(tmp_path, small_machine):

@@ -537,3 +537,118 @@ def test_a_pair_of_one_direction_keeps_off_them_too(small_machine, small_errors)
     machine = small_machine.with_setting("siemens-cec", "kept_tables", [last])
     text = compgen.export(machine, small_errors, "siemens-cec", reversal=reversal).files["NC_CEC.INI"]
     assert f"$AN_CEC_STEP[{last}]" not in text and f"$AN_CEC_STEP[{last + 1}]" in text
+
+
+# --- what --active shows of other axes is kept -----------------------------------------------------------------------
+
+SMALL_ERRORS = "error,position_mm,value,u_value\n" + "".join(
+    f"{name},{at},{value},\n"
+    for name, ends in (("EXX", (0, 950)), ("EYY", (-850, 0)), ("EZZ", (-650, 0)), ("EYX", (0, 950)))
+    for at, value in zip(ends, (0.0, 9.0), strict=True)
+)
+
+
+def export_with_active(folder, active, controller, settings="", more=()):
+    machine_with(folder, settings)
+    (folder / "e.errors.csv").write_text(SMALL_ERRORS)
+    words = ["export", folder / "machine.toml", folder / "e.errors.csv", "--controller", controller]
+    words += [word for path in active for word in ("--active", path)]
+    out = folder / "out"
+    code = run_command(cli, [str(word) for word in (*words, "--out", out, "--allow-unverified", *more)])
+    return code, out
+
+
+@pytest.mark.parametrize("controller", ["siemens-cec", "siemens-cec-eec"])
+def test_an_active_archive_keeps_the_tables_of_other_axes(tmp_path, controller):
+    """Table 1 goes from A into Y: the file has tables 0 and 2, ..., and nothing tells to switch table 1 off."""
+    cec = CEC_INI.replace("M17\n", table(1, [0, 0.001, 0], ("AX4", "AX2"), 90, 0, 180) + "M17\n")
+    encoder = "CHANDATA(1)\n" + "".join(
+        f"$AA_ENC_COMP[0,{n},{axis}]=0\n" for axis in ("AX1", "AX2", "AX3") for n in range(2)
+    )
+    for axis, low, high in (("AX1", 0, 950), ("AX2", -850, 0), ("AX3", -650, 0)):
+        values = {"STEP": high - low, "MIN": low, "MAX": high, "IS_MODULO": 0}
+        encoder += "".join(f"$AA_ENC_COMP_{key}[0,{axis}]={value}\n" for key, value in values.items())
+    content = archive([("NC_CEC", "INI", cec), ("AX_EEC", "INI", encoder + "M17\n"), ("INITIAL", "INI", INITIAL)])
+    (tmp_path / "control.arc").write_bytes(content)
+    own = '[controllers.siemens-cec-eec]\nmult_mode = "S1"\nsign = "error"\n'
+    own += '[controllers.siemens-cec]\nmult_mode = "S1"\nsign = "error"\n'
+    code, out = export_with_active(tmp_path, [tmp_path / "control.arc"], controller, own)
+    assert code == 0
+    text = (out / "NC_CEC.INI").read_text()
+    assert "$AN_CEC_STEP[0]" in text and "$AN_CEC_STEP[1]" not in text and "$AN_CEC_STEP[2]" in text
+    assert "$AN_CEC_STEP[7]" not in text
+    told = (out / "preflight.md").read_text()
+    assert "Tables kept (kept_tables): 1, 7" in told
+    assert "SD41300 = 0 for every other one but 1, 7" in told
+    assert "index 0, input" in told and "table 2 with both nodes 0.3" in told and "MULT_BY_TABLE[0] = 3" in told
+    assert "$SN_CEC_TABLE_ENABLE[0, 2" in told
+
+
+def test_without_an_archive_preflight_says_that_tables_of_other_axes_are_not_known(small_machine, small_errors):
+    told = compgen.export(small_machine, small_errors, "siemens-cec").preflight
+    first = told.split("## What the files overwrite")[1].strip().split("\n")[0]
+    assert first.startswith("- Of other axes: NOT KNOWN")
+
+
+FANUC_BACKUP = """%
+N03620Q1A1P40A2P140A3P240A4P1
+N03621Q1A1P40A2P131A3P231A4P1
+N03622Q1A1P59A2P145A3P245A4P30
+N03623Q1A1P1A2P1A3P1A4P1
+N03624Q1A1P50.0A2P100.0A3P100.0A4P12.0
+N05711Q1P0
+N05712Q1P0
+N05713Q1P0
+%
+"""
+
+
+def test_an_active_backup_of_a_fanuc_keeps_the_points_of_other_axes(tmp_path):
+    """The rotary axis A4 has points 1 to 30, where the points of X would begin otherwise."""
+    (tmp_path / "PRM.TXT").write_text(FANUC_BACKUP)
+    rows = [f"N{10000 + k}Q0P0" for k in range(300)]
+    (tmp_path / "PITCH.TXT").write_text("\n".join(["%", *rows, "%", ""]))
+    code, out = export_with_active(tmp_path, [tmp_path / "PRM.TXT", tmp_path / "PITCH.TXT"], "fanuc-pitch")
+    assert code == 0
+    told = (out / "preflight.md").read_text()
+    assert "Of other axes: nothing. The sample has A4: points 1 to 30; they stay." in told
+    written = {int(n) - 10000 for n in re.findall(r"(?m)^N(1\d{4})Q0", (out / "PITCH.TXT").read_text())}
+    assert not written & set(range(1, 31)) and written >= set(range(41, 60))
+
+
+def test_an_active_parameter_file_of_a_mitsubishi_is_followed(tmp_path):
+    rows = ["%", ";M80", "N4000P0"]
+    for k in range(10):
+        own = {0: ("A", "A", 4101, 4101, 4150, 1, "7.200"), 1: ("X", "X", 4210, 4201, 4220, 1, "100.000")}
+        own = own.get(k, ("", "", 0, 0, 0, 0, "0.000"))
+        rows += [f"N{4001 + 10 * k + j}P{value}" for j, value in enumerate(own)]
+    rows += [f"N{number}P0" for number in range(4101, 6000)]
+    (tmp_path / "ALL.PRM").write_text("\n".join([*rows, "%", ""]))
+    settings = "[controllers.mitsubishi]\nrelative_errors = false\nscale = 2\n"
+    code, out = export_with_active(tmp_path, [tmp_path / "ALL.PRM"], "mitsubishi", settings)
+    assert code == 0 and (out / "ALL-NEW.PRM").is_file()
+    text = (out / "ALL-NEW.PRM").read_text()
+    assert "\nN4001PA\n" in text and "\nN4000P0\n" in text
+
+
+def test_merge_keeps_the_tables_of_other_axes_as_well(tmp_path):
+    (tmp_path / "control.arc").write_bytes(cec_archive())
+    machine_with(tmp_path, '[controllers.siemens-cec]\nmult_mode = "S1"\n')
+    (tmp_path / "e.errors.csv").write_text(SMALL_ERRORS)
+    words = ["merge", tmp_path / "machine.toml", tmp_path / "control.arc", "--controller", "siemens-cec"]
+    words += ["--errors", tmp_path / "e.errors.csv", "--out", tmp_path / "out"]
+    assert run_command(cli, [str(word) for word in words]) == 0
+    assert "$AN_CEC_STEP[7]" not in (tmp_path / "out" / "NC_CEC.INI").read_text()
+
+
+def test_diff_follows_a_file_of_the_control_and_shows_remarks(tmp_path, capsys):
+    (tmp_path / "PRM.TXT").write_text(FANUC_BACKUP)
+    rows = [f"N{10000 + k}Q0P0" for k in range(300)]
+    (tmp_path / "PITCH.TXT").write_text("\n".join(["%", *rows, "%", ""]))
+    machine_with(tmp_path)
+    files = [tmp_path / "PRM.TXT", tmp_path / "PITCH.TXT"]
+    words = ["diff", tmp_path / "machine.toml", *files, "--against", *files, "--controller", "fanuc-pitch"]
+    words += ["--style-from", files[0], "--style-from", files[1], "--json", "--out", tmp_path / "out"]
+    assert run_command(cli, [str(word) for word in words]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert any("axis A4" in remark for remark in data["remarks_a"]) and data["remarks_a"] == data["remarks_b"]

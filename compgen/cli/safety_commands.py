@@ -35,7 +35,7 @@ from compgen.pipeline import export_and_verify, provenance_of, write_all
 from compgen.report.safety_text import crash_table, difference_table, merge_text
 from compgen.report.text import verification_table
 from compgen.verify import read_tables
-from compgen.verify.active import read_active
+from compgen.verify.active import keeping_others, read_active
 from compgen.verify.crash_test import ENTRIES, CrashTest, crash_test
 from compgen.verify.diff import TableDifference, difference
 from compgen.verify.merge import merge_report, merged_errors
@@ -63,6 +63,7 @@ class ManyAgainst(click.Command):
 @click.argument("tables", nargs=-1, required=True, metavar="A...", type=click.Path(path_type=Path))
 @click.option("--against", multiple=True, required=True, metavar="B...", type=click.Path(path_type=Path), help="Set B.")
 @controller_option()
+@sample_options
 @click.option("--controller-b", metavar="NAME", help="Control of set B; default: that of A.")
 @click.option("--points", type=click.Path(path_type=Path), help="*.points.csv (mm); default: a grid over the volume.")
 @click.option("--fail-above", type=NUMBER, metavar="UM", help="Exit code 1 if the largest difference exceeds UM um.")
@@ -94,7 +95,7 @@ def diff_command(
     for remark in (*first.remarks, *second.remarks):
         warnings.warn(remark, CompgenWarning, stacklevel=1)
     result = difference(machine, first, second, read_points(points) if points else None)
-    data = result.summary()
+    data = {**result.summary(), "remarks_a": list(first.remarks), "remarks_b": list(second.remarks)}
     files = {"diff.json": json.dumps(data, indent=2) + "\n", "difference.csv": _difference_csv(machine, result)}
     write_all(out, files)
     if as_json:
@@ -149,6 +150,7 @@ def merge_command(
     """
     OutputFolder(out)
     active = read_active(machine, old, controller_old or controller)
+    machine = keeping_others(machine, [controller], active)
     measured = open_errors(errors)
     bare, lost_um = merged_errors(machine, measured, active)
     provenance: Provenance = provenance_of(machine.source, errors, *active.paths)

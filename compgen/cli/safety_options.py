@@ -12,7 +12,7 @@ import click
 from compgen.cli.common import NUMBER, Command
 from compgen.core.machine import Machine
 from compgen.errors import InputError
-from compgen.verify.active import ActiveTables, read_active
+from compgen.verify.active import ActiveTables, keeping_others, read_active
 from compgen.verify.safety import SafetyLimits
 
 ACTIVE_HELP = (
@@ -33,7 +33,10 @@ def active_options(*names: str) -> Callable[[Command], Command]:
         def wrapper(
             *args: Any, machine: Machine, active: tuple[Path, ...], active_controller: str | None, **options: Any
         ) -> Any:
-            tables = _active(machine, active, active_controller, options.get("controller"))
+            target = options.get("controller")
+            tables = _active(machine, active, active_controller, target)
+            if tables is not None:
+                machine = keeping_others(machine, _names(target), tables)
             return command(*args, machine=machine, active=tables, **options)
 
         kind = click.Path(path_type=Path)
@@ -45,12 +48,17 @@ def active_options(*names: str) -> Callable[[Command], Command]:
     return decorate
 
 
+def _names(target: Any) -> list[str]:
+    """Names of the controls that are written."""
+    return [target] if isinstance(target, str) else list(dict.fromkeys(target or ()))
+
+
 def _active(machine: Machine, paths: tuple[Path, ...], name: str | None, target: Any) -> ActiveTables | None:
     if not paths:
         if name is not None:
             raise InputError("a control of active tables was named, but no --active FILE was given")
         return None
-    targets = [target] if isinstance(target, str) else list(dict.fromkeys(target or ()))
+    targets = _names(target)
     if name is None and len(targets) != 1:
         raise InputError("--active needs the control that the tables belong to: add --active-controller NAME")
     return read_active(machine, paths, name or targets[0])

@@ -204,6 +204,16 @@ class Controller(ABC, Generic[Settings, Tables]):
         """
         return []
 
+    def keeping_others(
+        self, machine: Machine, settings: Settings, tables: Tables, files: Sequence[Path]
+    ) -> dict[str, dict[str, Any]]:
+        """Return settings with which an export keeps what these files of the user's control hold of other axes.
+
+        By the name of a control and the key of its section. Empty if nothing is there to be kept, or the settings see
+        to it already.
+        """
+        return {}
+
     @abstractmethod
     def resolution_mm(self, settings: Settings) -> float:
         """Return the largest correction error that rounding to the format's quantum may cause on one axis, mm."""

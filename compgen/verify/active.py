@@ -95,6 +95,23 @@ def read_active(machine: Machine, paths: Sequence[str | Path], controller: str) 
     return ActiveTables(tables, tuple(files))
 
 
+def keeping_others(machine: Machine, targets: Sequence[str], active: ActiveTables) -> Machine:
+    """Return the machine with settings that keep what the active files hold of other axes, for the controls ``targets``.
+
+    What is kept is a CompgenWarning; a machine file that sees to it already is returned as it is.
+    """
+    read = active.tables
+    found = read.controller.keeping_others(machine, read.settings, read.tables, active.paths)
+    for name in dict.fromkeys(targets):
+        for key, value in found.get(name, {}).items():
+            machine = machine.with_setting(name, key, value)
+            shown = [Path(part).name for part in value] if key == "style_from" and isinstance(value, list) else value
+            shown = Path(shown).name if isinstance(shown, str) else shown
+            text = f"{name}: what --active shows of other axes is kept, as {key} = {shown} in the machine file would do"
+            warnings.warn(text, CompgenWarning, stacklevel=2)
+    return machine
+
+
 def without_active(
     machine: Machine, measurement: Measurement, active: ActiveTables
 ) -> tuple[Machine, Measurement, dict[str, object]]:
@@ -222,4 +239,4 @@ def _table(machine: Machine, errors: ErrorTable, solver: Projector, values: Floa
     return ErrorTable(curves, squareness, errors.metadata)
 
 
-__all__ = ["ActiveTables", "bare_errors", "read_active", "without_active"]
+__all__ = ["ActiveTables", "bare_errors", "keeping_others", "read_active", "without_active"]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from compgen.controllers.fanuc.pitch_grid import pitch_grid
 from compgen.controllers.fanuc.pitch_limits import pitch_usage, pitch_violations
 from compgen.controllers.fanuc.pitch_settings import PitchSettings, read_pitch_settings
 from compgen.controllers.fanuc.pitch_tables import PitchBlock, PitchTables, parse_pitch
+from compgen.controllers.fanuc.sample import as_sample
 from compgen.controllers.terms import one_dimensional_terms
 from compgen.controllers.transfer_plan import plan_contradictions
 from compgen.core.csvio import FloatArray
@@ -127,6 +129,12 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
     def usage(self, machine: Machine, settings: PitchSettings, tables: PitchTables) -> list[Usage]:
         """Return change per section, point numbers and interval against their limits."""
         return pitch_usage(settings, tables)
+
+    def keeping_others(
+        self, machine: Machine, settings: PitchSettings, tables: PitchTables, files: Sequence[Path]
+    ) -> dict[str, dict[str, Any]]:
+        """Return ``style_from`` with these files if they show points of other axes."""
+        return as_sample(machine, files, ("fanuc-pitch", "fanuc-straightness")) if tables.others else {}
 
     def resolution_mm(self, settings: PitchSettings) -> float:
         """Return half a count: the bound of :mod:`compgen.controllers.integers` where the limit does not bind."""

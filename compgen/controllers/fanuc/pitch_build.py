@@ -14,11 +14,14 @@ from decimal import Decimal
 import numpy as np
 
 from compgen.controllers.base import Term
-from compgen.controllers.fanuc.pitch_settings import PitchSettings
+from compgen.controllers.fanuc.pitch_grid import pitch_grid
+from compgen.controllers.fanuc.pitch_settings import PitchSettings, read_pitch_settings
 from compgen.controllers.fanuc.pitch_tables import PitchBlock, PitchTables, Shortfall, Wanted
+from compgen.controllers.fanuc.sample import PointGrid
 from compgen.controllers.integers import IntegerCurve, best_integers, lowest_free, section_weights
 from compgen.controllers.terms import one_dimensional_name
 from compgen.core.csvio import FloatArray
+from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import AXES
 from compgen.core.reversal import WORTH_MM, ReversalCurves
@@ -152,3 +155,27 @@ def _placed(settings: PitchSettings, blocks: Sequence[PitchBlock | None]) -> lis
             taken.append((negative, negative + count - 1))
         placed[axis] = replace(block, reference=block.reference + first, first=first, negative_first=negative)
     return placed
+
+
+def pitch_points(machine: Machine) -> tuple[PointGrid | None, ...]:
+    """Return the points that every fanuc-pitch export of this machine file gives X, Y and Z; None where errors decide.
+
+    Points are known whatever the errors are where a sample shows them, or interval and first number are stated; the first
+    number follows if the intervals of all axes are stated.
+    """
+    if "fanuc-pitch" not in machine.controllers:
+        return (None, None, None)
+    settings = read_pitch_settings(machine)
+    known = [settings.kept[axis] is not None or settings.interval_mm[axis] is not None for axis in range(3)]
+    blocks: list[PitchBlock | None] = []
+    for axis in range(3):
+        nodes_mm = pitch_grid(machine, settings, ErrorTable({}), axis).nodes_mm if known[axis] else np.zeros(0)
+        wanted = Wanted(nodes_mm, np.zeros(len(nodes_mm)))
+        blocks.append(_block(machine, settings, axis, wanted, None)[0] if known[axis] else None)
+    fixed = [settings.kept[axis] is not None or settings.first_numbers[axis] is not None for axis in range(3)]
+    return tuple(
+        PointGrid(block.reference, block.first, block.last, block.interval_mm)
+        if block is not None and (all(known) or fixed[axis])
+        else None
+        for axis, block in enumerate(_placed(settings, blocks))
+    )

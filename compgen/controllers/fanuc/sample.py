@@ -18,6 +18,7 @@ from compgen.controllers.fanuc.style import FanucStyle
 from compgen.controllers.fanuc.text import Record, axis_values, read_records, type_word
 from compgen.core import tomlio
 from compgen.core.files import read_bytes
+from compgen.core.machine import Machine
 
 #: Parameters whose values are whole numbers, and the one that is a length.
 WHOLE_PARAMETERS, LENGTH_PARAMETER = (3620, 3621, 3622, 3623, 3626, 3627), 3624
@@ -152,6 +153,12 @@ def take_sample(section: tomlio.Section, *, path: int = 1) -> Sample:
     unit_mm = take_length_unit_mm(section, style)
     points = _axes_of(sample.parameters, unit_mm)
     return replace(sample, style=style, interval_unit_mm=unit_mm, axes=points)
+
+
+def as_sample(machine: Machine, files: Sequence[Path], names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return ``style_from`` with punched files for each of the controls ``names``; the plan beside them is left out."""
+    texts = [str(path.resolve()) for path in files if path.suffix.lower() != ".json"]
+    return {name: {"style_from": texts} for name in names if "style_from" not in machine.controller_settings(name)}
 
 
 def sample_of(files: Sequence[SourceFile], path: int = 1) -> Sample:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from compgen.controllers.base import Controller, Monomial, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controllers.fanuc.polyline import Polyline, best_polyline
+from compgen.controllers.fanuc.sample import as_sample
 from compgen.controllers.fanuc.straightness_context import straightness_context
 from compgen.controllers.fanuc.straightness_settings import StraightnessSettings, read_straightness_settings
 from compgen.controllers.fanuc.straightness_tables import (
@@ -129,6 +131,12 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
     def usage(self, machine: Machine, settings: StraightnessSettings, tables: StraightTables) -> list[Usage]:
         """Return amounts and entries against their limits."""
         return straightness_usage(settings, tables)
+
+    def keeping_others(
+        self, machine: Machine, settings: StraightnessSettings, tables: StraightTables, files: Sequence[Path]
+    ) -> dict[str, dict[str, Any]]:
+        """Return ``style_from`` with these files: the points of X, Y and Z are those of pitch error compensation."""
+        return as_sample(machine, files, ("fanuc-straightness",))
 
     def resolution_mm(self, settings: StraightnessSettings) -> float:
         """Return half a count for each of the two tables that may move one axis."""

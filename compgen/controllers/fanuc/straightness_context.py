@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from decimal import Decimal
 from typing import Any
 
@@ -27,23 +28,29 @@ from compgen.core.names import AXES, MM_PER_UM
 def straightness_context(machine: Machine, settings: StraightnessSettings, tables: StraightTables) -> dict[str, Any]:
     """Return the context beyond the common one."""
     common = _common(settings, tables)
-    grids = _grids(settings, tables)
+    grids = _grids(settings, tables, settings.stated)
+    assumed = _grids(settings, tables, settings.assumed)
+    not_written = _grids(settings, tables, tuple(not stated for stated in settings.stated))
     return {
         "sign_statement": _sign_statement(machine, settings, tables),
-        "parameters": _rows(settings, tables, common, grids),
+        "parameters": _rows(settings, tables, common, grids, not_written),
         "warnings": _warnings(settings, tables),
         "tables": [_summary(machine, settings, entry) for entry in tables.entries],
         "settings": settings,
         "style_notes": list(settings.sample.notes),
-        "overwrites": _overwrites(settings, common, grids),
+        "overwrites": _overwrites(settings, common, grids, not_written),
         "file": _punched(settings, common, grids),
+        "points_file": _punched(settings, {}, assumed),
+        "container": "assumed points" if assumed else "points known",
+        "not_written": bool(not_written),
+        "switches": [MOVING + k for k in free_entries(settings)[0]],
         "plan": {
             "common": common,
             "axes": {number: {axis: text for axis, text in values} for number, values in grids.items()},
             "stores": settings.stores,
             "detection_unit_um": settings.detection_unit_um,
         },
-        "check": _check(machine, settings, tables.entries[0]) if tables.entries else None,
+        "check": _check(machine, settings, tables) if tables.entries else None,
     }
 
 
@@ -61,7 +68,10 @@ def _common(settings: StraightnessSettings, tables: StraightTables) -> dict[int,
 
 
 def _overwrites(
-    settings: StraightnessSettings, common: dict[int, int], grids: dict[int, list[tuple[int, str]]]
+    settings: StraightnessSettings,
+    common: dict[int, int],
+    grids: dict[int, list[tuple[int, str]]],
+    not_written: dict[int, list[tuple[int, str]]],
 ) -> list[str]:
     """Say what the file overwrites, other axes first."""
     sample, names = settings.sample, dict(zip(settings.axis_numbers, AXES, strict=True))
@@ -77,13 +87,10 @@ def _overwrites(
         found = [f"Of other axes: NOT KNOWN, {given} (`--style-from`): look at 5711 to 5723."]
     for number, values in grids.items():
         texts = [f"{names[axis]} (A{axis}) = {text}" for axis, text in values]
-        assumed = [names[axis] for axis, _ in values if not settings.stated[settings.axis_numbers.index(axis)]]
-        where = (
-            f"; ASSUMED for {', '.join(assumed)}: another value than the control's shifts its pitch table"
-            if assumed
-            else ""
-        )
-        found.append(f"{number}, which pitch error compensation uses as well: {', '.join(texts)}{where}")
+        found.append(f"{number}, which pitch error compensation uses as well: {', '.join(texts)}")
+    if not_written:
+        letters = ", ".join(names[axis] for axis, _ in not_written[GRID_PARAMETERS[0]])
+        found.append(f"NOT written: 3620, 3621, 3622 and 3624 of {letters}, which belong to pitch error compensation")
     old = {number: sample.common[number][0] for number in common if number in sample.common}
     changed = [
         f"{number} = {common[number]} (sample: {old[number]})"
@@ -96,11 +103,14 @@ def _overwrites(
     return found
 
 
-def _grids(settings: StraightnessSettings, tables: StraightTables) -> dict[int, list[tuple[int, str]]]:
-    """Parameters 3620 ... of the moving axes: number -> (axis number, value as text)."""
+def _grids(
+    settings: StraightnessSettings, tables: StraightTables, chosen: Sequence[bool]
+) -> dict[int, list[tuple[int, str]]]:
+    """Parameters 3620 ... of the ``chosen`` ones of the moving axes: number -> (axis number, value as text)."""
     style = settings.style
-    found: dict[int, list[tuple[int, str]]] = {number: [] for number in GRID_PARAMETERS}
-    for entry in tables.entries:
+    entries = [entry for entry in tables.entries if chosen[entry.moving]]
+    found: dict[int, list[tuple[int, str]]] = {number: [] for number in GRID_PARAMETERS} if entries else {}
+    for entry in entries:
         grid, axis = entry.grid, settings.axis_numbers[entry.moving]
         unit = Decimal(1) if style.real_point else Decimal(repr(settings.interval_unit_mm))
         length = style.length(grid.interval_mm / unit)
@@ -142,6 +152,7 @@ def _rows(
     tables: StraightTables,
     common: dict[int, int],
     grids: dict[int, list[tuple[int, str]]],
+    not_written: dict[int, list[tuple[int, str]]],
 ) -> list[dict[str, str]]:
     names = dict(zip(settings.axis_numbers, AXES, strict=True))
     meanings = dict(
@@ -151,9 +162,10 @@ def _rows(
         {
             "name": f"{number} ({names[axis]}, A{axis})",
             "value": text,
-            "meaning": f"{meanings[number]}; must be the value that stored pitch error compensation uses",
+            "meaning": f"{meanings[number]}; must be the value that stored pitch error compensation uses{behind}",
         }
-        for number, values in grids.items()
+        for part, behind in ((grids, ""), (not_written, ". COMPARE: not in `STRAIGHT.TXT`"))
+        for number, values in part.items()
         for axis, text in values
     ]
     free, _ = free_entries(settings)
@@ -184,10 +196,11 @@ def _warnings(settings: StraightnessSettings, tables: StraightTables) -> list[st
     for entry in tables.entries:
         grid = entry.grid
         if not settings.stated[entry.moving]:
+            source = "those of [controllers.fanuc-pitch]" if settings.of_pitch[entry.moving] else "assumed"
             found.append(
-                f"The compensation points of {AXES[entry.moving]} are assumed: {grid.first} to {grid.last}, reference point "
-                f"{grid.reference}, every {grid.interval_mm:f} mm. If pitch compensation uses others, state them as "
-                f"points.{AXES[entry.moving]} in the machine file and export again."
+                f"The compensation points of {AXES[entry.moving]} are {source}: {grid.first} to {grid.last}, reference point "
+                f"{grid.reference}, every {grid.interval_mm:f} mm. The table is right on a control that has exactly these; if "
+                f"it has others, give its file with --style-from, or state points.{AXES[entry.moving]}, and export again."
             )
         ends = [settings.sign * entry.amounts[k] * settings.count_mm / MM_PER_UM for k in (0, 3)]
         if any(ends):
@@ -209,13 +222,15 @@ def _summary(machine: Machine, settings: StraightnessSettings, entry: StraightTa
     }
 
 
-def _check(machine: Machine, settings: StraightnessSettings, entry: StraightTable) -> dict[str, Any]:
+def _check(machine: Machine, settings: StraightnessSettings, tables: StraightTables) -> dict[str, Any]:
     """A trial of one entry: all amounts 0 but one, and what the compensated axis must do there."""
-    counts = 10
+    counts, place, entry = 10, free_entries(settings)[0][0], tables.entries[0]
+    amounts = entry_numbers(place)[6:]
     return {
         "moving": AXES[entry.moving],
         "compensated": AXES[entry.compensated],
-        "parameter": entry_numbers(0)[7],
+        "parameter": amounts[1],
+        "amounts": f"{amounts[0]} to {amounts[-1]}",
         "counts": counts,
         "at_mm": float(machine.reference_point_mm[entry.moving] + entry.along_mm[1]),
         "zero_mm": float(machine.reference_point_mm[entry.moving] + entry.along_mm[2]),

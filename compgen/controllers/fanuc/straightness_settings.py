@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from decimal import ROUND_CEILING, Decimal
 from typing import Any, Literal
 
+from compgen.controllers.fanuc.pitch_build import pitch_points
+from compgen.controllers.fanuc.pitch_settings import PitchSettings, read_pitch_settings
 from compgen.controllers.fanuc.sample import PointGrid, Sample, take_sample
 from compgen.controllers.fanuc.style import FanucStyle
 from compgen.core import tomlio
@@ -27,7 +29,8 @@ class StraightnessSettings:
     stores : whether the amounts are the correction (added to the command) or the error.
     pairs : (compensated axis, moving axis), 0..2; None: the best ones are chosen.
     grids : compensation points of X, Y, Z; None where the sample shows that the axis has none. ``stated`` tells which of
-        them the user or the sample gave.
+        them the user or the sample gave, ``of_pitch`` which are those of ``[controllers.fanuc-pitch]``; the others are
+        assumed.
     amount_limit : largest magnitude of an amount.
     axis_numbers : controlled axis numbers of X, Y, Z.
     path : path of the control, for parameters with a word L.
@@ -39,6 +42,7 @@ class StraightnessSettings:
     pairs: tuple[tuple[int, int], ...] | None
     grids: tuple[PointGrid | None, PointGrid | None, PointGrid | None]
     stated: tuple[bool, bool, bool]
+    of_pitch: tuple[bool, bool, bool]
     amount_limit: int
     axis_numbers: tuple[int, int, int]
     path: int
@@ -48,6 +52,11 @@ class StraightnessSettings:
     def style(self) -> FanucStyle:
         """How the file is written."""
         return self.sample.style
+
+    @property
+    def assumed(self) -> tuple[bool, ...]:
+        """Whether the points of X, Y, Z are assumed."""
+        return tuple(not one and not other for one, other in zip(self.stated, self.of_pitch, strict=True))
 
     @property
     def interval_unit_mm(self) -> float:
@@ -71,16 +80,19 @@ def read_straightness_settings(machine: Machine) -> StraightnessSettings:
     path = section.take("path", tomlio.whole(1, 99), 1)
     sample = take_sample(section, path=path)
     points = section.section("points", required=False)
-    axis_numbers = _axis_numbers(section.section("axis_numbers", required=False))
+    pitch = read_pitch_settings(machine) if "fanuc-pitch" in machine.controllers else None
+    axis_numbers = _axis_numbers(section.section("axis_numbers", required=False), pitch)
     if len(set(axis_numbers)) < 3:
         raise section.fail("axis_numbers", f"{axis_numbers} gives two axes the same number")
-    grids, stated = _grids(machine, sample, points, axis_numbers)
+    grids, stated, of_pitch = _grids(machine, sample, points, axis_numbers)
+    unit_um = 1.0 if pitch is None else pitch.detection_unit_um
     settings = StraightnessSettings(
-        detection_unit_um=section.take("detection_unit_um", tomlio.positive, 1.0),
+        detection_unit_um=section.take("detection_unit_um", tomlio.positive, unit_um),
         stores=_stores(section.take("stores", tomlio.choice("correction", "error"), "correction")),
         pairs=section.take("pairs", _pairs, None),
         grids=grids,
         stated=stated,
+        of_pitch=of_pitch,
         amount_limit=section.take("amount_limit", tomlio.whole(1, 32767), 32767),
         axis_numbers=axis_numbers,
         path=path,
@@ -98,12 +110,15 @@ def read_straightness_settings(machine: Machine) -> StraightnessSettings:
 
 
 def _grids(machine: Machine, sample: Sample, points: tomlio.Section, axis_numbers: tuple[int, int, int]) -> Any:
-    """Compensation points of X, Y, Z and which of them are known: stated ones, those of the sample, else assumed ones.
+    """Compensation points of X, Y, Z: stated ones, those of the sample, of ``[controllers.fanuc-pitch]``, else assumed ones.
 
-    The numbers belong to pitch error compensation as well: with a sample no others than its own are written.
+    Beside them, which are of the first two kinds and which of the third. The numbers belong to pitch error compensation
+    as well: with a sample no others than its own are written, and assumed ones are never written beside the tables.
     """
     quantum = Decimal("0.001") if sample.style.real_point else Decimal(repr(sample.interval_unit_mm))
     grids: list[PointGrid | None] = []
+    pitch = pitch_points(machine)
+    of_pitch = [False, False, False]
     for axis, letter in enumerate(AXES):
         shown = sample.axes.get(axis_numbers[axis])
         known = None if shown is None or not shown.grid.interval_mm else shown.grid
@@ -122,20 +137,29 @@ def _grids(machine: Machine, sample: Sample, points: tomlio.Section, axis_number
             grids.append(known if known.last >= known.first + 3 else None)
         elif any((number, axis_numbers[axis]) in sample.parameters for number in (3620, 3621, 3622, 3624)):
             grids.append(None)
+        elif (own := pitch[axis]) is not None:
+            sample.check_free(axis_numbers[axis], letter, own.first, own.last)
+            grids.append(own if own.last >= own.first + 3 else None)
+            of_pitch[axis] = True
         else:
-            used = [grid.last for grid in grids if grid is not None] + [span[1] for _, span in sample.others(0)]
+            used = [grid.last for grid in (*grids, *pitch) if grid is not None]
+            used += [span[1] for _, span in sample.others(0)]
             grids.append(default_grid(machine, axis, max(used, default=0) + 1, quantum=quantum))
     stated = tuple(letter in points or axis_numbers[k] in sample.axes for k, letter in enumerate(AXES))
     points.finish()
-    return tuple(grids), stated
+    return tuple(grids), stated, tuple(of_pitch)
 
 
 def _stores(word: str) -> Literal["correction", "error"]:
     return "correction" if word == "correction" else "error"
 
 
-def _axis_numbers(section: tomlio.Section) -> tuple[int, int, int]:
-    x, y, z = (section.take(axis, tomlio.whole(1, 99), k + 1) for k, axis in enumerate(AXES))
+def _axis_numbers(section: tomlio.Section, pitch: PitchSettings | None) -> tuple[int, int, int]:
+    usual = (1, 2, 3) if pitch is None else pitch.axis_numbers
+    x, y, z = (section.take(axis, tomlio.whole(1, 99), usual[k]) for k, axis in enumerate(AXES))
+    if pitch is not None and (x, y, z) != usual:
+        stated = ", ".join(map(str, usual))
+        raise section.fail("X", f"{x}, {y}, {z} are the axis numbers here, and {stated} in [controllers.fanuc-pitch]")
     section.finish()
     return x, y, z
 

@@ -119,6 +119,13 @@ def parse_straightness(settings: StraightnessSettings, files: Sequence[SourceFil
         if entry.moving in moving[:k]:
             raise texts[0].fail(f"{AXES[entry.moving]} is the moving axis of two entries; each may have one")
     remarks = [found.unit_remark(settings.detection_unit_um), *map(str, apart)]
+    for entry in entries:
+        number, grid = settings.axis_numbers[entry.moving], entry.grid
+        if not any((parameter, number) in found.axes for parameter in GRID_PARAMETERS):
+            remarks.append(
+                f"3620 to 3624 of {AXES[entry.moving]} (A{number}) are not in the file; the points {grid.first} to "
+                f"{grid.last}, reference point {grid.reference}, every {grid.interval_mm:f} mm are taken from the machine file"
+            )
     if found.passed_over:
         remarks.append(found.passed_over_remark("straightness"))
     return StraightTables(entries, tuple(remarks))
@@ -167,8 +174,14 @@ def _entry(
 def _read_grid(settings: StraightnessSettings, file: SourceFile, axis: int, found: PunchedRecords) -> PointGrid:
     number = settings.axis_numbers[axis]
     missing = [str(parameter) for parameter in GRID_PARAMETERS if (parameter, number) not in found.axes]
+    known = settings.grids[axis]
+    if len(missing) == len(GRID_PARAMETERS) and known is not None and not settings.assumed[axis]:
+        return known
     if missing:
-        raise file.fail(f"parameter {', '.join(missing)} is missing for {AXES[axis]} (axis A{number})")
+        raise file.fail(
+            f"parameter {', '.join(missing)} is missing for {AXES[axis]} (axis A{number}); give the file that has it as "
+            f"well, or state points.{AXES[axis]} in the machine file"
+        )
     reference, first, last = (
         found.axes[parameter, number][1].whole(found.axes[parameter, number][0], 0, 9999)
         for parameter in GRID_PARAMETERS[:3]
@@ -185,7 +198,8 @@ def straightness_violations(machine: Machine, settings: StraightnessSettings, ta
         if most > settings.amount_limit:
             messages.append(f"{entry.name}: an amount of {most} counts, the limit is {settings.amount_limit}")
         knots = machine.reference_point_mm[entry.moving] + entry.along_mm
-        messages += coverage_violations(machine, entry.moving, knots[0], knots[-1], f"the polyline {entry.name}")
+        short = coverage_violations(machine, entry.moving, knots[0], knots[-1], f"the polyline {entry.name}")
+        messages += [f"{text}; {AXES[entry.moving]} needs a compensation point at or beyond each end" for text in short]
         known = settings.grids[entry.moving]
         if known is not None and settings.stated[entry.moving] and entry.grid != known:
             messages.append(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_
 from compgen.controllers.grids import Grid, curve_nodes_mm, equidistant_grid
 from compgen.controllers.integers import IntegerCurve, best_integers, lowest_free, section_weights
 from compgen.controllers.mitsubishi.context import sheet_context
+from compgen.controllers.mitsubishi.records import begins_with_mark
 from compgen.controllers.mitsubishi.settings import (
     HIGHEST_VALUE,
     INTERVAL_QUANTUM_MM,
@@ -150,6 +152,13 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
     def usage(self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables) -> list[Usage]:
         """Return the largest value, numbers and sets against their limits."""
         return sheet_usage(settings, tables)
+
+    def keeping_others(
+        self, machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables, files: Sequence[Path]
+    ) -> dict[str, dict[str, Any]]:
+        """Return ``style_from`` with the parameter file of the control, if that is among the files."""
+        own = [] if settings.sample.file is not None else list(filter(begins_with_mark, files))
+        return {self.name: {"style_from": str(own[0].resolve())}} if len(own) == 1 else {}
 
     def resolution_mm(self, settings: MitsubishiSettings) -> float:
         """Half a count of each table that acts on an axis, where the range of the values does not bind."""

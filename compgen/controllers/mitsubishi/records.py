@@ -71,6 +71,11 @@ def is_parameter_file(file: SourceFile) -> bool:
     return file.text.removeprefix("\ufeff").lstrip().startswith("%")
 
 
+def begins_with_mark(path: Path) -> bool:
+    """Whether a file is a parameter file of the control."""
+    return is_parameter_file(SourceFile(path, read_bytes(path)[:100].decode("ascii", "replace")))
+
+
 def sheet_entries(file: SourceFile) -> list[Entry]:
     """Rows ``#number,value,meaning``; blank lines and lines that begin with '#' and no digit (the header) are skipped."""
     if len(file.text) > MOST_IN_SHEET:

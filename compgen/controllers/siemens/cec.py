@@ -9,7 +9,8 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,13 @@ from compgen.controllers.base import Controller, SourceFile, Term, Usage, nodes_
 from compgen.controllers.grids import equidistant_grid
 from compgen.controllers.siemens.archive import Findings, Foreign, foreign_assignments
 from compgen.controllers.siemens.limits import cec_usage, largest_sums, set_violations, stated_limit_violations
-from compgen.controllers.siemens.preflight import cec_parameters, cec_reservations, cec_sign_statement, cec_warnings
+from compgen.controllers.siemens.preflight import (
+    cec_overwrites,
+    cec_parameters,
+    cec_reservations,
+    cec_sign_statement,
+    cec_warnings,
+)
 from compgen.controllers.siemens.products import (
     MM_DECIMALS,
     MODE_WORDS,
@@ -82,9 +89,10 @@ _FACTOR_ROUNDING_MM = 1e-8
 
 @dataclass(frozen=True)
 class CecTables:
-    """Tables by index, with the numbers as the file has them."""
+    """Tables by index, with the numbers as the file has them; ``others`` are the indices of tables of other axes."""
 
     tables: CecMap
+    others: tuple[int, ...] = field(default=(), compare=False)
 
 
 class SiemensCec(Controller[CecSettings, CecTables]):
@@ -166,6 +174,11 @@ class SiemensCec(Controller[CecSettings, CecTables]):
             "program_enables": settings.container.enables,
             "outputs": [names[axis] for axis in sorted({entry.output_axis for entry in tables.tables.values()})],
             "has_products": any(entry.multiplier for entry in tables.tables.values()),
+            "kept_tables": list(settings.kept_tables),
+            "test_tables": [
+                index for index in range(len(settings.kept_tables) + 2) if index not in settings.kept_tables
+            ],
+            "overwrites": cec_overwrites(tables.tables, settings.kept_tables),
             "tables": [self._table_context(settings, index, entry) for index, entry in sorted(tables.tables.items())],
         }
 
@@ -221,6 +234,15 @@ class SiemensCec(Controller[CecSettings, CecTables]):
             for index in sorted(set(tables.tables) & set(settings.kept_tables))
         ]
         return found + stated_limit_violations(machine, tables.tables, settings)
+
+    def keeping_others(
+        self, machine: Machine, settings: CecSettings, tables: CecTables, files: Sequence[Path]
+    ) -> dict[str, dict[str, Any]]:
+        """Return ``kept_tables`` with the tables of other axes that an archive holds."""
+        kept = sorted({*settings.kept_tables, *tables.others})
+        if kept == sorted(settings.kept_tables):
+            return {}
+        return {name: {"kept_tables": kept} for name in ("siemens-cec", "siemens-cec-eec")}
 
     def other_readings(self, settings: CecSettings, tables: CecTables) -> dict[str, CecSettings]:
         """Return the three other modes of products, where there are any."""
@@ -349,7 +371,8 @@ def foreign_cec_tables(given: Foreign, machine: Machine, settings: CecSettings, 
             findings.apart.append(f"table {index} ({axes[0]} into {axes[1]}, up to {part.largest})")
     if missing := sorted(apart - set(settings.kept_tables)):
         findings.notes.append(
-            f"new tables would overwrite these: with kept_tables = {missing} in the machine file nothing is written there"
+            "new tables may not take their places: an export with --active keeps them, or one with kept_tables = "
+            f"{missing} in the machine file"
         )
     _check_products(parts, set(found), apart, settings)
     if not found:
@@ -357,7 +380,7 @@ def foreign_cec_tables(given: Foreign, machine: Machine, settings: CecSettings, 
         raise next(iter(parts.values())).source.fail(
             f"holds no table over and into the axes {', '.join(settings.axis_names)} of the machine file{listed}"
         )
-    return CecTables(_switched(found, given, settings, findings))
+    return CecTables(_switched(found, given, settings, findings), tuple(sorted(apart)))
 
 
 def _foreign_table(
@@ -442,7 +465,7 @@ def _axis_value(item: Assignment, axis_names: Sequence[str]) -> int:
 def _axis_name_of(item: Assignment) -> str:
     match = _AXIS_VALUE.fullmatch(item.value)
     if match is None:
-        raise item.fail(f'{item.value[:40]!r} is not an axis; write e.g. (AX1) or "AX1"')
+        raise item.fail(f'{item.value[:40]!r} is not an axis; write (AX1) or "AX1"')
     return match.group(1) or match.group(2)
 
 

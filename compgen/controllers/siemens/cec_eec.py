@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
             "warnings": [*eec["warnings"], *cec["warnings"]],
             "tables": [*eec["tables"], *cec["tables"]],
             "container": cec["container"],
+            "overwrites": [*cec["overwrites"], *eec["overwrites"]],
             "cec": cec,
             "eec": eec,
         }
@@ -180,6 +182,12 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
             *self._cec.violations(machine, settings.cec, tables.cec),
             *_double_positioning(settings, tables),
         ]
+
+    def keeping_others(
+        self, machine: Machine, settings: CecEecSettings, tables: CecEecTables, files: Sequence[Path]
+    ) -> dict[str, dict[str, Any]]:
+        """Return ``kept_tables`` with the cross tables of other axes that an archive holds."""
+        return self._cec.keeping_others(machine, settings.cec, tables.cec, files)
 
     def other_readings(self, settings: CecEecSettings, tables: CecEecTables) -> dict[str, CecEecSettings]:
         """Return the other modes of products of the cross tables."""

@@ -101,6 +101,13 @@ class SiemensEec(Controller[EecSettings, EecTables]):
                 f"{name}: {encoder + 1}" for name, encoder in zip(settings.axis_names, settings.active, strict=True)
             ],
             "decimals": settings.decimals,
+            "overwrites": [
+                "Encoder tables ($AA_ENC_COMP) of other axes: none.",
+                *(
+                    f"The encoder table of {settings.axis_names[axis]}, measuring system {encoder + 1}, whatever it holds now."
+                    for axis, encoder in sorted(tables.tables)
+                ),
+            ],
             "tables": [
                 {
                     "letter": AXES[axis],

@@ -91,14 +91,40 @@ def cec_parameters(
         for index, entry in sorted(tables.items())
     ]
     rows += [
-        _row(f"SD41300 $SN_CEC_TABLE_ENABLE[{min(tables)} ... {max(tables)}]", "1", "every table is evaluated"),
-        _row(f"SD41310 $SN_CEC_TABLE_WEIGHT[{min(tables)} ... {max(tables)}]", "1.0", "weights stay 1"),
+        _row(f"SD41300 $SN_CEC_TABLE_ENABLE[{_indices(tables)}]", "1", "every table is evaluated"),
+        _row(f"SD41310 $SN_CEC_TABLE_WEIGHT[{_indices(tables)}]", "1.0", "weights stay 1"),
         _row("MD10240, MD10260, MD32711", "metric", "the tables are in mm"),
     ]
     slopes = largest_slopes(machine, tables, mode)
     for output in sorted({entry.output_axis for entry in tables.values()}):
         rows += _axis_rows(names, output, abs(sums[output][0]), slopes[output].tolist())
     return rows
+
+
+def _indices(tables: CecMap) -> str:
+    """Indices in words: ``0 ... 4, 6``; those between that belong to other axes are not named."""
+    found = sorted(tables)
+    ends = [index for index in found if index - 1 not in tables or index + 1 not in tables]
+    parts: list[str] = []
+    for index in ends:
+        alone, begins = index - 1 not in tables and index + 1 not in tables, index - 1 not in tables
+        if alone or begins:
+            parts.append(str(index))
+        else:
+            parts[-1] += f" ... {index}"
+    return ", ".join(parts)
+
+
+def cec_overwrites(tables: CecMap, kept: Sequence[int]) -> list[str]:
+    """Say which tables the file overwrites, other axes first."""
+    if kept:
+        first = f"Of other axes: nothing. Tables kept (kept_tables): {', '.join(map(str, sorted(kept)))}."
+    else:
+        first = (
+            "Of other axes: NOT KNOWN. A table of a rotary or further axis that has one of the indices below is lost: give "
+            "the archive of the control with --active, or state kept_tables in the machine file."
+        )
+    return [first, f"Tables {_indices(tables)}, whatever they hold now."]
 
 
 def _axis_rows(names: Sequence[str], output: int, needed_mm: float, slopes: Sequence[float]) -> list[dict[str, str]]:
