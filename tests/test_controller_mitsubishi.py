@@ -439,9 +439,38 @@ def test_tables_of_another_pair_go_into_free_sets_and_numbers(tmp_path, backup_f
     assert not any(taken & set(range(table.first, table.last + 1)) for table in tables.sets)
 
 
+def test_a_constant_at_the_reference_point_stays(tmp_path, make_errors):
+    """In the control's file X has 2 at its reference number: that is in all its new values, and moves no position."""
+    (tmp_path / "ALL.PRM").write_bytes(backup(sets=SETS, values={4103: 2, 4104: 5}).encode())
+    machine = following(tmp_path)
+    (tmp_path / "zero").mkdir()
+    (tmp_path / "zero" / "ALL.PRM").write_bytes(backup(sets=SETS).encode())
+    plain = following(tmp_path / "zero")
+    errors = make_errors(machine, squareness_rad=(0.0, 0.0, 0.0))
+    made, other = export(machine, errors, "mitsubishi"), export(plain, errors, "mitsubishi")
+    assert made.violations == []
+    x, bare = read_back(machine, made).sets[0], read_back(plain, other).sets[0]
+    assert x.values == tuple(value + 2 for value in bare.values)
+    np.testing.assert_array_equal(x.curve, bare.curve)
+    assert "The value at the reference number #4103 stays 2: a constant of 2 um in all values of X(x)" in made.preflight
+    read = compgen.read_tables(machine, [tmp_path / "ALL.PRM"], "mitsubishi")
+    found = added(machine, read.tables, [[-100.0, 0, -500.0], [0.0, 0, -500.0], [100.0, 0, -500.0]])
+    np.testing.assert_allclose(found[:, 0], np.array([0.0, 3.0, -2.0]) * UM, atol=ROUNDING_MM)
+    assert any("the value 2 at the reference number #4103 shifts the zero" in remark for remark in read.remarks)
+    changed = CONTROL.parse(
+        machine,
+        CONTROL.read_settings(machine),
+        [SourceFile(Path("S.CSV"), made.files["SETSHEET.CSV"].replace("\n#4103,2,", "\n#4103,0,"))],
+    )
+    assert any(
+        "the value at the reference number 4103 must be 2 as in the control's file" in text
+        for text in CONTROL.violations(machine, CONTROL.read_settings(machine), changed)
+    )
+
+
 def test_a_constant_at_the_reference_point_that_goes_is_said(tmp_path, make_errors):
     (tmp_path / "ALL.PRM").write_bytes(backup(sets=SETS, values={4103: 2}).encode())
-    machine = following(tmp_path)
+    machine = following(tmp_path, ONLY_OWN + "\ninterval_mm = { X = 40.0 }")
     made = export(machine, make_errors(machine, squareness_rad=(0.0, 0.0, 0.0)), "mitsubishi")
     assert "The value at the reference number #4103 was 2 and is now 0: X shifts by a constant" in made.preflight
 

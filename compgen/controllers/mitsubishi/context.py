@@ -116,21 +116,29 @@ def _overwrites(settings: MitsubishiSettings, tables: MitsubishiTables, rows: li
         found.append(f"Parameters that change: {', '.join(parameters) or 'none'}")
         found.append(f"Values that change: {len(changed) - len(parameters)}")
     for table in tables.sets:
-        old = sample.entries.get(table.reference)
-        if (
-            table.absolute
-            and old is not None
-            and settings.kept((table.output, table.base))
-            and not _same(old.value, "0")
-        ):
+        constant = table.at_reference * settings.half_unit_mm * table.scale / MM_PER_UM
+        if table.absolute and constant:
             found.append(
-                f"The value at the reference number #{table.reference} was {old.value} and is now 0: "
+                f"The value at the reference number #{table.reference} stays {table.at_reference}: a constant of "
+                f"{constant:g} um in all values of {AXES[table.output]}({AXES[table.base].lower()}), which shifts the zero of "
+                "the axis as before"
+            )
+        old = sample.entries.get(_old_reference(settings, table))
+        if table.absolute and not table.at_reference and old is not None and not _same(old.value or "0", "0"):
+            found.append(
+                f"The value at the reference number #{old.number} was {old.value} and is now 0: "
                 f"{AXES[table.output]} shifts by a constant, set the workpiece up anew"
             )
     cleared = [f"set {item.index + 1} ({item.output} over {item.base})" for item in _no_longer_used(settings, tables)]
     if cleared:
         found.append(f"Switched off, because this export has no such table: {', '.join(cleared)}")
     return found
+
+
+def _old_reference(settings: MitsubishiSettings, table: SetTable) -> int:
+    """Reference number of the control's own set for a table, 0 if it has none."""
+    own = settings.own_set((table.output, table.base))
+    return 0 if own is None else own.reference
 
 
 def _no_longer_used(settings: MitsubishiSettings, tables: MitsubishiTables) -> list[ControlSet]:

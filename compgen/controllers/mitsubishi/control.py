@@ -95,7 +95,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             term = terms[one_dimensional_name(output, base)]
             at = int(np.argmin(np.abs(term.nodes_mm - machine.reference_point_mm[base])))
             best = _best_counts(machine, settings, pair, term.nodes_mm, values[term.name], at)
-            numbers = tuple(int(v) for v in best.counts) if settings.absolute else values_of(best.counts, at)
+            numbers = values_of(best.counts, at, settings.kept_at_reference(pair), absolute=settings.absolute)
             kept, own = settings.kept(pair), settings.own_set(pair)
             first = lowest_free(taken, settings.first_number, len(numbers)) if kept is None else kept.first
             _check_free(settings, pair, first, first + len(numbers) - 1)

@@ -93,6 +93,12 @@ class MitsubishiSettings:
         same = own is not None and (stated is None or Decimal(repr(stated)) == own.interval_mm)
         return own if same else None
 
+    def kept_at_reference(self, pair: tuple[int, int]) -> int:
+        """Return the value at the reference number that a kept set of the control has: a constant, which stays; else 0."""
+        kept = self.kept(pair)
+        entry = None if kept is None else self.sample.entries.get(kept.reference)
+        return 0 if entry is None or not entry.value else entry.whole(LOWEST_VALUE, HIGHEST_VALUE)
+
     def free_sets(self) -> list[int]:
         """Return the sets (0 to 9) that no table of the control's file needs, from ``first_set`` on."""
         used = {item.index for item in self.sample.sets}

@@ -6,7 +6,8 @@ actual movement) x 2 for a feed from n+1 to n. So with the curve A in units of o
 
     A[n] = A[n-1] + v[n] on the positive side,   A[n] = A[n+1] - v[n] on the negative side.
 
-In the absolute system (#4000 = 0) the value of a point is A itself. That system holds for the sets of all axes.
+In the absolute system (#4000 = 0) the value of a point is A itself, but for a constant: what stands at the reference number
+shifts the zero of the axis and nothing else. That system holds for the sets of all axes.
 """
 
 from __future__ import annotations
@@ -77,10 +78,15 @@ class SetTable:
         at = self.reference - self.first
         values = np.array(self.values, dtype=np.int64)
         if self.absolute:
-            return values
+            return np.asarray(values - values[at], dtype=np.int64)
         above = np.cumsum(values[at + 1 :])
         below = -np.cumsum(values[:at][::-1])[::-1]
         return np.concatenate([below, [0], above]).astype(np.int64)
+
+    @property
+    def at_reference(self) -> int:
+        """Value at the reference number."""
+        return self.values[self.reference - self.first]
 
     @property
     def along_mm(self) -> FloatArray:
@@ -111,10 +117,12 @@ class MitsubishiTables:
     remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
-def values_of(curve: NDArray[np.int64], at: int) -> tuple[int, ...]:
-    """Return the numbers of the increment system for a curve (n,) in counts that is zero at the index ``at``."""
+def values_of(curve: NDArray[np.int64], at: int, at_reference: int = 0, *, absolute: bool = False) -> tuple[int, ...]:
+    """Return the numbers for a curve (n,) in counts that is zero at the index ``at``, where ``at_reference`` is stored."""
+    if absolute:
+        return tuple(int(value) + at_reference for value in curve)
     steps = np.diff(curve)
-    return tuple(int(value) for value in (*steps[:at], 0, *steps[at:]))
+    return tuple(int(value) for value in (*steps[:at], at_reference, *steps[at:]))
 
 
 def parse_tables(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
@@ -164,6 +172,12 @@ def _sets_of(
     said = [
         f"#{SYSTEM} = {int(not absolute)}: {system}; unit: the machine is taken to be metric, the setting unit "
         f"{settings.setting_unit_um:g} um"
+    ]
+    said += [
+        f"{set_name(table)}: the value {table.at_reference} at the reference number #{table.reference} shifts the zero of the "
+        "axis by a constant, which is not counted"
+        for table in sets
+        if absolute and table.at_reference
     ]
     said += [f"{name}, numbers {first} to {last}: not of the machine file, kept apart" for name, first, last in others]
     said += [f"passed over: {passed_over} lines that cannot change a table"] if passed_over else []
@@ -237,8 +251,10 @@ def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: Mit
             found.append(f"{what}: numbers go up to {table.last}, the last free one is {settings.last_number}")
         if table.scale == 0:
             found.append(f"{what}: the scale is 0, which leaves nothing of the table")
-        if table.values[table.reference - table.first]:
-            found.append(f"{what}: the value at the reference number {table.reference} must be 0")
+        kept = settings.kept_at_reference((table.output, table.base))
+        if table.at_reference != kept:
+            own = " as in the control's file" if kept else ""
+            found.append(f"{what}: the value at the reference number {table.reference} must be {kept}{own}")
     for one, other in combinations(tables.sets, 2):
         if one.first <= other.last and other.first <= one.last:
             found.append(f"the numbers of {set_name(one)} and {set_name(other)} overlap")
