@@ -151,7 +151,7 @@ def test_a_folder_or_a_file_that_is_not_there_is_refused(tmp_path):
         ("12 um", "'12 um' is not a number"),
         ('"1,5"', "'1,5' is not a number"),
         ("1_000", "'1_000' is not a number"),
-        ("\u0661\u0662", "'??' is not a number"),
+        ("\u0661\u0662", "'\u0661\u0662' is not a number"),
         ("0x10", "'0x10' is not a number"),
         ("", "is empty; a number"),
         ("nan", "'nan' is not a finite number"),

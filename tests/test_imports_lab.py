@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from compgen.core.axis_runs import read_axis_runs
+from compgen.core.lengths import Lengths
 from compgen.errors import InputError
 from compgen.imports import ImportOptions, import_file
 from compgen.imports.run_names import run_columns, statistic_in, way
@@ -318,3 +320,134 @@ def test_sheets_of_laboratories_come_out_as_a_person_reads_them(tmp_path, name):
     assert item.doubts == ()
     one_run = name == "two columns, temperature above"
     assert_is_the_example(item.data, ONE_RUN if one_run else RUNS_UM)
+
+
+GERMAN_HEAD = """\
+Messprotokoll Positionierabweichung X-Achse;;;;
+Datum;12.03.2024;;;
+Prüfer;Jürgen Müller;;;
+Messgerät:;XL-80;Seriennummer:;A123;
+Lufttemperatur [°C];20,4;20,6;;
+Ausdehnungskoeffizient;11,5 µm/m/K;;;
+# u_deviation_um = 0,4;;;;
+# reference_point_mm = -800;0;0;;
+"""
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "cp1252"])
+def test_what_stands_above_the_table_and_its_comments_are_kept(tmp_path, encoding):
+    path = written(tmp_path, GERMAN_HEAD + sheet(NAMES["german"]), "run.csv", encoding)
+    item = import_file(path)
+    assert item.doubts == ()
+    assert_is_the_example(item.data)
+    expected = {
+        "operator": "Jürgen Müller",
+        "instrument": "XL-80",
+        "serial_number": "A123",
+        "temp_ambient_c": "20.5",
+        "material_expansion_um_per_m_k": "11.5",
+        "u_deviation_um": "0.4",
+        "reference_point_mm": "-800, 0, 0",
+        "measured_at": "2024-03-12",
+        "date": "2024-03-12",
+        "source": "run.csv",
+    }
+    assert item.data.metadata == expected
+    out = written(tmp_path, item.files()["run.axis.csv"], "run.axis.csv")
+    assert read_axis_runs(out).metadata == expected
+
+
+@pytest.mark.parametrize(
+    ("line", "kept"),
+    [
+        ("Temperature;20.4 °C", {"temp_measured_c": "20.4"}),
+        ("Air temp [°F];68", {"temp_ambient_c": "20"}),
+        ("Température de l'air;20,0;20,4;°C", {"temp_ambient_c": "20.2"}),
+        ("Temperatur [°C];18;24", {}),  # of beginning and end, too far apart to be one number
+        ("Temperatur;68", {"temp_measured_c": "20"}),
+        ("Temperature [K];20", {}),
+        ("CTE;1.15e-5 1/K", {"material_expansion_um_per_m_k": "11.5"}),
+        ("SN;4711", {"serial_number": "4711"}),
+    ],
+)
+def test_lines_above_a_table_are_kept_where_they_are_clear(tmp_path, line, kept):
+    item = import_file(written(tmp_path, f"{line}\n" + sheet(NAMES["german"])), ImportOptions(axis="X"))
+    assert {key: value for key, value in item.data.metadata.items() if key != "source"} == kept
+
+
+def test_comments_of_own_files_survive_semicolons_and_utf_16_and_cut_ones_are_seen(tmp_path):
+    text = (
+        "# u_length_um = 0.2\n# rows = 3\nstation,point,x_mm,y_mm,z_mm,length_mm\n"
+        "A,1,0,0,0,100.5\nA,2,100,0,0,190.5\nA,3,100,90,0,260.5\n"
+    )
+    for name, other, encoding in (
+        ("a.csv", text, "utf-16"),
+        ("b.csv", text.replace(",", ";").replace(".", ","), "utf-8"),
+        ("c.csv", text.replace(",", "\t"), "cp1252"),
+    ):
+        item = import_file(written(tmp_path, other, name, encoding))
+        assert isinstance(item.data, Lengths)
+        assert item.data.metadata["u_length_um"] == "0.2"
+        assert item.data.length_mm.tolist() == [100.5, 190.5, 260.5]
+    with pytest.raises(InputError, match="declares '3' rows but holds 2: is it cut"):
+        import_file(written(tmp_path, text.rpartition("A,3")[0].replace(",", ";"), "d.csv"))
+
+
+def test_the_axis_is_known_by_the_title_and_asked_for_where_the_name_of_the_file_differs(tmp_path):
+    for title in ("Positionierung der Y-Achse", "Achse: Y", "Asse Y", "Y轴定位精度", "Axis;Y1"):
+        text = f"{title}\n{sheet(NAMES['german'])}"
+        assert (
+            import_file(written(tmp_path, text))
+            .doubts[0]
+            .startswith("above the table stands axis Y, the sheet or file is")
+        )
+        assert_is_the_example(import_file(written(tmp_path, text, "measured.csv")).data, axis=1)
+
+
+def test_a_missing_column_of_directions_is_named_as_such(tmp_path):
+    rows = [(t, v, n) for (n, _), values in RUNS_UM.items() for t, v in zip(TARGETS_MM, values, strict=True)]
+    by_target = "".join(f"{t},{v},{n}\n" for t, v, n in sorted(rows))
+    item = import_file(written(tmp_path, f"position [mm],deviation [um],run\n{by_target}"), ImportOptions(axis="X"))
+    assert "there is no column of directions (the header has 'position [mm], deviation [um], run')" in item.doubts[0]
+    assert "--map direction=COLUMN" in item.doubts[0]
+    forth_and_back = "".join(
+        f"{t},{v},{n}\n"
+        for (n, w), values in RUNS_UM.items()
+        for t, v in list(zip(TARGETS_MM, values, strict=True))[::w]
+    )
+    item = import_file(
+        written(tmp_path, f"position [mm],deviation [um],run\n{forth_and_back}"), ImportOptions(axis="X")
+    )
+    assert item.doubts == ()
+    assert_is_the_example(item.data)
+
+
+def test_messages_keep_umlauts_and_signs_and_escape_what_commands_a_terminal(tmp_path):
+    with pytest.raises(InputError, match="column Größe .µm.: 'groß' is not a number"):
+        import_file(
+            written(tmp_path, "Position [mm];Größe [µm]\n0;1\n1;groß\n"),
+            ImportOptions(columns={"deviation": "Größe [µm]"}),
+        )
+    with pytest.raises(InputError, match=r"'\\x1b\[2J' is not a number"):
+        import_file(written(tmp_path, "Position [mm];Fehler [µm]\n0;1\n1;\x1b[2J\n"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "Position;Fehler [µm]\n0;1\n100;2\n\nPosition;x;y\n0;1;2\n100;3;4\n",
+            ":2: rows of numbers stand here",
+        ),
+        ("Position;vor 1;vor 2\n0;1;1\n100;2;2\nPosition;Fehler\n0;1\n", "'Position' is not a number|rows of numbers"),
+        ("vor\n0;1\n100;2\n200;3\n\nPosition;Fehler\n0;1\n100;2\n200;3\n300;4\n", "rows of numbers stand here"),
+        (
+            "Fehler vor;;\nPosition;1;2\n0;1;1\n100;2;2\nFehler zurück;;\nPosition;1;2\n0;3;3\n100;4;4\n",
+            "rows of numbers",
+        ),
+        ("Position;vor;hoppla\n0;1;1;7\n100;2;2;7\n", "holds no table"),
+    ],
+)
+def test_a_second_block_of_numbers_is_never_left_out(tmp_path, text, message):
+    with pytest.raises(InputError, match=message):
+        import_file(written(tmp_path, text), ImportOptions(axis="X"))

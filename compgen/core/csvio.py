@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from compgen.core.csvparse import CsvFile, parse_any, parse_plain
 from compgen.core.files import read_text
 from compgen.core.names import LARGEST, SMALLEST
-from compgen.core.text import doubled, nearest, one_line
+from compgen.core.text import doubled, nearest, visible_line
 from compgen.errors import CompgenWarning, InputError
 
 FloatArray = NDArray[np.float64]
@@ -91,7 +91,7 @@ class CsvTable:
     def _bad_number(self, column: str, cells: Sequence[str]) -> InputError:
         for row, cell in enumerate(cells):
             if not _is_number(cell):
-                what = "is empty" if not cell else f"{one_line(cell)[:40]!r} is not a number"
+                what = "is empty" if not cell else f"{visible_line(cell)[:40]!r} is not a number"
                 return self.fail(row, column, f"{what}; a number with '.' as decimal point is due")
         return InputError("holds text where numbers are due", file=self.path, field=f"column {column}")
 
@@ -184,7 +184,7 @@ def _warn_left_out(place: str, names: list[str], known: set[str]) -> None:
 
 def _shown(text: str) -> str:
     """Return the beginning of a user's text on one line: a message is no place for megabytes."""
-    return one_line(text[: 2 * _SHOWN])[:_SHOWN] + (" ..." if len(text) > _SHOWN else "")
+    return visible_line(text[: 2 * _SHOWN])[:_SHOWN] + (" ..." if len(text) > _SHOWN else "")
 
 
 def _is_allowed(name: str, known: set[str], patterns: tuple[str, ...]) -> bool:
@@ -221,7 +221,7 @@ def _check_complete(source: Path, content: str, file: CsvFile) -> None:
     """
     declared, count, last_line = file.metadata.get("rows"), len(file.lines), file.lines[-1]
     if declared is not None and declared != str(count):
-        raise InputError(f"declares {one_line(declared)} rows but holds {count}: is it truncated?", file=source)
+        raise InputError(f"declares {visible_line(declared)} rows but holds {count}: is it truncated?", file=source)
     if content.endswith(("\n", "\r")):
         return
     if declared is not None:
@@ -248,7 +248,8 @@ def format_csv(
     rows = max((len(cells) for _, cells in parts), default=0)
     if any(len(cells) != rows for _, cells in parts):
         raise ValueError(f"columns differ in length: {', '.join(f'{k} {len(v)}' for k, v in columns.items())}")
-    noted = [f"# {one_line(key)} = {one_line(value)}" for key, value in {**(metadata or {}), "rows": rows}.items()]
+    facts = {**(metadata or {}), "rows": rows}
+    noted = [f"# {visible_line(key)} = {visible_line(value)}" for key, value in facts.items()]
     comments = [_IN_COMMENT.sub(" ", line) for line in noted]
     row = ",".join(template for template, _ in parts) + "\n"
     text = ["\n".join([*comments, ",".join(columns)]), "\n"]

@@ -52,6 +52,15 @@ def visible(text: str, *, flat: bool = False) -> str:
     return shown.replace("\n", "\\n") if flat else shown
 
 
+def visible_line(text: object) -> str:
+    """Return ``text`` on one line in its own script, with escapes for what a terminal would obey.
+
+    >>> visible_line("20  °C ") == "20 °C"
+    True
+    """
+    return visible(" ".join(str(text).split()), flat=True)
+
+
 def one_line(text: object) -> str:
     """Return ``text`` as printable ASCII on one line, so that it is safe in a comment of a controller file."""
     flat = " ".join(str(text).split())

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, overload
 
 from compgen.core.files import read_text
 from compgen.core.names import LARGEST, SMALLEST
-from compgen.core.text import nearest, one_line
+from compgen.core.text import nearest, visible_line
 from compgen.errors import InputError
 
 T = TypeVar("T")
@@ -66,7 +66,7 @@ class Section:
     def fail(self, key: str, message: str) -> InputError:
         """Return the error that points at ``key`` of this section."""
         field = f"[{self.name}] {key}" if self.name else key
-        return InputError(message, file=self.path, line=self._line_of(key), field=one_line(field))
+        return InputError(message, file=self.path, line=self._line_of(key), field=visible_line(field))
 
     def __contains__(self, key: str) -> bool:
         """Whether the file holds ``key``; asking makes the key a known one."""
@@ -87,7 +87,7 @@ class Section:
         try:
             return check(self.data[key])
         except ValueError as error:
-            raise self.fail(key, f"{error}; got {one_line(repr(self.data[key]))[:80]}") from None
+            raise self.fail(key, f"{error}; got {visible_line(repr(self.data[key]))[:80]}") from None
 
     def _misspelt(self, key: str) -> str:
         """The end of a message about a missing ``key``: a key of the file that was probably meant for it."""
@@ -95,7 +95,7 @@ class Section:
         # another case, or the unit was left out
         alike = [name for name in present if f"{key}_".lower().startswith(f"{name}_".lower())]
         alike = alike or difflib.get_close_matches(key, present, n=1, cutoff=0.6)
-        return f"; {one_line(alike[0])!r} is not a key here, did you mean {key!r}?" if alike else ""
+        return f"; {visible_line(alike[0])!r} is not a key here, did you mean {key!r}?" if alike else ""
 
     def section(self, key: str, *, required: bool = True) -> Section:
         """Return the sub-section ``key`` (an empty one if it is absent and not required)."""

@@ -33,11 +33,18 @@ _CHANNELS = {
         "environment",
         "ambiente",
         "aria",
+        "delair",
+        "dellaria",
+        "delaire",
+        "\u73af\u5883",
+        "\u7a7a\u6c14",
     ],
     "spindle": ["spindle", "spindel", "spdl", "mandrin", "mandrino", "husillo", "broche"],
     "material": ["material", "mat", "workpiece", "werkstuck", "part", "teil"],
 }
-_FILLERS = re.compile(r"temperatur(?:en|es|e|a)?|temp|sensor|fuhler|scale|massstab|axis|achse|channel|kanal|celsius")
+_FILLERS = re.compile(
+    r"temperatur(?:en|es|e|a)?|temp|sensor|fuhler|scale|massstab|axis|achse|channel|kanal|celsius|\u6e29\u5ea6"
+)
 
 
 def is_temperature(column: Column) -> bool:

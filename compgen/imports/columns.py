@@ -114,7 +114,7 @@ _INDEX = ("i", "no", "nr", "n", "index", "count", "number", "nummer", "lfdnr", "
 CHANNEL = re.compile(r"temp_[a-z0-9_]{1,30}")
 #: A column of one run that the user names by --map run3-=COLUMN: number, and direction if one is given.
 RUN_FIELD = re.compile(r"run(\d{1,3})([+\-]?)")
-_TEMPERATURE = re.compile(r"(?<!at)temp(?!o|late|s$)")
+_TEMPERATURE = re.compile(r"(?<!at)temp(?!o|late|s$)|\u6e29\u5ea6")
 _BRACKETS = re.compile(r"\s*[\[(<{]\s*([^\])>}]{1,20}?)\s*[\])>}]\s*")
 _SUFFIX = re.compile(r"^(.*?\w)[\s_/,]+([a-zA-Z\u00b0\u00b5\u03bc\"']{1,12}|um/m|mm/m|m{1,2}/min|m{1,2}/s)$")
 

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from compgen.core.csvio import FloatArray
 from compgen.errors import InputError
 from compgen.imports.amounts import (
+    POSSIBLE_C,
+    USUAL_C,
     amount_of,
     celsius_of,
     channel_of,
@@ -30,8 +32,9 @@ from compgen.imports.columns import CHANNEL, Column, is_index, split_name
 from compgen.imports.findings import Findings
 from compgen.imports.moments import date_in_header, times_of
 from compgen.imports.result import Kind
-from compgen.imports.source import shown
-from compgen.imports.units import KG_PER_MASS, MM_MIN_PER_FEED, Quantity, further_unit
+from compgen.imports.source import parse_number, shown
+from compgen.imports.surroundings import STEADY_K
+from compgen.imports.units import CELSIUS, KG_PER_MASS, MM_MIN_PER_FEED, Quantity, further_unit
 
 #: Why a column is not used that the user left out.
 LEFT_OUT = "left out by --ignore"
@@ -47,6 +50,27 @@ _HARMLESS = (
 _READINGS = ("actual", "deviation", "correction", "value", "length", "x", "y", "z", "dx", "dy", "dz", "xa", "ya", "za")
 #: Units in brackets that are neither a length nor an angle.
 _OTHER_UNIT = re.compile(r"(?i)[\[(]\s*(%|%\s?rh|rh|[hkm]?pa|m?bar|mmhg|ppm|m?v|m?a|k?w|k?n|hz|rpm|1/min|db)\s*[\])]")
+
+#: What stands above a table and is kept, by the words of its key.
+_FACTS = {
+    "operator": ("operator", "bediener", "prufer", "pruefer", "messtechniker", "gemessenvon", "measuredby", "inspector",
+                 "technician", "operateur", "operatore", "operador", "bearbeiter", "\u64cd\u4f5c\u5458", "\u6d4b\u91cf\u5458",
+                 "\u68c0\u6d4b\u5458"),
+    "instrument": ("instrument", "messgerat", "messmittel", "messsystem", "gerat", "device", "laser", "laserinterferometer",
+                   "interferometer", "equipment", "appareil", "strumento", "instrumento", "equipo", "\u4eea\u5668"),
+    "serial_number": ("serialnumber", "serialno", "seriennummer", "seriennr", "laserseriennummer", "serial", "sn",
+                      "laserserialno",
+                      "instrumentserialnumber", "gerateseriennummer",
+                      "numerodeserie", "nodeserie", "matricola",
+                      "numerodiserie", "\u5e8f\u5217\u53f7", "\u4eea\u5668\u7f16\u53f7"),
+}  # fmt: skip
+_EXPANSION = ("expansion", "expansioncoefficient", "expcoeff", "coefficientofthermalexpansion", "cte", "materialexpansion",
+              "ausdehnung", "ausdehnungskoeffizient", "wak", "langenausdehnungskoeffizient", "dilatation",
+              "coefficientdedilatation", "coefficientededilatazione", "dilatazione", "coeficientededilatacion",
+              "\u81a8\u80c0\u7cfb\u6570", "\u7ebf\u81a8\u80c0\u7cfb\u6570")  # fmt: skip
+#: An expansion below this is one per kelvin, not one in a million; um/(m K) of any material of machines.
+_FRACTION, _LARGEST_EXPANSION = 1e-3, 100.0
+_NUMBER = r"[+\-]?\d+(?:[.,]\d+)?(?:[eE][+\-]?\d+)?"
 
 _LABELS = ("run", "repeat", "line", "block", "setup", "pose")
 _MAIN: Mapping[str, tuple[str, ...]] = {
@@ -274,8 +298,46 @@ class _Reader:
 
 
 def metadata_of(findings: Findings, further: Further) -> dict[str, str]:
-    """Return the comments of the contract file: its source, and when it was measured where that is clear."""
+    """Return the comments of the contract file: those of the file itself, what stands above its table, source and date.
+
+    Comments ``# key = value`` count for other commands (``u_length_um``, ``reference_point_mm``) and are kept as they are.
+    Temperatures, operator, instrument, its serial number and the expansion coefficient are kept where they are clear; a
+    temperature above a table corrects nothing.
+    """
+    comments = {key: _with_point(value) for key, value in findings.table.comments.items()}
+    above = {name: value for key, text in findings.table.metadata.items() for name, value in _fact(key, text).items()}
     at = further.measured_at or date_in_header(findings)
     if at:
         findings.understood["measured_at"] = at
-    return {"source": findings.table.grid.path.name, **({"measured_at": at, "date": at} if at else {})}
+    dated = {"measured_at": at, "date": at} if at else {}
+    return {**above, **comments, "source": findings.table.grid.path.name, **dated}
+
+
+def _with_point(text: str) -> str:
+    """Return a number with a decimal comma as one with a point; other text stays."""
+    value = parse_number(text) if text.count(",") == 1 and "." not in text else None
+    return text if value is None else repr(value)
+
+
+def _fact(key: str, text: str) -> dict[str, str]:
+    """Return what a line above a table says, by the name and in the unit of the contract; nothing if it is not clear."""
+    column = split_name(key)
+    name = next((name for name, words in _FACTS.items() if column.word in words), None)
+    if name is not None and text:
+        return {name: text}
+    numbers = [value for word in re.findall(_NUMBER, text) if (value := parse_number(word)) is not None]
+    if column.word in _EXPANSION and numbers:
+        value = numbers[0] * (1e6 if abs(numbers[0]) < _FRACTION else 1.0)
+        return {"material_expansion_um_per_m_k": f"{value:g}"} if 0 < value <= _LARGEST_EXPANSION else {}
+    if not is_temperature(column) or not numbers:
+        return {}
+    rest = re.sub(_NUMBER, " ", text).strip()
+    unit = column.unit or further_unit(next(iter(rest.split()), ""), "temperature")
+    usual = [scale for name, scale in CELSIUS.items() if unit in (None, name)]
+    found = [[factor * value + offset for value in numbers] for factor, offset in usual]
+    fitting = [values for values in found if all(POSSIBLE_C[0] < value < POSSIBLE_C[1] for value in values)]
+    if unit is None:
+        fitting = [values for values in fitting if all(USUAL_C[0] <= value <= USUAL_C[1] for value in values)]
+    if len(fitting) != 1 or max(fitting[0]) - min(fitting[0]) > STEADY_K:
+        return {}
+    return {f"temp_{channel_of(column.word)}_c": f"{sum(fitting[0]) / len(numbers):.6g}"}

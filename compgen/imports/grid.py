@@ -200,7 +200,7 @@ def find_table(grid: Grid, decimal: str | None = None) -> Table:
     comments: dict[str, str] = {}
     for row in grid.rows[: best.top]:
         _note(row, metadata, comments)
-    _check_beside(grid, 0, best.top)
+    _check_beside(grid, 0, best.top, 2)
     if not best.labels:
         return _table(grid, best, metadata, comments, decimal)
     _check_beside(grid, best.end, len(grid.rows))
@@ -411,8 +411,8 @@ def _trimmed(row: Sequence[str]) -> Sequence[str]:
     return row[:end]
 
 
-def _check_beside(grid: Grid, start: int, end: int) -> None:
-    """Refuse rows of readings that do not belong to the table; statistics over the runs may stand there."""
+def _check_beside(grid: Grid, start: int, end: int, least: int = 1) -> None:
+    """Refuse ``least`` adjacent rows of readings that do not belong to the table; statistics over the runs may stand there."""
     last, count = 0, 0
     for k in range(start, end):
         row = grid.rows[k]
@@ -421,9 +421,9 @@ def _check_beside(grid: Grid, start: int, end: int) -> None:
         readings = readings and (parse_number(label) is not None or run_in(label) is not None or _is_position(label))
         count = count + 1 if readings and (not count or k == last + 1) else int(readings)
         last = k
-        if count >= 2 and not _is_summary(grid, k - 1):
+        if count >= least and not _is_summary(grid, k + 1 - count):
             message = "rows of numbers stand here that do not belong to the table: put each table into a file or sheet of its own"
-            raise grid.fail(message, grid.lines[k - 1])
+            raise grid.fail(message, grid.lines[k + 1 - count])
 
 
 def _is_summary(grid: Grid, first: int) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -24,6 +25,11 @@ from compgen.imports.source import parse_number, shown
 _LIKELY = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "in", "nm")}
 #: A column without a telling name holds readings, not deviations, if it follows the targets so closely.
 FOLLOWS = 1e-2
+_AXIS_KEYS = ("measuredaxis", "machineaxis", "testaxis", "gemesseneachse", "messachse", "maschinenachse", "axemesure",
+              "assemisurato", "ejemedido")  # fmt: skip
+_NAMED_AXIS = re.compile(
+    r"\b([XYZ])[1-9]?[\s\-_]*(?:ACHSE|AXIS|AXE|ASSE|EJE|\u8f74)|(?:ACHSE|AXIS|AXE|ASSE|EJE|\u8f74)[\s\-_:]*([XYZ])[1-9]?\b"
+)
 #: Parts of words that speak of corrections.
 _COUNTER = ("korr", "kompens", "compens", "correc", "correzion", "\u8865\u507f")
 _TELLING = (
@@ -364,17 +370,29 @@ def _axes(findings: Findings, row: IntArray) -> list[str]:
         return [letters[k] for k in row]
     if findings.letter is not None:
         return [findings.letter] * len(row)
-    metadata = findings.table.metadata
-    words = [value for key, value in metadata.items() if key in ("axis", "achse")]
-    words += [*findings.table.grid.notes[:1], findings.table.grid.path.stem.replace("_", " ").replace("-", " ")]
-    for word in words:
-        letter = axis_in(word)
-        if letter:
-            if word not in metadata.values():
-                findings.notes.append(f"axis {letter} by the name of the sheet or file")
-            return [letter] * len(row)
+    said = {letter for key, text in findings.table.metadata.items() if (letter := _axis_said(key, text))}
+    names = [*findings.table.grid.notes[:1], findings.table.grid.path.stem.replace("_", " ").replace("-", " ")]
+    named = next((letter for name in names if (letter := axis_in(name))), None)
+    if len(said) == 1 and named in (None, *said):
+        return [said.pop()] * len(row)
+    if said:
+        other = f"the sheet or file is called {named}" if len(said) == 1 else "several axes are named"
+        findings.doubts.append(f"above the table stands axis {', '.join(sorted(said))}, {other}; give --axis")
+        return [sorted(said)[0]] * len(row)
+    if named:
+        findings.notes.append(f"axis {named} by the name of the sheet or file")
+        return [named] * len(row)
     findings.doubts.append(f"nothing says which axis it is; give --axis {', '.join(AXES)}")
     return [""] * len(row)
+
+
+def _axis_said(key: str, text: str) -> str | None:
+    """Return the axis that a line above the table names, such as ``Achse: X`` or a title ``Positionierung Y-Achse``."""
+    column = split_name(key).word
+    if column in FIELDS["axis"] or column in _AXIS_KEYS:
+        return axis_in(text)
+    found = {first or second for first, second in _NAMED_AXIS.findall(f"{key} {text}".upper())}
+    return found.pop() if len(found) == 1 else None
 
 
 def _directions(findings: Findings, target: FloatArray, run: IntArray, label: IntArray) -> tuple[IntArray, IntArray]:
@@ -386,6 +404,8 @@ def _directions(findings: Findings, target: FloatArray, run: IntArray, label: In
         direction = np.where(order % 2 == 0, 1, -1).astype(np.int64)
         return direction, cycles(direction, one_way)
     if not label.any():
+        if len(set(zip(one_way.tolist(), target.tolist(), strict=True))) < len(target):
+            one_way = _sweeps(target, one_way)  # a run that goes forth and back
         direction = motion(target, one_way)
         findings.understood.setdefault("directions_from", "the order of the rows")
         if not direction.all():
@@ -409,14 +429,16 @@ def _directions(findings: Findings, target: FloatArray, run: IntArray, label: In
     return label, run if run.any() else cycles(label, _repeats(target, label))
 
 
-def _sweeps(target: FloatArray) -> IntArray:
-    """Number of the one-way run of each row: a new one begins where a target comes a second time."""
+def _sweeps(target: FloatArray, run: IntArray | None = None) -> IntArray:
+    """Number of the one-way run of each row: a new one begins where a target comes a second time, or with another ``run``."""
     keys = np.round(target / SAME_TARGET_MM).astype(np.int64).tolist()
-    number, seen, result = 1, set[int](), []
-    for key in keys:
-        if key in seen:
+    runs = [0] * len(keys) if run is None else run.tolist()
+    number, seen, result, last = 1, set[int](), [], runs[0] if runs else 0
+    for key, own in zip(keys, runs, strict=True):
+        if key in seen or own != last:
             number, seen = number + 1, set()
         seen.add(key)
+        last = own
         result.append(number)
     return np.array(result, dtype=np.int64)
 
