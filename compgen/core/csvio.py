@@ -64,7 +64,7 @@ class CsvTable:
         if "=" in "".join(found):
             row = next(k for k, name in enumerate(found) if "=" in name)
             raise self.fail(
-                row, column, f"{one_line(found[row])[:40]!r} is not a name: '=' is not allowed; leave it out"
+                row, column, f"{visible_line(found[row])[:40]!r} is not a name: '=' is not allowed; leave it out"
             )
         return found
 
