@@ -86,10 +86,49 @@ def test_positions_beyond_the_travel_are_named(capsys, tmp_path, machine):
     assert not (tmp_path / "o").exists()
 
 
-def test_own_files_and_unknown_sheets_are_usage_errors(capsys):
-    code, _, err = call(capsys, "import", ROOT / "examples" / "zha-gantry.lengths.csv")
+OWN = {
+    "lengths": ROOT / "examples" / "zha-gantry.lengths.csv",
+    "sixdof": ROOT / "examples" / "jia-xytz.sixdof.csv",
+    "errors": ROOT / "examples" / "jia-xytz.truth.errors.csv",
+    "part": "# origin_mm = -400, -500, -120\nx_mm,y_mm,mx_mm,my_mm\n10,10,10.013,9.998\n10,250,9.999,250.006\n90,10,90,10\n",
+    "axis": "axis,position_mm,direction,run,deviation_um\nX,-800,1,1,2.5\nX,0,1,1,-1\n",
+    "deviations": "x_mm,y_mm,z_mm,dx_um\n-800,0,0,1\n0,0,0,2\n",
+    "diagonals": "diagonal,x_mm,y_mm,z_mm,deviation_um,run\nPPP,-800,-1000,-350,0,1\nPPP,0,0,0,7,1\n",
+}
+
+
+@pytest.mark.parametrize("kind", OWN)
+def test_files_of_the_own_format_are_shown_and_copied(capsys, tmp_path, kind):
+    path = OWN[kind]
+    if isinstance(path, str):
+        path = tmp_path / f"a.{kind}.csv"
+        path.write_text(OWN[kind])
+    code, out, err = call(capsys, "import", path, "--out", tmp_path / "o", "--json")
+    assert code == 0, err
+    facts = json.loads(out)
+    assert (facts["format"], facts["kind"]) == ("compgen", kind)
+    names = [line for line in path.read_text().splitlines() if not line.startswith("#")][0].split(",")
+    assert list(facts["understood"]["columns"]) == names
+    assert facts["files"] == [str(tmp_path / "o" / path.name)]
+    assert (tmp_path / "o" / path.name).read_text() == path.read_text()
+    code, out, _ = call(capsys, "import", path)
+    assert code == 0
+    assert f"compgen, {kind}" in out
+    assert "the other commands take it as it is" in out
+
+
+def test_damaged_own_files_options_that_convert_and_unknown_sheets_are_usage_errors(capsys, tmp_path):
+    path = tmp_path / "a.axis.csv"
+    path.write_text(OWN["axis"].replace("2.5", "x"))
+    code, _, err = call(capsys, "import", path, "--out", tmp_path / "o")
     assert code == 2
-    assert "compgen's own format (lengths)" in err
+    assert "a.axis.csv:2: column deviation_um: 'x' is not a number" in err
+    assert not (tmp_path / "o").exists()
+    code, _, err = call(capsys, "import", OWN["lengths"], "--sign", "correction")
+    assert code == 2
+    assert "--sign: is a file of compgen's own format (lengths)" in err
+    code, _, err = call(capsys, "import", OWN["lengths"], "--machine", "jia-xytz", "--out", tmp_path / "o")
+    assert code == 2
     code, _, err = call(capsys, "import", GOLDEN / "wide.xlsx", "--sheet", "Q", "--json")
     assert code == 2
     assert "no sheet 'Q'" in err

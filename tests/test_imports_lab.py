@@ -1,12 +1,15 @@
 """Sheets of laboratories: names of runs in several languages, statistics beside the runs, and what is never left out."""
 
+from datetime import datetime
+
 import numpy as np
+import openpyxl
 import pytest
 
 from compgen.core.axis_runs import read_axis_runs
 from compgen.core.lengths import Lengths
 from compgen.errors import InputError
-from compgen.imports import ImportOptions, import_file
+from compgen.imports import ImportOptions, import_file, open_measurement
 from compgen.imports.run_names import run_columns, statistic_in, way
 
 #: One axis, worked by hand: deviations at three targets in two runs each way, um.
@@ -451,3 +454,92 @@ def test_messages_keep_umlauts_and_signs_and_escape_what_commands_a_terminal(tmp
 def test_a_second_block_of_numbers_is_never_left_out(tmp_path, text, message):
     with pytest.raises(InputError, match=message):
         import_file(written(tmp_path, text), ImportOptions(axis="X"))
+
+
+def workbook(tmp_path, sheets, name="lab.xlsx"):
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for title, rows in sheets.items():
+        own = book.create_sheet(title)
+        for row in rows:
+            own.append(row)
+    book.save(tmp_path / name)
+    return tmp_path / name
+
+
+def axis_sheet(*before):
+    rows = [[t, *(values[k] for values in RUNS_UM.values())] for k, t in enumerate(TARGETS_MM)]
+    return [*before, ["Position [mm]", *NAMES["german"]], *rows]
+
+
+def test_a_row_with_a_number_above_a_sheet_and_an_empty_margin(tmp_path):
+    rows = axis_sheet(["Temperatur", 20.4, "°C"], ["Datum", datetime(2024, 3, 12), None], [])
+    shifted = [[], *([None, None, *row] for row in rows), [], [None, None, "Mittelwert", 2.67, 5.0, 2.83, 5.03]]
+    for number, own in enumerate((rows, shifted)):
+        item = import_file(workbook(tmp_path, {"X": own}, f"{number}.xlsx"))
+        assert item.doubts == ()
+        assert_is_the_example(item.data)
+        assert item.data.metadata["temp_measured_c"] == "20.4"
+        assert item.data.metadata["measured_at"].startswith("2024-03-12")
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected_urad"),
+    [
+        ([["EC0Y", 25, "µrad"]], {"EC0Y": 25.0}),
+        ([["Squareness", "Value [arcsec]"], ["EC0Y", 2.0], ["EB0Z", -1.0]], {"EC0Y": 9.6962736, "EB0Z": -4.8481368}),
+        ([["Error", "µm/m"], ["E_C0Y", -12.5], ["EA0Z", 3]], {"EC0Y": -12.5, "EA0Z": 3.0}),
+        # +Y leans to -X where EC0Y > 0: the angle is more than 90 degrees; +Z leans to +X where EB0Z > 0
+        ([["X-Y", 90.001, "°"], ["X-Z", 90.001, "°"]], {"EC0Y": 17.4532925, "EB0Z": -17.4532925}),
+    ],
+)
+def test_a_sheet_of_squareness_beside_sheets_of_axes(tmp_path, rows, expected_urad):
+    path = workbook(tmp_path, {"X": axis_sheet(), "Y": axis_sheet(), "Squareness": rows, "Info": [["made by", "hand"]]})
+    item = import_file(path)
+    assert item.doubts == ()
+    assert item.data.axes == (0, 1)
+    found = {name: 1e6 * value for name, (value, _) in item.beside.squareness.items()}
+    assert found == pytest.approx(expected_urad, abs=1e-6)
+    assert set(item.files()) == {"lab.axis.csv", "lab.errors.csv"}
+    with pytest.raises(InputError, match="holds runs of axes and errors as well .E"):
+        open_measurement([path])
+    alone = import_file(path, ImportOptions(ignore=["Squareness"]))
+    assert alone.beside is None
+    assert len(alone.data) == 24
+
+
+@pytest.mark.parametrize(
+    ("rows", "doubt"),
+    [
+        ([["XY", 25, "µrad"]], "the sign of 'XY' is not known; write EC0Y in its place"),
+        ([["EC0Y", 25]], "no unit of 'EC0Y'"),
+        ([["Rechtwinkligkeit"], ["Spindel", 25, "µm"]], "'Squareness' holds numbers that are not understood"),
+        ([["a", "b"], ["c", 1, 2, 3], ["d", 4, 5, 6]], "'Squareness' holds numbers that are not understood"),
+    ],
+)
+def test_a_sheet_that_is_not_understood_is_asked_for(tmp_path, rows, doubt):
+    path = workbook(tmp_path, {"X": axis_sheet(), "Squareness": rows})
+    assert any(doubt in text for text in import_file(path).doubts)
+    with pytest.raises(InputError, match="leaves open"):
+        open_measurement([path])
+    alone = import_file(path, ImportOptions(ignore=["Squareness"]))
+    assert alone.doubts == ()
+    assert_is_the_example(alone.data)
+    with pytest.raises(InputError, match="there is no column or sheet 'Rechteck'"):
+        import_file(path, ImportOptions(ignore=["Squareness", "Rechteck"]))
+
+
+def test_a_sheet_of_statistics_is_left_out_and_one_of_mean_errors_is_held_against_the_runs(tmp_path):
+    results = [["Parameter", "vor", "zurück"], ["Umkehrspanne B", 2.4, 2.4], ["Wiederholpräzision R", 0.4, 0.3]]
+    item = import_file(workbook(tmp_path, {"X": axis_sheet(), "Ergebnis": results}))
+    assert item.doubts == ()
+    assert any("sheet left out: 'Ergebnis'" in note for note in item.notes)
+    means = [["Position [mm]", "EXX [µm]", "EYX [µm]"], [-800, 2.075, 0.5], [-400, 3.25, 1], [0, 6.325, 0]]
+    path = workbook(tmp_path, {"X": axis_sheet(), "Mittel": means})
+    (doubt,) = import_file(path).doubts
+    assert "holds EXX, and the runs of X give it as well (their means differ by up to " in doubt
+    assert float(doubt.partition("up to ")[2].split()[0]) < 1e-6
+    straight = workbook(tmp_path, {"X": axis_sheet(), "Geradheit": [[row[0], row[2]] for row in means]})
+    item = import_file(straight)
+    assert item.doubts == ()
+    assert item.beside.curves["EYX"].value.tolist() == pytest.approx([5e-4, 1e-3, 0], abs=ROUNDING_MM)

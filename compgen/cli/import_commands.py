@@ -13,12 +13,12 @@ from compgen.cli.common import json_option, open_machine, print_json, stdout
 from compgen.core.axis_runs import AxisRuns
 from compgen.core.deviations import Deviations
 from compgen.core.error_table import ErrorTable
-from compgen.core.files import OutputFolder
+from compgen.core.files import OutputFolder, read_text
 from compgen.core.lengths import Lengths
 from compgen.core.machine import Machine
 from compgen.core.names import AXES, error_named
 from compgen.errors import InputError
-from compgen.imports import Imported, ImportOptions, import_file, own_kind
+from compgen.imports import ImportOptions, describe_own, import_file, own_kind
 from compgen.imports.result import KINDS
 
 _HELP = {
@@ -91,8 +91,8 @@ def import_command(
     Renishaw .rtl, .rta, .rts (text) and .rtx (captures), Etalon exchange files, ISO 230-2 .dat files of ecmc, tables as
     text (any separator, decimal comma or point) and Excel workbooks (.xlsx). Shown are axis, targets, runs,
     directions, unit, sign, instrument, and what the file leaves open. Deviations are measured minus commanded; units in
-    the written file are mm, um and urad. Nothing is written while something is open: say it by an option. Exit code 2
-    then, if --out was given.
+    the written file are mm, um and urad. A file of compgen's own format is shown as well, and copied with --out. Nothing is
+    written while something is open: say it by an option. Exit code 2 then, if --out was given.
 
     \b
     Example:
@@ -100,32 +100,42 @@ def import_command(
     """
     target = OutputFolder(out) if out is not None else None
     kind = own_kind(file)
-    if kind is not None:
-        raise InputError(f"is a file of compgen's own format ({kind}); the other commands take it as it is", file=file)
-    options = ImportOptions(columns=_pairs(mapping, "--map"), units=_pairs(units, "--unit", "value"), **said)
-    item = import_file(file, options)
     known = None if machine is None else open_machine(machine, machines)
-    against = [] if known is None else outside_travel(known, item)
-    summary = {**item.summary(), "machine": _machine_summary(known, against), "files": []}
-    if target is not None and not item.doubts and not against:
-        for name, text in item.files().items():
+    data: object
+    if kind is not None:
+        given = [key for key, value in {"map": mapping, "unit": units, **said}.items() if value]
+        if given:
+            message = f"is a file of compgen's own format ({kind}): it says what it holds, and nothing is converted"
+            raise InputError(message, file=file, field=f"--{given[0].replace('_', '-')}")
+        understood, data = describe_own(file, kind)
+        note = "is a file of compgen's own format: the other commands take it as it is"
+        summary: dict[str, Any] = {"file": str(file), "format": "compgen", "kind": kind, "understood": understood, "doubts": [],
+                   "notes": [note]}  # fmt: skip
+    else:
+        options = ImportOptions(columns=_pairs(mapping, "--map"), units=_pairs(units, "--unit", "value"), **said)
+        item = import_file(file, options)
+        summary, data = item.summary(), item.data
+    against = [] if known is None else outside_travel(known, data)
+    summary = {**summary, "machine": _machine_summary(known, against), "files": []}
+    if target is not None and not summary["doubts"] and not against:
+        for name, text in {file.name: read_text(file)}.items() if kind is not None else item.files().items():
             target.add(name, text)
         summary["files"] = [str(path) for path in target.commit().values()]
     if as_json:
         print_json(summary)
     else:
         _show(summary)
-    return 2 if against or (target is not None and item.doubts) else 0
+    return 2 if against or (target is not None and summary["doubts"]) else 0
 
 
 def _machine_summary(machine: Machine | None, against: Sequence[str]) -> dict[str, Any] | None:
     return None if machine is None else {"name": machine.name, "outside": list(against)}
 
 
-def outside_travel(machine: Machine, item: Imported) -> list[str]:
+def outside_travel(machine: Machine, data: object) -> list[str]:
     """Say which positions of an imported file lie outside the travel of a machine, one line for each axis."""
     found = []
-    for axis, values in _positions(item).items():
+    for axis, values in _positions(data).items():
         low, high = machine.axes[axis].range_mm
         if len(values) and (values.min() < low - 1e-3 or values.max() > high + 1e-3):
             found.append(
@@ -135,8 +145,7 @@ def outside_travel(machine: Machine, item: Imported) -> list[str]:
     return found
 
 
-def _positions(item: Imported) -> dict[int, np.ndarray]:
-    data = item.data
+def _positions(data: object) -> dict[int, np.ndarray]:
     if isinstance(data, AxisRuns):
         return {axis: data.position_mm[data.axis == axis] for axis in data.axes}
     if isinstance(data, Lengths | Deviations):

@@ -36,6 +36,7 @@ _UNIT_WORDS = {
     "microrad": "urad",
     "millimeter": "mm",
     "degree": "deg",
+    "\u00b0": "deg",
     "meter": "m",
 }
 #: Words of column names by field; the words are compared without case, accents, blanks and units.

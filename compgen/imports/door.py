@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.core.axis_runs import AxisRuns, check_single, read_axis_runs
-from compgen.core.csvio import FloatArray
+from compgen.core.csvio import CsvTable, FloatArray, read_csv
 from compgen.core.deviations import Deviations, read_deviations
+from compgen.core.diagonals import read_diagonals
 from compgen.core.error_table import ErrorTable, read_errors
 from compgen.core.lengths import Lengths, read_lengths
 from compgen.core.parts import read_parts
@@ -23,8 +24,11 @@ from compgen.identify.axis_runs import positioning_errors
 from compgen.identify.measurement import Measurement, read_measurement
 from compgen.imports.recognise import import_file, own_kind
 from compgen.imports.result import Imported, ImportOptions
+from compgen.sixdof.readings import read_sixdof
 
 Plain = Lengths | Deviations | AxisRuns
+#: So many labels of a column are shown.
+_SHOWN_LABELS = 8
 _OWN_READERS: dict[str | None, Callable[[Path], Plain]] = {
     "lengths": read_lengths,
     "deviations": read_deviations,
@@ -64,6 +68,35 @@ def open_measurement(
         raise InputError("holds another kind of measurement than the first file; identify them one after the other",
                          file=paths[-1])  # fmt: skip
     return _joined(parts if any(kinds) else _on_one_clock(parts))
+
+
+def describe_own(path: Path, kind: str) -> tuple[dict[str, Any], object]:
+    """Return what a file of the project's own format holds, in words and numbers, and its object.
+
+    Raises
+    ------
+    InputError
+        for a file that its reader refuses.
+    """
+    readers: dict[str, Callable[[Path], object]] = {
+        "errors": read_errors, "diagonals": read_diagonals, "sixdof": read_sixdof,
+        **{name: read for name, read in _OWN_READERS.items() if name},
+    }  # fmt: skip
+    data = readers[kind](path)
+    table = read_csv(path, (), (), ("*",))
+    columns = {name: _described(table, name) for name in table.columns}
+    return {"rows": len(table), "columns": columns, "comments": dict(table.metadata)}, data
+
+
+def _described(table: CsvTable, name: str) -> str:
+    """Return the range of a column of numbers, or how many labels another one has and the first of them."""
+    try:
+        values = table.numbers(name, empty=float("nan"))
+    except InputError:
+        labels = list(dict.fromkeys(table.columns[name]))
+        return ", ".join(labels[:_SHOWN_LABELS]) + (f" ... ({len(labels)})" if len(labels) > _SHOWN_LABELS else "")
+    known = values[np.isfinite(values)]
+    return f"{known.min():.6g} to {known.max():.6g}" if known.size else "empty"
 
 
 def _on_one_clock(parts: Sequence[Plain]) -> list[Plain]:

@@ -29,6 +29,7 @@ _SAMPLE_LINES, _SAMPLE_CHARACTERS, _HEADER_LINES = 200, 20_000, 200
 _MEASURED_ROWS = 5_000
 #: A number in any way of writing; which one it is turns out later.
 _NUMERAL = re.compile(r"[+\-\u2212]?(\d[\d.,' \u00a0\u202f]*)?[.,]?\d(e[+\-]?\d+)?", re.IGNORECASE)
+_SQUARENESS = re.compile(r"(?i)rechtwinkl|square|perpendic|equerr|ortogonal|\u5782\u76f4|E[ABC]0[YZ]")
 _ALL_WORDS = frozenset(word for words in FIELDS.values() for word in words)
 #: What stands in a row of units where there is none.
 _NO_UNIT = ("", "-", "\u2013", "--", "/", "1")
@@ -424,6 +425,15 @@ def _check_beside(grid: Grid, start: int, end: int, least: int = 1) -> None:
         if count >= least and not _is_summary(grid, k + 1 - count):
             message = "rows of numbers stand here that do not belong to the table: put each table into a file or sheet of its own"
             raise grid.fail(message, grid.lines[k + 1 - count])
+
+
+def holds_readings(grid: Grid) -> bool:
+    """Whether a sheet holds what looks like data: two rows or more with two numbers, no statistics; or numbers of squareness."""
+    counts = [sum(parse_number(cell) is not None for cell in row) for row in grid.rows]
+    labels = [next(iter(_filled(row)), "") for row in grid.rows]
+    data = [k for k, count in enumerate(counts) if count >= 2 and statistic_in(labels[k]) is None]
+    text = " ".join([*grid.notes, *(cell for row in grid.rows for cell in row)])
+    return (len(data) >= 2 and not _is_summary(grid, data[0])) or (any(counts) and _SQUARENESS.search(text) is not None)
 
 
 def _is_summary(grid: Grid, first: int) -> bool:

@@ -15,7 +15,7 @@ from compgen.imports.capture import MOST_BYTES as MOST_CAPTURE
 from compgen.imports.capture import is_capture
 from compgen.imports.columns import check_field
 from compgen.imports.ecmc import is_ecmc
-from compgen.imports.grid import grid_of_text
+from compgen.imports.grid import grid_of_text, holds_readings
 from compgen.imports.instruments import import_capture, import_ecmc, import_exchange, import_renishaw
 from compgen.imports.renishaw import REFUSED, is_renishaw_text
 from compgen.imports.result import Imported, ImportOptions
@@ -112,9 +112,18 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
     item = READERS[form](source, chosen)
     if not item.doubts and isinstance(item.data, AxisRuns | Deviations):
         check_largest(item.data.deviation_mm, item.data.origin)
+    _check_ignored(source, chosen, item)
     if chosen.kind is not None and item.kind != chosen.kind:
         raise InputError(f"holds {item.kind}, not {chosen.kind}", file=source, field="--kind")
     return item
+
+
+def _check_ignored(path: Path, options: ImportOptions, item: Imported) -> None:
+    """Refuse a name after --ignore that is neither a column nor a sheet: it would hide what the user meant."""
+    text = f"{item.understood} {item.notes}"
+    for name in options.ignore:
+        if name not in text:
+            raise InputError(f"there is no column or sheet {name!r}", file=path, field="--ignore")
 
 
 def _check_options(path: Path, form: str, options: ImportOptions) -> None:
@@ -139,20 +148,35 @@ def _import_text(path: Path, options: ImportOptions) -> Imported:
 def _import_workbook(path: Path, options: ImportOptions) -> Imported:
     sheets, hidden = read_sheets(path, options.sheet)
     aside = tuple(f"sheet {shown(name)} is hidden and was left out; --sheet takes it" for name in hidden)
+    left_out = [name for name, _ in sheets if name in options.ignore]
+    aside += tuple(f"sheet {shown(name)} was left out by --ignore" for name in left_out)
+    sheets = [sheet for sheet in sheets if sheet[0] not in left_out]
+    if not sheets:
+        raise InputError("no sheet is left to read", file=path, field="--ignore")
     one = chosen_sheet(path, sheets, options.sheet)
     if one is not None:
         item = _of_sheet(import_table(one[1], options, "xlsx"), one[0])
         return replace(item, notes=(*item.notes, *aside))
-    read, reasons = [], []
+    read, reasons, open_sheets = [], [], []
     for name, grid in sheets:
         try:
             read.append((name, _of_sheet(import_table(grid, options, "xlsx"), name)))
         except CompgenError as error:
-            reasons.append(f"{shown(name)}: {error}")
+            reason = f"sheet left out: {shown(name)}: {error}"
+            if holds_readings(grid):
+                reason = (
+                    f"sheet {shown(name)} holds numbers that are not understood ({error}); take one sheet with --sheet, or "
+                    f"leave it out: --ignore {shown(name)}"
+                )
+                open_sheets.append(reason)
+            else:
+                reasons.append(reason)
     if not read:
-        raise InputError(f"no sheet holds a table that can be read: {'; '.join(reasons)}"[:1000], file=path)
+        raise InputError(
+            f"no sheet holds a table that can be read: {'; '.join([*reasons, *open_sheets])}"[:1000], file=path
+        )
     item = merged_sheets(read)
-    return replace(item, notes=(*item.notes, *aside, *(f"sheet left out: {reason}" for reason in reasons)))
+    return replace(item, doubts=(*item.doubts, *open_sheets), notes=(*item.notes, *aside, *reasons))
 
 
 def _of_sheet(item: Imported, name: str) -> Imported:

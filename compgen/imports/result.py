@@ -75,6 +75,7 @@ class Imported:
     doubts : what the file does not settle; until the user has said it, no other command takes the file as it is.
     notes : remarks that do not stand in the way.
     reversal : difference of both directions, where ``data`` holds only their mean.
+    beside : errors on other sheets of a workbook of axis runs (squareness, straightness).
     """
 
     path: Path
@@ -85,6 +86,7 @@ class Imported:
     doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     reversal: ReversalCurves | None = None
+    beside: ErrorTable | None = None
 
     @property
     def file_name(self) -> str:
@@ -92,11 +94,19 @@ class Imported:
         return f"{self.path.stem}{SUFFIXES[self.kind]}"
 
     def check_settled(self) -> None:
-        """Raise InputError if something is in doubt."""
+        """Raise InputError if something is in doubt, or the file holds two measurements."""
         if self.doubts:
             raise InputError(
                 f"leaves open: {'; '.join(self.doubts)}. 'compgen import' shows what was understood and takes what is "
                 "missing; give its result to this command",
+                file=self.path,
+            )
+
+        if self.beside is not None:
+            names = ", ".join(self.beside.names)
+            raise InputError(
+                f"holds runs of axes and errors as well ({names}): 'compgen import --out DIR' writes a file of each; or take one "
+                "of them, with --ignore SHEET for the other",
                 file=self.path,
             )
 
@@ -105,6 +115,8 @@ class Imported:
         found = {self.file_name: _text_of(self.data)}
         if self.reversal is not None:
             found[f"{self.path.stem}.reversal.csv"] = format_reversal(self.reversal)
+        if self.beside is not None:
+            found[f"{self.path.stem}{SUFFIXES['errors']}"] = format_errors(self.beside)
         return found
 
     def summary(self) -> dict[str, Any]:

@@ -53,7 +53,8 @@ _DEVIATIONS = _words(
 )
 #: Words that say only that readings or deviations follow, or that a direction does.
 _FILLERS = _DEVIATIONS | _words(
-    """position positioning positional actual reading measured laser ist istwert
+    """position positioning positional systematic bidirectional unidirectional bi uni directional two one value values werte
+    wert systematische systematisch beidseitig beidseitige einseitig einseitige actual reading measured laser ist istwert
     istposition mesuree misurato medido lecture lettura lectura
     direction dir richtung sens direzione direccion in im de du di en der den the of and st nd rd th er eme way
     \u5b9e\u6d4b \u503c \u65b9\u5411"""

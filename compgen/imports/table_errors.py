@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,10 +11,14 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.names import ERROR_INDEX, ERROR_NAMES, SQUARENESS_NAMES, error_named
 from compgen.core.text import nearest
-from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, Column
+from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, Column, known_unit, split_name
 from compgen.imports.findings import Findings
+from compgen.imports.grid import Grid
 from compgen.imports.hypotheses import USUAL_URAD, usual_deviation_mm
-from compgen.imports.source import shown
+from compgen.imports.source import parse_number, shown
+
+#: An angle between two axes differs from 90 degrees by less.
+_MOST_DEG = 0.5
 
 
 def wide_errors(findings: Findings, columns: Mapping[str, Column]) -> ErrorTable:
@@ -117,3 +122,61 @@ def _finished(findings: Findings, curves: dict[str, Curve], squareness: dict[str
     turned = {name: Curve(curve.position_mm, sign * curve.value, curve.u) for name, curve in curves.items()}
     constants = {name: (sign * value, u) for name, (value, u) in squareness.items()}
     return ErrorTable(turned, constants, {"source": findings.table.grid.path.name})
+
+
+#: Names of squareness in sheets of laboratories: the pair of axes, the error of ISO 230-1, and the sign with which an angle
+#: above 90 degrees between the positive axes enters it.
+_PAIRS = {"XY": ("EC0Y", 1.0), "XZ": ("EB0Z", -1.0), "YZ": ("EA0Z", 1.0)}
+_PAIR = re.compile(
+    r"(?<![A-Z])([XYZ])\s*[-/\u2013_:]?\s*(?:ZU|TO|\u00c0|A|VS|AND|UND|ET|E|Y)?\s*[-/\u2013_]?\s*([XYZ])(?![A-Z])"
+)
+_ISO = re.compile(r"(?<![A-Z0-9])E_?([CBA])_?[0O]_?([YZ])(?![A-Z0-9])")
+
+
+def squareness_in(grid: Grid) -> tuple[ErrorTable, list[str]] | None:
+    """Return the squareness errors of a sheet that holds nothing else, rad, and what it leaves open; None for another sheet.
+
+    Each row has a name (EC0Y, or a pair of axes), a number and a unit, which may stand above. The sign of a bare pair is
+    never guessed; an angle in degrees near 90 shows it.
+    """
+    found: dict[str, tuple[float, float]] = {}
+    doubts: list[str] = []
+    above: dict[int, str] = {}
+    for row, line in zip(grid.rows, grid.lines, strict=True):
+        numbers = [n for n, cell in enumerate(row) if parse_number(cell) is not None]
+        label = " ".join(cell for n, cell in enumerate(row) if n not in numbers).upper()
+        if not numbers:
+            above |= {
+                n: unit for n, cell in enumerate(row) if (unit := known_unit(cell) or split_name(f"v {cell}").unit)
+            }
+            continue
+        called = next((cell for n, cell in enumerate(row) if cell and n not in numbers), "")
+        iso = {f"E{a}0{b}" for a, b in _ISO.findall(label)} & set(SQUARENESS_NAMES)
+        pairs = {"".join(sorted(pair)) for pair in _PAIR.findall(label)} & set(_PAIRS)
+        if len(numbers) != 1 or len(iso) + (0 if iso else len(pairs)) != 1:
+            return None
+        value = float(parse_number(row[numbers[0]]) or 0.0)
+        own = (
+            known_unit(cell) or split_name(f"v {cell}").unit for n, cell in enumerate(row) if n not in numbers and cell
+        )
+        unit = next((name for name in own if name in RAD_PER_ANGLE), above.get(numbers[0], ""))
+        if unit not in RAD_PER_ANGLE:
+            doubts.append(
+                f"line {line}: no unit of {shown(called)} stands in the file; write urad, arcsec, um/m or deg beside it"
+            )
+            continue
+        if iso:
+            name, rad = iso.pop(), value * RAD_PER_ANGLE[unit]
+        else:
+            name, sign = _PAIRS[pairs.pop()]
+            rad = sign * (value - 90.0) * RAD_PER_ANGLE[unit]
+            if unit != "deg" or abs(value - 90.0) > _MOST_DEG:
+                meaning = f"{name} > 0: the angle between the positive axes is {'more' if sign > 0 else 'less'} than 90 degrees"
+                doubts.append(
+                    f"line {line}: the sign of {shown(called)} is not known; write {name} in its place ({meaning})"
+                )
+                continue
+        if name in found:
+            raise grid.fail(f"{name} is one number, it stands here again", line)
+        found[name] = (rad, float("nan"))
+    return (ErrorTable({}, found, {"source": grid.path.name}), doubts) if found or doubts else None

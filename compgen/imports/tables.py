@@ -10,10 +10,11 @@ import numpy as np
 from compgen.core.axis_runs import AxisRuns, check_single
 from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
-from compgen.core.names import AXES, MM_PER_UM
+from compgen.core.names import AXES, MM_PER_UM, RAD_PER_URAD
 from compgen.core.reversal import ReversalCurves
 from compgen.core.text import doubled
 from compgen.errors import InputError
+from compgen.identify.axis_runs import POSITIONING, two_way_mean
 from compgen.imports.columns import error_columns, fields_of
 from compgen.imports.findings import Findings
 from compgen.imports.further import further_of, metadata_of
@@ -22,7 +23,7 @@ from compgen.imports.one_axis import OneAxis, check_error, errors_of
 from compgen.imports.result import Data, Imported, ImportOptions, Kind
 from compgen.imports.source import shown
 from compgen.imports.table_axis import axis_readings
-from compgen.imports.table_errors import long_errors, wide_errors
+from compgen.imports.table_errors import long_errors, squareness_in, wide_errors
 from compgen.imports.table_points import deviations_of, lengths_of
 
 #: So many lines above a table are shown.
@@ -30,7 +31,19 @@ _MOST_HEADER = 12
 
 
 def import_table(grid: Grid, options: ImportOptions, form: str = "table") -> Imported:
-    """Import one table; InputError if it is none or lacks what its kind needs."""
+    """Import one table, or a list of squareness errors; InputError if it is none or lacks what its kind needs."""
+    try:
+        return _import_table(grid, options, form)
+    except InputError:
+        found = squareness_in(grid)
+        if found is None:
+            raise
+    errors, doubts = found
+    understood = {"squareness_urad": {name: value / RAD_PER_URAD for name, (value, _) in errors.squareness.items()}}
+    return Imported(grid.path, form, "errors", errors, understood, tuple(doubts), grid.notes)
+
+
+def _import_table(grid: Grid, options: ImportOptions, form: str) -> Imported:
     table = find_table(grid, options.decimal)
     findings = Findings(table, fields_of(table.header, options.columns, options.ignore), options)
     findings.notes.extend(table.grid.notes)
@@ -169,16 +182,38 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
     names = ", ".join(shown(name) for name, _ in parts)
     if len(parts) == 1:
         return first
-    if kinds == {"axis"}:
+    doubts = [f"sheet {name}: {text}" for name, item in parts for text in item.doubts]
+    errors = [item.data for _, item in parts if isinstance(item.data, ErrorTable)]
+    beside = None
+    if kinds == {"axis"} or kinds == {"axis", "errors"}:
         data: Data = _joined_runs([item.data for _, item in parts if isinstance(item.data, AxisRuns)])
+        beside = _joined_errors(first, errors) if errors else None
+        doubts += _measured_twice(data, beside) if isinstance(data, AxisRuns) and beside else []
     elif kinds == {"errors"}:
-        data = _joined_errors(first, [item.data for _, item in parts if isinstance(item.data, ErrorTable)])
+        data = _joined_errors(first, errors)
     else:
         raise InputError(f"has several tables ({names}); choose one with --sheet", file=first.path)
     understood = {f"sheet {name}": dict(item.understood) for name, item in parts}
-    doubts = tuple(f"sheet {name}: {text}" for name, item in parts for text in item.doubts)
     notes = tuple(dict.fromkeys(text for _, item in parts for text in item.notes))
-    return replace(first, data=data, understood=understood, doubts=doubts, notes=notes)
+    kind: Kind = "errors" if kinds == {"errors"} else "axis"
+    return replace(first, kind=kind, data=data, understood=understood, doubts=tuple(doubts), notes=notes, beside=beside)
+
+
+def _measured_twice(runs: AxisRuns, beside: ErrorTable) -> list[str]:
+    """Ask about errors of another sheet that the runs give as well, with the largest difference."""
+    doubts = []
+    for axis in runs.axes:
+        name = POSITIONING[axis]
+        if name not in beside.curves:
+            continue
+        own = runs.axis == axis
+        mean, _, _ = two_way_mean(runs.position_mm[own], runs.direction[own], runs.deviation_mm[own])
+        away = mean.value - beside.curves[name].at(mean.position_mm)
+        doubts.append(
+            f"a sheet holds {name}, and the runs of {AXES[axis]} give it as well (their means differ by up to "
+            f"{np.abs(away).max() / MM_PER_UM:.3g} um); leave out one sheet with --ignore SHEET"
+        )
+    return doubts
 
 
 def _together(parts: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
