@@ -93,7 +93,7 @@ OWN = {
     "part": "# origin_mm = -400, -500, -120\nx_mm,y_mm,mx_mm,my_mm\n10,10,10.013,9.998\n10,250,9.999,250.006\n90,10,90,10\n",
     "axis": "axis,position_mm,direction,run,deviation_um\nX,-800,1,1,2.5\nX,0,1,1,-1\n",
     "deviations": "x_mm,y_mm,z_mm,dx_um\n-800,0,0,1\n0,0,0,2\n",
-    "diagonals": "diagonal,x_mm,y_mm,z_mm,deviation_um,run\nPPP,-800,-1000,-350,0,1\nPPP,0,0,0,7,1\n",
+    "diagonals": "diagonal,x_mm,y_mm,z_mm,direction,run,deviation_um\nPPP,-800,-1000,-350,1,1,0\nPPP,0,0,0,1,1,7\n",
 }
 
 
