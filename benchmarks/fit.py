@@ -8,11 +8,16 @@ curve, written as a quadratic form (the form that suits it best). The smoothness
 
 "no bound active": bounds are there and none is touched. "active": 0.8 of the largest value and 0.6 of the largest slope
 of each curve, so that every curve touches bounds.
+
+"with covariance" is what ``compgen run`` does: ``fit`` with the joint covariance of the nodes, the whole call (zeroing,
+search for the smoothness, solution, uncertainties, report), and its solution at the smoothness found, alone. The others get
+the programs of that smoothness and only solve.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 import warnings
 from collections.abc import Callable, Sequence
 
@@ -24,13 +29,21 @@ import scipy.sparse as sp
 import timing
 
 from compgen.core.csvio import FloatArray
-from compgen.fit.bounds import Bounds
+from compgen.core.error_table import Curve, ErrorTable
+from compgen.core.machine import Axis, Chain, Machine
+from compgen.core.names import CURVE_NAMES, SQUARENESS_NAMES, error_named
+from compgen.fit import FitOptions, fit, zero_ends
+from compgen.fit.bounds import Bounds, constraint_rows
+from compgen.fit.curve import prepare, smoothness, solve
 from compgen.fit.smooth import second_difference
 from compgen.fit.solve import solve_curves
 from compgen.fit.stacked import CurveProblem, Stack
-from compgen.model.evaluate import load_kernels
+from compgen.model import load_kernels, modelled_errors
 
 OURS, OSQP, CVXPY = "compgen", "OSQP cold", "cvxpy+Clarabel"
+WHOLE = "compgen.fit, whole call"
+#: More nodes than this no identification gives; the peers need minutes for them.
+MOST_CORRELATED = 101
 CURVES = 18
 #: Bounds so wide that no curve touches them.
 WIDE = 1.5
@@ -112,11 +125,10 @@ def with_cvxpy(programs: Sequence[Program]) -> list[FloatArray]:
     return found
 
 
-def referee(problems: Sequence[CurveProblem]) -> list[FloatArray]:
-    """Clarabel directly, unknowns scaled to 1 on the diagonal, as tight as it goes: the referee of the solution."""
+def referee(programs: Sequence[Program]) -> list[FloatArray]:
+    """Clarabel directly, unknowns scaled to 1 on the diagonal, as tight as it goes: the referee; returns the free nodes."""
     found = []
-    for problem in problems:
-        quadratic, linear, matrix, limit = program(problem)
+    for quadratic, linear, matrix, limit in programs:
         scale = 1 / np.sqrt(quadratic.diagonal())
         stretch = sp.diags_array(scale)
         settings = clarabel.DefaultSettings()
@@ -126,7 +138,7 @@ def referee(problems: Sequence[CurveProblem]) -> list[FloatArray]:
         cone = [clarabel.NonnegativeConeT(2 * len(limit))]
         inner = sp.triu(sp.csc_matrix(stretch @ quadratic @ stretch), format="csc")
         solver = clarabel.DefaultSolver(inner, scale * linear, rows, np.ones(2 * len(limit)), cone, settings)
-        found.append(_whole(problem, scale * np.array(solver.solve().x)))
+        found.append(scale * np.array(solver.solve().x))
     return found
 
 
@@ -135,7 +147,7 @@ def deviation(found: Sequence[FloatArray], expected: Sequence[FloatArray]) -> fl
     return max(float(np.abs(one - other).max()) for one, other in zip(found, expected, strict=True))
 
 
-def compare(n: int, runs: int, *, active: bool, slow: bool) -> None:
+def compare(n: int, runs: int, clock: timing.Clock, *, active: bool, slow: bool) -> None:
     """Time one case and print it; ``slow``: with the peers that need seconds here."""
     problems = curves(n, active=active)
     programs = [program(problem) for problem in problems]
@@ -146,10 +158,10 @@ def compare(n: int, runs: int, *, active: bool, slow: bool) -> None:
         functions[CVXPY] = lambda: with_cvxpy(programs)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        comparison = timing.alternate(functions, runs)
+        comparison = timing.alternate(functions, runs, clock)
         title = f"{CURVES} curves of {n} nodes, {'active bounds' if active else 'no bound active'}"
         timing.print_comparison(title, comparison, references=(OURS,))
-        expected = referee(problems)
+        expected = [_whole(problem, x) for problem, x in zip(problems, referee(programs), strict=True)]
         far = {OURS: f"{deviation(ours(problems), expected):.1e}"}
         for name in [name for name in functions if name != OURS]:
             whole = [_whole(problem, x) for problem, x in zip(problems, functions[name](), strict=True)]
@@ -158,18 +170,109 @@ def compare(n: int, runs: int, *, active: bool, slow: bool) -> None:
     print(f"  curves at a bound: {touched}; deviation from the referee, um: {far}")
 
 
+class Correlated:
+    """14 curves of n nodes each whose errors are correlated along the axis, as ``run`` fits them."""
+
+    def __init__(self, n: int, *, active: bool, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        travels = (800.0, 1000.0, 350.0)
+        axes = tuple(Axis((-travel, 0.0), np.linspace(-travel, 0.0, n)) for travel in travels)
+        self.machine = Machine("gantry", Chain("WFYXZT"), axes)
+        t = np.linspace(0, 1, n)
+        distance = np.abs(t[:, None] - t)
+        covariance = 0.09 * np.exp(-distance / 0.2) + 0.02 * np.eye(n)
+        root = np.linalg.cholesky(covariance)
+        curves, self.covariance = {}, {}
+        for k, name in enumerate(name for name in modelled_errors(self.machine) if name in CURVE_NAMES):
+            error = error_named(name)
+            unit = error.si_per_unit
+            y = 20 * np.sin(2 * np.pi * t + 0.1 * k) + 8 * np.sin(6 * np.pi * t + 0.3) + root @ rng.normal(size=n)
+            curves[name] = Curve(axes[error.axis].nodes_mm, unit * y, unit * np.sqrt(np.diag(covariance)))
+            self.covariance[name] = unit**2 * covariance
+        self.errors = ErrorTable(curves, {name: (0.0, 0.0) for name in SQUARENESS_NAMES})
+        self.options = FitOptions()
+        self.options = self._bounds((0.8, 0.6) if active else (WIDE, WIDE))
+        zeroed = zero_ends(self.machine, self.errors, self.covariance).curves
+        self.prepared = [prepare(name, held, self.options) for name, held in zeroed.items()]
+        self.mu = [smoothness(item, self.options).mu for item in self.prepared]
+
+    def _bounds(self, share: tuple[float, float]) -> FitOptions:
+        free = self.whole()
+        return FitOptions(
+            max_abs={name: share[0] * np.abs(c.value).max() for name, c in free.items()},
+            max_slope={
+                name: share[1] * np.abs(np.diff(c.value) / np.diff(c.position_mm)).max() for name, c in free.items()
+            },
+        )
+
+    def whole(self) -> dict[str, Curve]:
+        """Fit as ``run`` does; every curve by its name."""
+        found = fit(self.machine, self.errors, self.options, covariance=self.covariance)
+        return dict(found.errors.curves)
+
+    def at_smoothness(self) -> list[FloatArray]:
+        """Solve at the smoothness that was found; um and urad."""
+        return [solution.curve for solution in solve(self.prepared, self.mu)]
+
+    def programs(self) -> list[Program]:
+        """The same for the peers."""
+        found = []
+        for item, mu in zip(self.prepared, self.mu, strict=True):
+            nodes = item.smoother.nodes
+            rows = constraint_rows(item.held.position_mm, item.smoother, *item.bounds.limits, item.bounds.direction)
+            used = np.flatnonzero(np.isfinite(rows.upper))
+            quadratic = sp.csc_matrix(item.smoother.matrix(mu)[nodes][:, nodes])
+            linear = -item.smoother.load(item.y[:, None])[nodes, 0]
+            found.append((quadratic, linear, sp.csc_matrix(rows.matrix[used][:, nodes]), rows.upper[used]))
+        return found
+
+
+def compare_correlated(n: int, runs: int, clock: timing.Clock, *, active: bool) -> None:
+    """Time the fit with covariance and print it."""
+    case = Correlated(n, active=active)
+    programs = case.programs()
+    functions: dict[str, Callable[[], object]] = {
+        WHOLE: case.whole,
+        OURS: case.at_smoothness,
+        OSQP: lambda: with_osqp(programs),
+        CVXPY: lambda: with_cvxpy(programs),
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        comparison = timing.alternate(functions, runs, clock)
+        title = (
+            f"{len(programs)} curves of {n} nodes with covariance, {'active bounds' if active else 'no bound active'}"
+        )
+        timing.print_comparison(title, comparison, references=(WHOLE, OURS))
+        expected = referee(programs)
+        smoothers = [item.smoother for item in case.prepared]
+        ours_free = [curve[s.nodes] for curve, s in zip(case.at_smoothness(), smoothers, strict=True)]
+        far = {
+            OURS: f"{deviation(ours_free, expected):.1e}",
+            OSQP: f"{deviation(with_osqp(programs), expected):.1e}",
+            CVXPY: f"{deviation(with_cvxpy(programs), expected):.1e}",
+        }
+    solvers = sorted({solution.solver for solution in solve(case.prepared, case.mu)})
+    print(f"  solved by {', '.join(solvers)}; deviation from the referee, um: {far}")
+
+
 def main() -> None:
     """Run all cases."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=5, help="rounds, at least 5")
     parser.add_argument("--nodes", type=int, nargs="*", default=[11, 51, 101, 301, 1001], help="nodes per curve")
     parser.add_argument("--slow", action="store_true", help="also the peers that need many seconds for a case")
+    parser.add_argument("--cpu", action="store_true", help="processor time instead of time: for a busy computer")
     arguments = parser.parse_args()
+    clock = time.process_time if arguments.cpu else time.perf_counter
     print(timing.machine_line(("numpy", "scipy", "osqp", "clarabel", "cvxpy")))
-    print("  compiled loops loaded beforehand, as after an identification:", load_kernels())
+    print("  compiled loops (COMPGEN_KERNELS=compiled; curves without covariance alone have some):", load_kernels())
+    for active in (False, True):
+        for n in [nodes for nodes in arguments.nodes if nodes <= MOST_CORRELATED]:
+            compare_correlated(n, arguments.runs, clock, active=active)
     for active in (False, True):
         for n in arguments.nodes:
-            compare(n, arguments.runs, active=active, slow=arguments.slow or n <= 101)
+            compare(n, arguments.runs, clock, active=active, slow=arguments.slow or n <= 101)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import importlib
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import scipy.sparse as sp
 from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scipy.optimize import linprog, minimize
+from scipy.optimize import linprog, minimize, nnls
 from scipy.stats import multivariate_normal
 
 import compgen
@@ -78,6 +79,17 @@ def cost_of(problem, c):
     return np.sum(problem.weight * (c - problem.y) ** 2) + problem.mu * np.sum(bend**2)
 
 
+def bounds_of(position, c, shares=(), direction=0, held=None):
+    """Bounds at the given shares of what a curve needs."""
+    needs = {
+        "max_abs": np.abs(c).max(),
+        "max_slope": np.abs(np.diff(c) / np.diff(position)).max(),
+        "max_curvature": np.abs((curvature(position) * np.stack([c[:-2], c[1:-1], c[2:]], 1)).sum(1)).max(),
+    }
+    limits = {name: share * needs[name] for name, share in dict(shares).items()}
+    return Bounds(**limits, direction=direction)
+
+
 def case(n, mu, seed, held=None, shares=(), direction=0):
     """A wavy curve with bounds at the given shares of what it needs without them."""
     rng = np.random.default_rng(seed)
@@ -88,13 +100,7 @@ def case(n, mu, seed, held=None, shares=(), direction=0):
     y[list(held)] = 0
     problem = CurveProblem(position, y, rng.uniform(0.5, 2, n), held, mu)
     c = Stack.build([problem]).solve()
-    needs = {
-        "max_abs": np.abs(c).max(),
-        "max_slope": np.abs(np.diff(c) / np.diff(position)).max(),
-        "max_curvature": np.abs((curvature(position) * np.stack([c[:-2], c[1:-1], c[2:]], 1)).sum(1)).max(),
-    }
-    limits = {name: share * needs[name] for name, share in dict(shares).items()}
-    return CurveProblem(position, y, problem.weight, held, mu, Bounds(**limits, direction=direction))
+    return CurveProblem(position, y, problem.weight, held, mu, bounds_of(position, c, shares, direction))
 
 
 KINDS = [
@@ -468,6 +474,72 @@ def test_bounds_hold_with_correlated_nodes_and_the_optimum_is_clarabels():
     )
     assert found.touched.any()
     assert found.curve == pytest.approx(c.value, abs=1e-5)
+
+
+def correlated_with_bounds(kind, seed):
+    """A curve with correlated nodes within bounds that it touches: held at both ends, at a node, or between two."""
+    rng = np.random.default_rng(100 * kind + seed)
+    n = (4, 9, 15, 31, 60)[seed % 5]
+    position = np.cumsum(rng.uniform(5, 20, n))
+    ends = ((position[0], position[-1]), (position[n // 2],), (0.3 * position[1] + 0.7 * position[2],))[seed % 3]
+    if "direction" in KINDS[kind]:
+        ends = ends[-1:]
+    held = tuple(interpolation_row(position, at) for at in ends)
+    distance = np.abs(position[:, None] - position)
+    covariance = (np.exp(-distance / 60) + 0.2 * np.eye(n)) * rng.uniform(0.05, 0.5)
+    smoother = CorrelatedSmoother.of(Smoother.build(position, np.ones(n), held), covariance / 0.25)
+    mu = min(10.0 ** rng.uniform(-2, 3), smoother.largest_mu)
+    wave = 10 * np.sin(3 * position / np.ptp(position) + seed) + rng.normal(size=n)
+    y = smoother.expand(wave[:, None])[:, 0]
+    problem = CurveProblem(position, y, np.ones(n), (), mu, Bounds())
+    free = smoother.solve(mu, y[:, None])[:, 0]
+    return replace(problem, bounds=bounds_of(position, free, **KINDS[kind])), smoother, covariance
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("kind", range(len(KINDS)))
+def test_correlated_curves_within_bounds_meet_the_optimality_conditions_and_the_general_solver(kind, seed, monkeypatch):
+    problem, smoother, covariance = correlated_with_bounds(kind, seed)
+    found = solve_general(problem, smoother)
+    assert found.solver in ("direct", "active set")
+    monkeypatch.setattr(CorrelatedSmoother, "inverse_root", lambda self, mu: None)
+    general = solve_general(problem, smoother)
+    assert general.solver == ("direct" if found.solver == "direct" else "OSQP")
+    assert found.curve == pytest.approx(general.curve, abs=1e-8)
+    excess = problem.bounds.excess(problem.position_mm, found.curve)
+    limits = (*problem.bounds.limits, np.abs(problem.y).max() / np.ptp(problem.position_mm))
+    assert all(over <= KEPT * limit for over, limit in zip(excess, limits, strict=True) if over)
+    # the gradient by the free nodes, with the inverse of the covariance, is a sum of active rows with multipliers >= 0
+    nodes = smoother.nodes
+    weight = 0.25 * np.linalg.inv(covariance[np.ix_(nodes, nodes)])
+    d2 = np.zeros((len(problem.y) - 2, len(problem.y)))
+    for k, row in enumerate(second_difference(problem.position_mm)):
+        d2[k, k : k + 3] = row
+    turned = d2 @ smoother.turn
+    gradient = weight @ (found.curve - problem.y)[nodes] + problem.mu * turned.T @ (turned @ found.curve[nodes])
+    rows = constraint_rows(problem.position_mm, smoother, *problem.bounds.limits, problem.bounds.direction)
+    touched = np.flatnonzero(found.touched)
+    signed = rows.matrix.toarray()[touched][:, nodes] * found.touched[touched, None]
+    left = nnls(signed.T, -gradient)[1] if len(touched) else np.linalg.norm(gradient)
+    assert left <= 1e-7 * np.linalg.norm(weight @ problem.y[nodes])
+
+
+def test_misfit_and_bending_of_correlated_nodes_are_those_of_the_fitted_curve():
+    for held_at_one in (False, True):
+        _, y, covariance, smoother, _ = correlated_case(n=12, seed=4)
+        if held_at_one:
+            position = np.cumsum(np.random.default_rng(4).uniform(5, 20, 12))
+            at = interpolation_row(position, 0.4 * position[3] + 0.6 * position[4])
+            smoother = CorrelatedSmoother.of(Smoother.build(position, np.ones(12), (at,)), covariance)
+            y = smoother.expand(y[:, None])[:, 0]
+        costs = smoother.costs(y)
+        for mu in (0.0, 1e-3, 1.0, 1e4):
+            curve = smoother.solve(mu, y[:, None])[:, 0]
+            expected = smoother.misfit(y - curve), float(np.sum(smoother.bend(curve[:, None]) ** 2))
+            assert costs(mu) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+            root = smoother.inverse_root(mu)
+            load = np.random.default_rng(1).normal(size=(12, 1))
+            assert root @ (root.T @ smoother.load(load)) == pytest.approx(smoother.solve(mu, load), abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,12 @@
-"""One bounded curve by a general solver: where the banded method does not apply, or did not pass its check.
+"""One bounded curve by itself: where the banded method does not apply, or did not pass its check.
 
 minimise x^T A x / 2 - x^T g   subject to   lower <= G x <= upper
 
 in the unknowns of the smoother, with g = Z^T W y. The zero curve satisfies every bound, so the program always has a
-solution. The solver's result serves to find the active bounds; with these as equations the system is solved directly,
+solution. For correlated nodes a root F of the inverse of A is at hand, and the program is that of the point nearest to
+the free optimum, x = free + F d with the least |d|; its multipliers are a non-negative least-squares problem (Lawson &
+Hanson 1974, Solving Least Squares Problems, chapter 23). Other curves go to a general solver.
+The result serves to find the active bounds; with these as equations the system is solved directly,
 and the Karush-Kuhn-Tucker conditions (every bound kept, every multiplier of the right sign) prove that it is the
 optimum. Where the active bounds depend on one another, so that their multipliers are not unique, the solver's own curve
 is taken if its duality gap is closed.
@@ -25,6 +28,9 @@ from compgen.fit.bounds import KEPT, Rows
 from compgen.fit.smooth import Smoother
 
 _SIGN = 1e-9
+#: Combinations of active rows that reach less than this fraction of the largest take no part.
+_DEPENDENT = 1e-13
+ACTIVE_SET = "active set"
 #: Largest duality gap, as a fraction of what the bounds cost, of a solution whose active rows depend on one another.
 _GAP = 1e-8
 
@@ -66,6 +72,11 @@ def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: Rows) -> Bou
         when no solver's result passes the optimality conditions.
     """
     free = smoother.solve(mu, y[:, None])[:, 0]
+    root = smoother.inverse_root(mu)
+    if root is not None:
+        found = _active_set(smoother, mu, free, rows, _nearest(root, free, rows))
+        if found is not None:
+            return Bounded(*found, ACTIVE_SET)
     for solver, call in SOLVERS.items():
         start = _start(smoother, mu, y, rows, call)
         if start is None:
@@ -78,6 +89,34 @@ def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: Rows) -> Bou
     raise ConvergenceError(
         "the bounded fit found no optimum that passes its check; loosen the bounds or the smoothness"
     )
+
+
+def _nearest(root: FloatArray, free: FloatArray, rows: Rows) -> FloatArray:
+    """Active rows (-1, 0, 1) of the point within the bounds that is nearest to the free optimum; a good guess at least.
+
+    With d in units of the greatest excess e, the rows G F over their lengths and the right side h = (G free - limit)/e,
+    min |d| subject to -G F d >= h has the multipliers u of min |(-G F)^T u|^2 + (h^T u - 1)^2, u >= 0.
+    """
+    from scipy.optimize import nnls  # imported here: slow to load
+
+    reach, value = rows.dense @ root, rows.dense @ free
+    length = np.linalg.norm(reach, axis=1)
+    above, below = (np.flatnonzero(np.isfinite(limit) & (length > 0)) for limit in (rows.upper, rows.lower))
+    row = np.concatenate([above, below])
+    excess = np.concatenate([value[above] - rows.upper[above], rows.lower[below] - value[below]]) / length[row]
+    sign = np.repeat([1.0, -1.0], [len(above), len(below)])
+    active = np.zeros(len(value))
+    if not excess.max(initial=0.0) > 0.0:
+        return active
+    excess /= excess.max()
+    system = np.vstack([-(sign / length[row]) * reach[row].T, excess])
+    try:
+        multiplier = nnls(system, np.append(np.zeros(reach.shape[1]), 1.0))[0]
+    except RuntimeError:  # too many steps: the rows most outside their limits are where the search begins
+        multiplier = np.maximum(excess, 0.0)
+    chosen = multiplier > _SIGN * multiplier.max()
+    active[row[chosen]] = sign[chosen]
+    return active
 
 
 def _touched(multiplier: FloatArray) -> FloatArray:
@@ -109,7 +148,7 @@ def _start(
     multiplier = np.zeros(rows.matrix.shape[0])
     multiplier[used] = found[1]
     curve = smoother.expand((scale * found[0])[:, None])[:, 0]
-    values = np.asarray(rows.matrix @ curve)
+    values = rows.dense @ curve
     limit = np.where(values > 0, rows.upper, -rows.lower)
     share = np.where((limit > 0) & np.isfinite(limit), np.abs(values) / np.where(limit > 0, limit, 1.0), 0.0)
     return _Start(
@@ -160,7 +199,7 @@ def _is_optimal(smoother: Smoother, mu: float, free: FloatArray, rows: Rows, sta
         return False
     e, v = start.curve - free, start.multiplier
     cost = 0.5 * float(e @ smoother.apply(mu, e[:, None])[:, 0])
-    pull = np.asarray(rows.matrix.T @ v)
+    pull = rows.dense.T @ v
     reach = smoother.inverse(mu, pull[:, None])[:, 0]
     limit = np.where(v > 0, rows.upper, rows.lower)
     value = float(pull @ free - np.sum(np.where(v != 0, v * limit, 0.0)) - 0.5 * pull @ reach)
@@ -181,7 +220,7 @@ def _active_set(
         target = np.where(sign > 0, rows.upper[picked], -rows.lower[picked])
         if not np.isfinite(target).all():
             return None
-        signed = rows.matrix[picked].toarray() * sign[:, None]
+        signed = rows.dense[picked] * sign[:, None]
         curve, multiplier = _equalities(smoother, mu, free, signed, target)
         if len(picked) and multiplier.min() < -_SIGN * np.abs(multiplier).max():
             active[picked[np.argmin(multiplier)]] = 0.0
@@ -208,10 +247,13 @@ def _equalities(
     reach = smoother.inverse(mu, signed.T)
     schur = signed @ reach
     scale = 1 / np.sqrt(np.maximum(np.diag(schur), np.finfo(float).tiny))
-    scaled, spread = schur * scale * scale[:, None], reach * scale
+    spread = reach * scale
+    value, vector = np.linalg.eigh(schur * scale * scale[:, None])
+    used = value > _DEPENDENT * value[-1]
+    value, vector = value[used], vector[:, used]
     curve, multiplier = free, np.zeros(len(signed))
     for _ in range(3):
-        more = np.linalg.lstsq(scaled, scale * (signed @ curve - target), rcond=1e-13)[0]
+        more = vector @ (vector.T @ (scale * (signed @ curve - target)) / value)
         curve = smoother.expand((curve - spread @ more)[:, None])[:, 0]
         multiplier = multiplier + more
     return curve, multiplier

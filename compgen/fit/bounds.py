@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -65,18 +65,23 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Rows:
-    """lower <= matrix @ x <= upper in the smoother's unknowns: matrix (m, n), limits (m,).
+    """lower <= dense @ x <= upper in the smoother's unknowns: dense (m, n), limits (m,).
 
     n values come first, then n - 1 slopes, then n - 2 curvatures, each over its bound; rows without limits are zero.
     """
 
-    matrix: sp.csr_array
+    dense: FloatArray
     lower: FloatArray
     upper: FloatArray
 
+    @cached_property
+    def matrix(self) -> sp.csr_array:
+        """The rows as the general solvers want them: sparse."""
+        return sp.csr_array(self.dense)
+
     def excess(self, curve: FloatArray) -> FloatArray:
         """Amount (m,) by which a curve is above (positive) or below (negative) its limits, else 0."""
-        values = np.asarray(self.matrix @ curve)
+        values = self.dense @ curve
         return np.maximum(values - self.upper, 0.0) + np.minimum(values - self.lower, 0.0)
 
 
@@ -106,30 +111,22 @@ def constraint_rows(
     """Rows of a curve's bounds in the smoother's unknowns."""
     n = len(position_mm)
     bounds = Bounds(largest, steepest, most_bent, direction)
-    turn: Any = sp.csr_array(smoother.expand(np.eye(n)))
+    turn = smoother.expand(np.eye(n))
     step = np.diff(position_mm)
     typical = 1.0 / float(np.ptp(position_mm)) if n > 1 else 1.0
     scale, low, high = slope_limits(bounds, typical)
     if math.isinf(low) and math.isinf(high):
         scale = math.inf
-    slopes = _band(np.stack([-1 / step, 1 / step], axis=1) / scale, n)
-    bends = _band(curvature(position_mm) / most_bent, n)
-    matrix = sp.csr_array(sp.vstack([turn / largest, slopes @ turn, bends @ turn]))
-    matrix.data[np.abs(matrix.data) < 1e-13 * np.abs(matrix.data).max(initial=0.0)] = 0.0
-    matrix.eliminate_zeros()
+    slopes = np.diff(turn, axis=0) / (step[:, None] * scale)
+    first, middle, last = (curvature(position_mm) / most_bent).T[:, :, None]
+    bends = first * turn[:-2] + middle * turn[1:-1] + last * turn[2:]
+    dense = np.concatenate([turn / largest, slopes, bends])
+    dense[np.abs(dense) < 1e-13 * np.abs(dense).max(initial=0.0)] = 0.0
     count = (n, max(n - 1, 0), max(n - 2, 0))
     lower = np.repeat([-1.0, low, -1.0], count)
     upper = np.repeat([1.0, high, 1.0], count)
-    empty = np.diff(matrix.indptr) == 0
-    return Rows(matrix, np.where(empty, -math.inf, lower), np.where(empty, math.inf, upper))
-
-
-def _band(coefficients: FloatArray, n: int) -> Any:
-    """Sparse matrix (m, n) whose row k holds its coefficients from column k on."""
-    m, width = coefficients.shape
-    row = np.repeat(np.arange(m), width)
-    column = row + np.tile(np.arange(width), m)
-    return sp.csr_array((coefficients.ravel(), (row, column)), shape=(m, n))
+    empty = ~dense.any(axis=1)
+    return Rows(dense, np.where(empty, -math.inf, lower), np.where(empty, math.inf, upper))
 
 
 def active_bounds(position_mm: FloatArray, active: FloatArray, bounds: Bounds) -> tuple[ActiveBound, ...]:

@@ -9,7 +9,7 @@ Q^T L^-1. Dense, O(n^3) once per curve.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -108,6 +108,24 @@ class CorrelatedSmoother(Smoother):
         """r^T W r for residuals (n,)."""
         white = solve_triangular(self.root, residual[self.nodes], lower=True)
         return float(white @ white)
+
+    def costs(self, y: FloatArray) -> Callable[[float], tuple[float, float]]:
+        """Return misfit and |D2 c|^2 as a function of mu; along Q both are sums over the components t of the data.
+
+        With t = Q^T L^-1 y the fitted curve has the components t/(1 + mu s^2), for zeroed data.
+        """
+        power = (self.basis.T @ solve_triangular(self.root, y[self.nodes], lower=True)) ** 2
+
+        def at(mu: float) -> tuple[float, float]:
+            damping = 1 / (1 + mu * self.strength)
+            bent = self.strength * damping
+            return mu**2 * float(power @ bent**2), float(power @ (bent * damping))
+
+        return at
+
+    def inverse_root(self, mu: float) -> FloatArray:
+        """F (n, m) with F F^T = Z A^-1 Z^T: L Q (1 + mu s^2)^-1/2."""
+        return np.asarray(self.turn @ (self.root @ (self.basis / np.sqrt(1 + mu * self.strength))))
 
     def matrix(self, mu: float) -> sp.csc_array:
         """A (n, n) with 1 on the diagonal of eliminated unknowns."""

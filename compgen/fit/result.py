@@ -42,8 +42,8 @@ class CurveReport:
     smoothing_bias_max, smoothing_bias_rms : how much the smoothing flattens a curve like the fitted one, S c - c.
     smoothing_bias : the same per position, shape (n,).
     active_bounds : where the curve touches a bound.
-    solver : ``direct``; ``interior point`` when a bound is active (``OSQP`` or ``Clarabel`` where that does not apply or
-        fails); ``cvxpy`` with constraints of your own.
+    solver : ``direct``; ``interior point`` when a bound is active, ``active set`` when nodes are correlated as well
+        (``OSQP`` or ``Clarabel`` where neither applies, or fails); ``cvxpy`` with constraints of your own.
     correlated : whether the covariance of the nodes was used.
     distrusted_mm : nodes that a robust loss gave less than their weight.
     """

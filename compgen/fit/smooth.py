@@ -7,7 +7,7 @@ unknown keeps its place in the arrays, with 1 on the diagonal and 0 beside it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -220,6 +220,19 @@ class Smoother:
     def misfit(self, residual: FloatArray) -> float:
         """Weighted square sum of residuals (n,)."""
         return float(np.sum(self.weight * residual**2))
+
+    def costs(self, y: FloatArray) -> Callable[[float], tuple[float, float]]:
+        """Return the function of mu that gives the weighted square sum of y - c and |D2 c|^2 of the fitted curve c."""
+
+        def at(mu: float) -> tuple[float, float]:
+            c = self.solve(mu, y[:, None])
+            return self.misfit(y - c[:, 0]), float(np.sum(self.bend(c) ** 2))
+
+        return at
+
+    def inverse_root(self, mu: float) -> FloatArray | None:
+        """F (n, m) with F F^T = Z A^-1 Z^T where it is at hand; None here, where only bands are."""
+        return None
 
     def matrix(self, mu: float) -> sp.csc_array:
         """A (n, n) with 1 on the diagonal of eliminated unknowns."""

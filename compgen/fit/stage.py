@@ -8,6 +8,7 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import error_named
+from compgen.core.threads import one_thread
 from compgen.errors import InputError
 from compgen.fit.correlated import curve_covariances
 from compgen.fit.curve import Prepared, Weighted, finish, prepare, smoothness, solve
@@ -56,6 +57,17 @@ def fit(
     ConvergenceError
         when the bounded fit does not pass its check.
     """
+    with one_thread():
+        return _fit(machine, errors, options, covariance, constraints)
+
+
+def _fit(
+    machine: Machine,
+    errors: ErrorTable,
+    options: FitOptions,
+    covariance: Covariance | Mapping[str, FloatArray] | None,
+    constraints: OwnConstraints | None,
+) -> FitResult:
     blocks = curve_covariances(errors, covariance) if covariance is not None else {}
     zeroed = zero_ends(machine, _as_independent(machine, errors, blocks), blocks)
     prepared, weighted = _prepared(zeroed.curves, options)

@@ -28,20 +28,22 @@ _ROUNDING = 1e-12
 
 def reml_criterion(smoother: Smoother, y: FloatArray, u0: float) -> Callable[[float], float]:
     """J of the module's page as a function of mu, for data (n,) with the scale ``u0`` of their uncertainty."""
+    costs = smoother.costs(y)
 
     def value(mu: float) -> float:
-        c = smoother.solve(mu, y[:, None])
-        misfit = smoother.misfit(y - c[:, 0]) + mu * np.sum(smoother.bend(c) ** 2)
-        return float(np.sum(np.log1p(mu * smoother.eigenvalues)) - smoother.rank * np.log(mu) + misfit / u0**2)
+        misfit, bending = costs(mu)
+        penalty = (misfit + mu * bending) / u0**2
+        return float(np.sum(np.log1p(mu * smoother.eigenvalues)) - smoother.rank * np.log(mu) + penalty)
 
     return value
 
 
 def gcv_criterion(smoother: Smoother, y: FloatArray) -> Callable[[float], float]:
     """V of the module's page as a function of mu, for data (n,)."""
+    costs = smoother.costs(y)
 
     def value(mu: float) -> float:
-        misfit = smoother.misfit(y - smoother.solve(mu, y[:, None])[:, 0])
+        misfit, _ = costs(mu)
         left = np.sum(mu * smoother.eigenvalues / (1 + mu * smoother.eigenvalues))
         return float(smoother.unknowns * misfit / left**2)
 
