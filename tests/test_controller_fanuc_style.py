@@ -255,6 +255,43 @@ def test_a_control_that_the_files_would_not_suit_is_refused(controls_files, make
         export(machine, make_errors(machine), "fanuc-pitch")
 
 
+@pytest.mark.parametrize("number", [3620, 3621, 3622])
+def test_an_axis_whose_points_are_not_known_is_refused(controls_files, make_errors, number):
+    """Without its 3621 the rotary axis A4 would seem to have no points, and lose those that it has."""
+    path = Path(controls_files[0])
+    path.write_text(re.sub(rf"(N0{number}.*)A4P\d+", r"\1", PARAMETERS))
+    machine = controls_machine(controls_files)
+    with pytest.raises(InputError, match=f"axis A4 has a value here, but none for {number}") as caught:
+        export(machine, make_errors(machine), "fanuc-pitch")
+    assert caught.value.line
+    path.write_text("\n".join(row for row in PARAMETERS.split("\n") if f"N0{number}" not in row))
+    with pytest.raises(InputError, match="could be written over. Punch all parameters"):
+        export(machine, make_errors(machine), "fanuc-pitch")
+
+
+def test_points_of_an_axis_without_an_interval_are_kept(controls_files, make_errors):
+    Path(controls_files[0]).write_text(re.sub(r"(N03624.*)A4P[\d.]+", r"\1", PARAMETERS))
+    machine = controls_machine(controls_files)
+    assert (
+        "The sample has A4: points 300 to 312; they stay."
+        in export(machine, make_errors(machine), "fanuc-pitch").preflight
+    )
+
+
+def test_comments_of_the_sample_may_be_in_any_language(controls_files, make_errors):
+    path = Path(controls_files[0])
+    for comment in (
+        "(GEPR\u00dcFT)".encode("latin-1"),
+        "(\u041f\u0420\u041e\u0412\u0415\u0420\u0415\u041d\u041e)".encode(),
+    ):
+        path.write_bytes(PARAMETERS.encode().replace(b"%\n", b"%\n" + comment + b"\n", 1))
+        machine = controls_machine(controls_files)
+        assert export(machine, make_errors(machine), "fanuc-pitch").violations == []
+    path.write_bytes(PARAMETERS.encode().replace(b"A4P301", b"A4P\xa0301"))
+    with pytest.raises(InputError, match="not ASCII"):
+        export(machine, make_errors(machine), "fanuc-pitch")
+
+
 def test_reading_asks_where_the_file_has_a_table_of_each_direction(controls_files):
     Path(controls_files[0]).write_text(PARAMETERS.replace("N03605Q1A1P00000010", "N03605Q1A1P00000011"))
     machine = controls_machine(controls_files)

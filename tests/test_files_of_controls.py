@@ -652,3 +652,23 @@ def test_diff_follows_a_file_of_the_control_and_shows_remarks(tmp_path, capsys):
     assert run_command(cli, [str(word) for word in words]) == 0
     data = json.loads(capsys.readouterr().out)
     assert any("axis A4" in remark for remark in data["remarks_a"]) and data["remarks_a"] == data["remarks_b"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["G90 G64 G500", "N10 G71 G40 D0", "SUPA", "ANFANG:", "DEF REAL _HUB, _SAG", "DEF STRING[32] _TEXT", "DISPLOF",
+     "EXTERN L99 (REAL, INT)", "G4 F0.5", 'MSG("bitte warten")'],
+)  # fmt: skip
+def test_words_without_a_value_that_cannot_change_a_table_are_passed_over(tmp_path, line):
+    read(tmp_path, SPF.replace("STOPRE", line), name="KOMP.SPF")
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["G70", "G90 G700", "$AN_CEC_STEP[2] 475", "$AN_CEC[2,1] 0.004", "GOTOF ENDE", "L99", "L99(0.5)", "DEF REAL _X=$AN_CEC[2,1]",
+     "R1=5", "IF _X > 3", "G90 $AN_CEC[2,1]=0.1", "M55", "WHILE TRUE"],
+)  # fmt: skip
+def test_words_that_could_change_a_table_are_refused(tmp_path, line):
+    with pytest.raises(InputError) as caught:
+        read(tmp_path, SPF.replace("STOPRE", line), name="KOMP.SPF")
+    assert caught.value.line == 6

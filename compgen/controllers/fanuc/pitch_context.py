@@ -126,8 +126,10 @@ def _overwrites(settings: PitchSettings, present: list[tuple[int, PitchBlock]]) 
         for low, high in axis.spans
     ]
     if sample.shows_points:
-        told = "; ".join(others) or "no other axis with points"
-        found = [f"Of other axes: nothing. The sample has {told}; they stay."]
+        told = (
+            f"The sample has {'; '.join(others)}; they stay." if others else "No other axis of the sample has points."
+        )
+        found = [f"Of other axes: nothing. {told}"]
     else:
         given = (
             "the sample has no parameters 3620 to 3622" if settings.style_notes else "no file of this control was given"

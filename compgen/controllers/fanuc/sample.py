@@ -19,6 +19,7 @@ from compgen.controllers.fanuc.text import Record, axis_values, read_records, ty
 from compgen.core import tomlio
 from compgen.core.files import read_bytes
 from compgen.core.machine import Machine
+from compgen.errors import InputError
 
 #: Parameters whose values are whole numbers, and the one that is a length.
 WHOLE_PARAMETERS, LENGTH_PARAMETER = (3620, 3621, 3622, 3623, 3626, 3627), 3624
@@ -30,6 +31,9 @@ UNIT_PARAMETER, TOTAL_PARAMETER, STRAIGHTNESS_PARAMETERS = 1001, 3602, range(570
 MOST_NUMBER, MOST_VALUE = 9999, 10_000_000
 #: Line ends of controls; LF CR CR is the end of block in ISO code.
 LINE_ENDS = {"\n\r\r": "LF CR CR", "\r\n": "CR LF", "\n": "LF", "\r": "CR"}
+
+#: Comments may be in any language; they are followed with ? in place of what is not ASCII.
+_COMMENT, _NOT_ASCII = re.compile(rb"\([^()\r\n]*\)"), re.compile(rb"[\x80-\xff]+")
 
 Span = tuple[int, int]
 #: (number, axis number) -> value as text and the record that it is in.
@@ -275,11 +279,14 @@ def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:
     """Compensation points of each axis that has some: an interval, or a number that is not 0."""
     found = {}
     for axis in sorted({axis for _, axis in parameters}):
-        entries = [parameters.get((number, axis)) for number in (3620, 3621, 3622, 3624)]
-        if any(entry is None for entry in entries):
+        entries = [parameters.get((number, axis)) for number in (3620, 3621, 3622)]
+        numbers = _numbers(entries)
+        if len(numbers) < 3:
+            if any(numbers):
+                raise _incomplete(axis, entries)
             continue
-        (reference, first, last), record = _numbers(entries[:3]), entries[1][1]  # type: ignore[index]
-        text, at = entries[3]  # type: ignore[misc]
+        (reference, first, last), record = numbers, entries[1][1]  # type: ignore[index]
+        text, at = parameters.get((LENGTH_PARAMETER, axis), ("0", record))
         interval = length_of(at, text, unit_mm) if Decimal(text) else Decimal(0)
         magnification = parameters.get((3623, axis), ("1", record))
         factor = magnification[1].whole(magnification[0], 0, 100)
@@ -293,6 +300,16 @@ def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:
         grid = PointGrid(reference, first, last, interval)
         found[axis] = AxisPoints(axis, grid, factor, negative, record)
     return found
+
+
+def _incomplete(axis: int, entries: Sequence[tuple[str, Record] | None]) -> InputError:
+    """Return the error of an axis whose points are not known: some of 3620 to 3622 are there, but not all."""
+    missing = [str(3620 + k) for k, entry in enumerate(entries) if entry is None]
+    record = next(entry[1] for entry in entries if entry is not None and Decimal(entry[0]))
+    return record.fail(
+        f"axis A{axis} has a value here, but none for {' and '.join(missing)}: which points it uses is not known, and they "
+        "could be written over. Punch all parameters of the control"
+    )
 
 
 def _numbers(entries: Sequence[tuple[str, Record] | None]) -> tuple[int, ...]:
@@ -337,8 +354,8 @@ def take_length_unit_mm(section: tomlio.Section, style: FanucStyle) -> float:
 
 
 def punched_file(path: Path) -> SourceFile:
-    """Read a punched file with its line ends as they are; InputError for bytes that are not ASCII."""
-    content = read_bytes(path)
+    """Read a punched file with its line ends as they are; InputError for bytes outside comments that are not ASCII."""
+    content = _COMMENT.sub(lambda found: _NOT_ASCII.sub(b"?", found[0]), read_bytes(path))
     try:
         return SourceFile(path, content.decode("ascii"))
     except UnicodeDecodeError as error:

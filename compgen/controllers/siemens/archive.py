@@ -38,10 +38,13 @@ HARMLESS: Mapping[str, tuple[str, ...] | None] = {
 }
 #: Cylinder error compensation has the same three letters; where it is zero it does nothing.
 _OTHER_CEC = re.compile(r"SN_CEC_(?:\d|BAS|COMP|CALC)[A-Z0-9_]*")
-#: Words of a program that have no bearing on a table.
+#: Words of a program that have no bearing on a table: units, path and display modes, dwells, messages, labels (what jumps
+#: to them is refused), declarations without a table in them.
+_MODE = r"(?:G(?!70|700)\d{1,3}|D0|SUPA|DISPLOF|DISPLON|SBLOF|SBLON)"
 _IDLE_WORD = re.compile(
-    r"METRIC|G7(?:1|10)|NEWCONF|STOPRE|M0?[01]|MSG ?\(.*\)|G0?4 ?[FS] ?=?[\d.]+|CHANDATA ?\( ?\d{1,3} ?\)|"
-    r"PROC [A-Z0-9_]+.*|REDEF .*|%"
+    r"METRIC|NEWCONF|STOPRE|M0?[01]|MSG ?\(.*\)|G0?4 ?[FS] ?=?[\d.]+|CHANDATA ?\( ?\d{1,3} ?\)|"
+    rf"PROC [A-Z0-9_]+.*|REDEF .*|%|{_MODE}(?: {_MODE})*|[A-Z_][A-Z0-9_]{{1,31}}:|"
+    r"DEF (?:INT|REAL|BOOL|CHAR|AXIS|STRING ?\[\d{1,3}\]) [A-Z0-9_, ]+|EXTERN [A-Z0-9_]+(?: ?\([A-Z, ]*\))?"
 )
 _END_WORD = re.compile(r"M17|M30|M0?2|RET")
 _INCH_WORD = re.compile(r"INCH|G70|G700")
