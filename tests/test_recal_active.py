@@ -6,13 +6,18 @@ something else, or left to guess from times.
 
 import os
 import shutil
+from dataclasses import replace
 from datetime import datetime, timedelta
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from test_recal import CONTROL, NOW, active_correction, deviations_text, drifted, worst_left_um
 
+from compgen.core.error_table import ErrorTable
+from compgen.model.volumetric import volumetric_error
 from compgen.recal import actions
+from compgen.recal.change import volume_points
 from compgen.recal.job import read_job
 from compgen.recal.reprocess import Wish, reprocess
 from compgen.recal.runner import run_jobs
@@ -104,6 +109,24 @@ def test_readings_of_the_bare_machine_from_which_tables_are_taken_out_are_held(r
     reasons = held(running)
     assert "the opposite of what version 1 adds (correlation -1.000, size 1.00" in reasons
     assert "as if version 1 was off" in reasons and "--active-table none" in reasons
+
+
+@pytest.mark.parametrize(("on", "said"), [(True, "none"), (False, "v1")])
+def test_a_drift_on_top_does_not_hide_which_tables_were_on(running, small_machine, small_errors, on, said):
+    """The machine drifts by a third of what version 1 takes out, in another shape, and the wrong tables are stated."""
+    running.write(policy="clock_minutes = 0")
+    signs = dict(zip(small_errors.names, (1, -1) * 12, strict=False))
+    curves = {
+        name: replace(curve, value=curve.value + signs[name] * (curve.value[::-1] - curve.value[::-1][-1]) / 3.0)
+        for name, curve in small_errors.curves.items()
+    }
+    moved = ErrorTable(curves, small_errors.squareness)
+    position = volume_points(small_machine)
+    before, after = (volumetric_error(small_machine, item, position) for item in (small_errors, moved))
+    assert 0.25 < np.linalg.norm(after - before) / np.linalg.norm(before) < 0.4
+    running.measure("wrong", moved, on=running.on() if on else None, seed=2, active_table=said)
+    reasons = held(running)
+    assert "adds (correlation" in reasons
 
 
 def test_a_machine_that_really_changed_is_not_held_for_it(running, small_errors):
@@ -239,6 +262,29 @@ def test_it_has_to_say_so_only_once(site):
     site.measure("second", seed=2)
     assert site.run().state == "ok"
     assert [table.state for table in site.tables()] == ["superseded", "pending"]
+
+
+def test_what_was_said_of_tables_that_the_store_does_not_know_is_no_statement_that_none_were_on(site):
+    site.measure("first", active_table="v1")  # of a store that was lost
+    assert site.run().state == "failed"
+    site.now += HOUR
+    site.measure("second", seed=2)
+    outcome = site.run()
+    assert outcome.active is None
+    assert "does not know which tables were on" in " ".join(site.tables()[0].reasons)
+
+
+def test_the_last_statement_counts(site):
+    site.write(approval="manual")
+    site.measure("first", active_table="none")
+    assert site.run().state == "ok"
+    site.now += HOUR
+    site.measure("second", seed=2, active_table="v1")  # loaded, though nobody approved it
+    site.run()
+    site.now += HOUR
+    site.measure("third", seed=3)
+    assert site.run().state == "held"
+    assert "does not know which tables were on" in " ".join(site.tables()[-1].reasons)
 
 
 def test_a_machine_whose_tables_are_off_when_it_is_measured_says_nothing(site):

@@ -25,8 +25,9 @@ from compgen.model.volumetric import volumetric_error
 
 #: Points along each axis of the grid on which the change is looked at.
 POINTS = 6
-#: A change equals a field if what the two differ by, beyond the noise, is at most this share of the field (rms).
-ALIKE = 0.25
+#: A change is like a field if what the two differ by, beyond the noise, is at most this share of the field (rms): the
+#: machine may have drifted as well since.
+ALIKE = 0.5
 #: Probabilities below this are said as that: the number of independent directions is hardly known.
 LEAST_P = 1e-9
 

@@ -123,10 +123,11 @@ class Past:
         return [item for item in self.decisions if AFTER[item.kind] == "active" and item.at >= self._since]
 
     @property
-    def stated(self) -> bool:
-        """Whether a file or a person said which tables were on, since the folder was given to this store."""
-        by_file = any(item.active_table is not None and item.received_at >= self._since for item in self.measurements)
-        return by_file or any(STATED in item.summary and item.at >= self._since for item in self.tables)
+    def stated(self) -> str | None:
+        """What a file or a person said last of the tables that were on, since the folder was given to this store."""
+        said = [(item.received_at, item.active_table) for item in self.measurements if item.active_table is not None]
+        said += [(item.at, str(item.summary[STATED])) for item in self.tables if STATED in item.summary]
+        return max((item for item in said if item[0] >= self._since), default=(None, None))[1]
 
     @property
     def _since(self) -> datetime:
@@ -135,16 +136,17 @@ class Past:
 
 
 def judge_assumption(
-    judgement: Judgement, job: MachineJob, measurement: MeasurementRecord, past: Past, now: datetime, taken: str
+    judgement: Judgement, job: MachineJob, measurement: MeasurementRecord, past: Past, now: datetime, taken: int | None
 ) -> None:
-    """Hold where the time of the measurement does not say which tables were on; ``taken`` says which were taken out.
+    """Hold where the time of the measurement does not say which tables were on; ``taken`` is the version taken out.
 
     Only for a measurement that does not say it itself, of a machine that is measured with its tables on. A wrong
     assumption goes into the errors in full: the new tables then undo the compensation, or apply it twice.
     """
     swaps, margin = past.swaps, timedelta(minutes=job.policy.clock_minutes)
     if not swaps:
-        if not past.stated:
+        said = past.stated
+        if said is None or version_said(said) != taken:
             judgement.hold.append(
                 "the store does not know which tables were on while the machine was measured: it never made any of "
                 f"{job.name} active. If none were on: {how_to_state(job.name, measurement, 'none')}; if tables were on, "
@@ -172,9 +174,17 @@ def judge_assumption(
             doubts.append(f"the clock went back, so the time of the decision of {_day(swap.at)} is not certain")
     if doubts:
         judgement.hold.append(
-            f"it is not certain which tables were on while the machine was measured, and {taken} was taken out: "
+            "it is not certain which tables were on while the machine was measured, and "
+            f"{'no table' if taken is None else f'version {taken}'} was taken out: "
             f"{'; '.join(dict.fromkeys(doubts))}; {how_to_state(job.name, measurement, 'VERSION|none')}"
         )
+
+
+def version_said(text: str) -> int | str | None:
+    """Return the version that ``active_table`` names, None for "none" or "bare", another text as it is."""
+    word = text.lower()
+    number = word.removeprefix("v")
+    return None if word in ("none", "bare") else int(number) if number.isdecimal() and number.isascii() else text
 
 
 def how_to_state(name: str, measurement: MeasurementRecord, tables: str) -> str:

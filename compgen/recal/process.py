@@ -35,6 +35,7 @@ from compgen.recal.judge import (
     judge_tables,
     judge_twins,
     shows_all,
+    version_said,
 )
 from compgen.recal.records import MachineRecord, MeasurementRecord, NewResult, TableFile, TableRecord
 from compgen.recal.states import AFTER, active_id
@@ -117,8 +118,7 @@ def process(
         if said is not None:
             judgement.figures[STATED] = said
         elif job.measured_with == "active":
-            taken_out = "no table" if taken is None else f"version {taken}"
-            judge_assumption(judgement, job, measurement, past, now, taken_out)
+            judge_assumption(judgement, job, measurement, past, now, taken)
         if outcome.accepted:
             about = (job, machine, measurement)
             _judge_likeness(judgement, store, about, past, outcome, taken, Path(folder) / "earlier")
@@ -162,11 +162,11 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
 def _active_then(job: MachineJob, measurement: MeasurementRecord, past: Past, said: str | None) -> TableRecord | None:
     """Return the tables that were active while the machine was measured: what is said, else what the job says."""
     tables = past.tables
-    if said is not None and said.lower() in ("none", "bare"):
+    version = None if said is None else version_said(said)
+    if said is not None and version is None:
         return None
     if said is not None:
-        version = said.lower().removeprefix("v")
-        found = next((table for table in tables if version.isdigit() and table.version == int(version)), None)
+        found = next((table for table in tables if table.version == version), None)
         if found is None or not found.accepted:
             of_file = said == measurement.active_table
             raise InputError(

@@ -217,8 +217,11 @@ def _read_ledger(text: str | None) -> dict[str, Any] | None:
 
 def _is_of_others(folder: Path, about: Mapping[str, Any]) -> bool:
     """Whether the folder of a version says that it was made by another store; a damaged or missing note says nothing."""
+    path = folder / "version.json"
+    if not path.is_file():  # nor a pipe, which would be waited for
+        return False
     try:
-        found = json.loads((folder / "version.json").read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
     keys = ("machine", "version", "made_at", "measurement")
