@@ -400,8 +400,9 @@ def test_a_laser_along_one_axis_never_replaces_tables_of_all_errors(example, tmp
     (inbox / "compensated.axis.csv").unlink()
     (inbox / "bare.axis.csv").write_text("# active_table = none\n" + said + readings)
     assert year.run("mill-b").state == "held"
-    (reason,) = year.tables("mill-b")[-1].reasons
+    reason, coverage = year.tables("mill-b")[-1].reasons
     assert reason.startswith("the measurement does not show EYX, EZX, ") and "EC0Y" in reason
+    assert coverage.startswith("reservation: isg-csv: partial: positioning only, 1 of 17 errors measured")
     store = open_store(year.job.store)
     told = drift_of_store(store, store.machine("mill-b"), DriftSettings())
     store.close()

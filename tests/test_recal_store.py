@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -486,6 +487,55 @@ def test_the_version_of_a_store_changes_with_everything_that_is_added(store):
     seen.add(store.version())
     assert len(seen) == 5
     assert store.version() in seen
+
+
+def checkpointed(path):
+    with sqlite3.connect(path) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    connection.close()
+
+
+def test_an_older_copy_that_is_written_over_the_open_file_is_noticed(tmp_path):
+    path = tmp_path / "recal.sqlite"
+    store = open_store(str(path))
+    machine = store.add_machine("mill")
+    processed(store, machine, 1)
+    checkpointed(path)
+    shutil.copyfile(path, tmp_path / "old.sqlite")
+    processed(store, machine, 2)
+    checkpointed(path)
+    assert len(store.tables(machine)) == 2  # a checkpoint is no other store
+    decisions.approve(store, machine, 2, "ada")
+    checkpointed(path)
+    good = path.read_bytes()
+    number = path.stat().st_ino
+    path.write_bytes((tmp_path / "old.sqlite").read_bytes())
+    assert path.stat().st_ino == number
+    with pytest.raises(StoreError, match="was moved, removed or replaced"):
+        store.version()
+    with pytest.raises(StoreError, match="was moved, removed or replaced"):
+        decisions.reject(store, machine, 1, "ada", "why")
+    path.write_bytes(b"no store " * 1000)
+    with pytest.raises(StoreError, match="was moved, removed or replaced"):
+        store.version()
+    path.write_bytes(good)
+    assert [item.kind for item in store.decisions(machine)][-1] == "approve"
+    store.close()
+
+
+def test_another_store_that_is_written_over_the_open_file_is_noticed(tmp_path):
+    stores = []
+    for number, seed in enumerate((1, 5)):
+        store = open_store(str(tmp_path / f"{number}.sqlite"))
+        for each in range(number + 1):  # the other one is longer
+            processed(store, store.add_machine("mill"), seed + each)
+        checkpointed(tmp_path / f"{number}.sqlite")
+        store.version()
+        stores.append(store)
+    (tmp_path / "0.sqlite").write_bytes((tmp_path / "1.sqlite").read_bytes())
+    with pytest.raises(StoreError, match="was moved, removed or replaced"):
+        stores[0].version()
+    assert stores[1].version()
 
 
 # --- who decides, and what is shown --------------------------------------------------------------------------------------

@@ -7,12 +7,14 @@ Open it with :func:`open_store`. Approval and rollback are in :mod:`compgen.reca
 from __future__ import annotations
 
 import os
+import sqlite3
 import zlib
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
@@ -47,13 +49,13 @@ _together: ContextVar[tuple[Store, sa.Connection] | None] = ContextVar("compgen_
 class Store:
     """A store that is open; every method is one transaction. ``clock`` is for tests.
 
-    A method raises StoreError once the file of an SQLite store was moved, removed or replaced: what is written to an open
-    file that nobody finds any more is lost.
+    A method raises StoreError once the file of an SQLite store was moved, removed, replaced or overwritten: what is written
+    to an open file that nobody finds any more is lost, and what goes into another store spoils both.
     """
 
     def __init__(self, engine: sa.Engine, url: str, clock: Clock | None = None) -> None:
         self.engine, self.url, self._clock = engine, url, clock
-        self._file = _file_of(engine)
+        self._file = _File(Path(str(engine.url.database))) if engine.dialect.name == "sqlite" else None
 
     def close(self) -> None:
         """Give the connections back."""
@@ -119,8 +121,8 @@ class Store:
         return retried(once, self.url)
 
     def _check_file(self) -> None:
-        """Raise StoreError unless the path still leads to the file that was opened."""
-        if self._file is not None and _file_of(self.engine) != self._file:
+        """Raise StoreError unless the path still leads to the store that was opened."""
+        if self._file is not None and not self._file.is_same():
             raise StoreError(
                 f"the store {shown(self.url)} was moved, removed or replaced while it was open; nothing was written: "
                 "put the file back, or start again with the right one"
@@ -376,15 +378,67 @@ class Store:
         return self.read(lambda connection: list(connection.execute(query).all()))
 
 
-def _file_of(engine: sa.Engine) -> tuple[int, int] | None:
-    """Return which file the path of an SQLite store leads to, None if there is none or it is another database."""
-    if engine.dialect.name != "sqlite":
-        return None
-    try:
-        found = os.stat(str(engine.url.database))
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino
+class _File:
+    """The file of an SQLite store as it was opened, for finding out whether another one came into its place.
+
+    A copy may also be written over it (``cp``), which leaves place and number of the file. In a store rows are only
+    added, so those that were in the file must still be there as they were. It is looked into when its time changed.
+    """
+
+    #: Tables whose newest rows are compared.
+    TABLES = ("measurements", "decisions", "events")
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._place, self._written = self._look()
+        self._rows: dict[str, Any] = {}
+        self._has_rows()
+
+    def is_same(self) -> bool:
+        """Whether the path leads to the file that was opened, and that still holds the rows that it held."""
+        place, written = self._look()
+        if place != self._place:
+            return False
+        if written == self._written:
+            return True
+        same = self._has_rows()
+        if same:
+            self._written = written
+        return same is not False
+
+    def _look(self) -> tuple[Any, Any]:
+        try:
+            found = os.stat(self._path)
+        except OSError:
+            return None, None
+        return (found.st_dev, found.st_ino), (found.st_mtime_ns, found.st_size)
+
+    def _has_rows(self) -> bool | None:
+        """Whether the rows that are known are in the file itself; None where that cannot be told while it is written.
+
+        The file is read without its write-ahead log, and by SQLite: to open and close it in another way would give the
+        locks of this process away.
+        """
+        if self._written is None:
+            return None
+        newest = {}
+        try:
+            address = f"{self._path.absolute().as_uri()}?mode=ro&immutable=1"
+            with closing(sqlite3.connect(address, uri=True)) as connection:
+                if connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
+                    return not self._rows  # a new store whose tables are in the log still
+                for table in self.TABLES:
+                    known = self._rows.get(table)
+                    query = f"SELECT * FROM {table} WHERE id = ?"
+                    if known is not None:
+                        found = connection.execute(query, known[:1]).fetchone()
+                        if found is None or found[: len(known)] != known:  # a newer program may have added columns
+                            return False
+                    newest[table] = connection.execute(f"SELECT * FROM {table} ORDER BY id DESC LIMIT 1").fetchone()
+        except sqlite3.DatabaseError as error:
+            return False if error.sqlite_errorcode == sqlite3.SQLITE_NOTADB else None
+        self._rows = {table: row for table, row in newest.items() if row is not None}
+        return True
 
 
 def files_of(connection: sa.Connection, table_id: int) -> list[TableFile]:
