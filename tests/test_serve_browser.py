@@ -136,6 +136,24 @@ def test_no_page_complains_runs_a_text_or_asks_others(reader, shown, browser, pa
     assert browser.ask("document.documentElement.scrollWidth <= window.innerWidth")
 
 
+@pytest.mark.parametrize("path", PATHS)
+def test_no_page_is_wider_than_a_phone(reader, browser, path):
+    reader.visit(path)
+    browser.picture(width=390)
+    assert browser.ask("document.documentElement.scrollWidth <= 390")
+    browser.picture()
+
+
+@pytest.mark.parametrize("width", [390, 1300])
+def test_the_fleet_shows_trend_and_tolerance_without_scrolling(reader, browser, width):
+    reader.visit("/")
+    browser.picture(width=width)
+    beyond = "(() => { const e = document.querySelector('.wide'); return e.scrollWidth - e.clientWidth; })()"
+    assert browser.ask(beyond) <= 0
+    assert "Tolerance" in reader.text() or width == 390
+    browser.picture()
+
+
 def test_the_pages_follow_dark_and_light_and_narrow_windows(reader, browser):
     reader.visit("/machines/1")
     grounds = set()

@@ -9,6 +9,7 @@ import sys
 import threading
 import urllib.request
 from datetime import UTC, datetime
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -20,8 +21,9 @@ pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed:
 import serve_site as helper
 from prometheus_client.parser import text_string_to_metric_families
 
-from compgen.cli import cli
+from compgen.cli import cli, serve_commands
 from compgen.cli.common import run_command
+from compgen.errors import InputError
 from compgen.recal.runner import MachineOutcome
 from compgen.recal.store import open_store
 from compgen.serve.app import make_app
@@ -195,3 +197,16 @@ def test_watch_metrics_are_served_while_it_runs(tmp_path):
     assert found["compgen_recal_pass_seconds_sum",] == 2.2
     assert found["compgen_recal_last_pass_timestamp_seconds", "mill-1"] >= before
     assert found["compgen_waiting_tables", "mill-1"] == 1.0
+
+
+def test_the_store_of_the_job_file_may_be_given_by_its_path(tmp_path, monkeypatch):
+    (tmp_path / "recal.toml").write_text("[machines]\n")
+    monkeypatch.chdir(tmp_path)
+    url = f"sqlite:///{tmp_path / 'recal.sqlite'}"
+    for given in (None, "recal.sqlite", str(tmp_path / "recal.sqlite"), url):
+        assert serve_commands._store_url(given, Path("recal.toml")) == url
+    with pytest.raises(
+        InputError, match=r"h/n is not the store of recal.toml, sqlite:.*recal.sqlite; leave it out"
+    ) as found:
+        serve_commands._store_url("postgresql://u:secret@h/n", Path("recal.toml"))
+    assert "secret" not in str(found.value)

@@ -86,11 +86,13 @@ def _store_url(store: str | None, job: Path | None) -> str:
         if store is None:
             raise click.UsageError("give --store URL or --job FILE")
         return store
+    from compgen.recal.database import shown
     from compgen.recal.job import read_job
 
     url = read_job(job).store
-    if store is not None and store != url:
-        raise InputError(f"--store is not the store of {job}; leave --store out", field="--store")
+    given = url if store is None else store if "://" in store else f"sqlite:///{Path(store).absolute()}"
+    if given != url:
+        raise InputError(f"{shown(given)} is not the store of {job}, {shown(url)}; leave it out", field="--store")
     return url
 
 
