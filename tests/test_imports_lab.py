@@ -543,3 +543,57 @@ def test_a_sheet_of_statistics_is_left_out_and_one_of_mean_errors_is_held_agains
     item = import_file(straight)
     assert item.doubts == ()
     assert item.beside.curves["EYX"].value.tolist() == pytest.approx([5e-4, 1e-3, 0], abs=ROUNDING_MM)
+
+
+MORE = {
+    "signs behind the unit": ("utf-8", "X-Achse\nPosition [mm];Abw. 1 [µm] +;Abw. 1 [µm] -;Abw. 2 [µm] +;Abw. 2 [µm] -;"
+                              "Feuchte [%]\n"
+                              "-800;1,0;3,0;1,2;3,1;45\n-400;2,0;4,5;2,1;4,4;45\n0;5,0;7,5;5,2;7,6;46\n"),
+    "blank lines between the rows": ("utf-8", "X-Achse Abweichung\nPos [mm]\tL1+\tL1-\tL2+\tL2-\n\n-800\t1\t3\t1.2\t3.1\n\n"
+                                     "-400\t2\t4.5\t2.1\t4.4\n\n0\t5\t7.5\t5.2\t7.6\n"),
+    "chinese code page": ("gbk", "X轴 定位误差 (um)\n目标位置 mm,-800,-400,0\n正向 1,1,2,5\n反向 1,3,4.5,7.5\n"
+                          "正向 2,1.2,2.1,5.2\n反向 2,3.1,4.4,7.6\n"),
+    "rows of directions": ("utf-8", "Axis,X\nDeviation (um)\nDirection,-800,-400,0\nfwd,1,2,5\nrev,3,4.5,7.5\n"
+                           "fwd,1.2,2.1,5.2\nrev,3.1,4.4,7.6\n"),
+    "capitals": ("cp1252", "ACHSE X ABWEICHUNG\nPOSITION [MM];LAUF 1 VOR [µM];LAUF 1 ZURÜCK [µM];"
+                 "LAUF 2 VOR [µM];LAUF 2 ZURÜCK [µM]\n"
+                 "-800;1,0;3,0;1,2;3,1\n-400;2,0;4,5;2,1;4,4\n0;5,0;7,5;5,2;7,6\n"),
+    "unit in the title": ("utf-8", "Eje X, desviación en mm\nPosición (mm);-800;-400;0\nIda 1;0,0010;0,0020;0,0050\n"
+                          "Vuelta 1;0,0030;0,0045;0,0075\nIda 2;0,0012;0,0021;0,0052\nVuelta 2;0,0031;0,0044;0,0076\n"
+                          "Media;0,0021;0,0032;0,0063\n"),
+    "back before forth": ("utf-8", "Asse X\nQuota [mm];Scarto ritorno 1 [µm];Scarto andata 1 [µm];"
+                          "Scarto ritorno 2 [µm];Scarto andata 2 [µm]\n"
+                          "-800;3,0;1,0;3,1;1,2\n-400;4,5;2,0;4,4;2,1\n0;7,5;5,0;7,6;5,2\n"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MORE)
+def test_further_sheets_without_any_option(tmp_path, name):
+    encoding, text = MORE[name]
+    item = import_file(written(tmp_path, text, "t.csv", encoding))
+    assert item.doubts == ()
+    assert_is_the_example(item.data)
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("X-Achse\nPosition [mm];Mittel vor [µm];Mittel zurück [µm]\n-800;1;3\n0;5;7\n", "no deviations or readings"),
+        (
+            "X-Achse\nvor;;;rück;\nPosition [mm];Fehler [µm];;Position [mm];Fehler [µm]\n-800;1,0;;-800;3,0\n0;5,0;;0;7,5\n",
+            "twice",
+        ),
+        (
+            "X-Achse\nPosition [mm];Abweichung [µm]\nvor\n-800;1,0\n0;5,0\nrück\n0;7,5\n-800;3,0\n",
+            "no table|no row|not a number",
+        ),
+        ("Kompensation X-Achse\nPosition [mm];vor [µm];zurück [µm]\n-800;1;3\n0;5;7\n", "--sign"),
+        ("X axis error\nPosition [mm];Run 1 fwd;Run 1 rtrn\n-800;1;3\n0;5;7.5\n", "'Run 1 rtrn' holds numbers"),
+        ("X-Achse\nPosition [mm];X vor [µm];Y vor [µm]\n-800;1;3\n0;5;7\n", "no deviations or readings"),
+        ("X-Achse Fehler\nPosition [mm];vor [µm];zurück [µm]\n-800;1;3\n0;5;\n;;9\n", "is empty|not a number"),
+    ],
+)
+def test_what_a_person_would_ask_about_is_asked(tmp_path, text, what):
+    path = written(tmp_path, text, "t.csv")
+    with pytest.raises(InputError, match=what):
+        open_measurement([path])

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from compgen.core.names import ERROR_NAMES
 from compgen.core.text import nearest
 from compgen.errors import InputError
+from compgen.imports.run_names import run_in
 from compgen.imports.units import Quantity, further_unit
 
 MM_PER_LENGTH = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "m": 1e3, "cm": 10.0, "in": 25.4, "mil": 0.0254, "0.1um": 1e-4}
@@ -198,6 +199,8 @@ def fields_of(header: Sequence[str], given: Mapping[str, str], ignored: Sequence
         if key in found:
             continue
         matching = [column for column in columns if column.name not in taken and column.word in words]
+        if key in ("actual", "deviation", "value"):  # one way of several, "Deviation +", is a run
+            matching = [column for column in matching if (run := run_in(column.name)) is None or not run.direction]
         if matching:
             found[key] = min(matching, key=lambda column: words.index(column.word))
             taken.add(found[key].name)

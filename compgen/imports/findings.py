@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,8 +15,11 @@ from compgen.imports.columns import MM_PER_LENGTH, RAD_PER_ANGLE, Column, known_
 from compgen.imports.grid import Table
 from compgen.imports.hypotheses import ABSURD_DECADES, Verdict, decades_off, unit_of_deviations, unit_of_positions
 from compgen.imports.result import ImportOptions
+from compgen.imports.run_names import is_deviation
 from compgen.imports.source import parse_number, shown
 
+#: A unit in brackets, after the word "in" (en, em), or at the end of a line.
+_UNIT_IN_TEXT = re.compile(r"[\[(]([^\])]{1,8})[\])]|\b(?:in|en|em)\s+(\S{1,6})|\s([u\u00b5\u03bc]m|mm)\s*$")
 #: Units that are weighed when a file says none.
 _LENGTHS = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "nm", "in")}
 _ANGLES = {name: RAD_PER_ANGLE[name] for name in ("urad", "mrad", "arcsec", "deg")}
@@ -103,8 +107,16 @@ class Findings:
         return values * units[unit]
 
     def _unit_in(self, name: str) -> str | None:
-        from_metadata = next((v for k, v in self.table.metadata.items() if k in ("unit", "units", "einheit")), None)
-        return known_unit(from_metadata) if from_metadata else None
+        """Return the unit above the table: ``Unit: um``, or the one in a line that speaks of deviations, if it is one."""
+        metadata = self.table.metadata
+        from_metadata = next((v for k, v in metadata.items() if k in ("unit", "units", "einheit")), None)
+        if from_metadata:
+            return known_unit(from_metadata)
+        lines = [f"{key} {text}" for key, text in metadata.items()]
+        found = {
+            known_unit("".join(part)) for line in lines if is_deviation(line) for part in _UNIT_IN_TEXT.findall(line)
+        }
+        return found.pop() if len(found - {None}) == 1 and len(found) == 1 else None
 
     def _weighed(self, what: str, judged: Verdict) -> str:
         key = what.rpartition(" ")[2]

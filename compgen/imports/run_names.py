@@ -158,7 +158,7 @@ def _read(text: str, letters: str = "") -> _Words:
             ways.add(-1)
         elif token in _STATISTIC:
             statistics.append(_STATISTIC[token])
-        elif token in _RUN or (token in ("r", "m", "n") and following.isdigit()):
+        elif token in _RUN or (token in ("r", "m", "n", "l") and following.isdigit()):
             names_run = True
         elif token == "s" and k and tokens[k - 1][0].isdigit():
             statistics.append("scatter")

@@ -23,6 +23,16 @@ HEAD_BYTES = 65_536
 ENCODINGS = ("utf-8", "cp1252", "latin-1")
 #: Instruments of one maker write user text in the code page of the computer (see :mod:`compgen.imports.renishaw`).
 ENCODINGS_EAST = ("utf-8", "gbk", "latin-1")
+#: Position, deviation, error, forward, backward, temperature, positioning; two characters are not met by chance.
+_CHINESE = (
+    "\u4f4d\u7f6e",
+    "\u504f\u5dee",
+    "\u8bef\u5dee",
+    "\u6b63\u5411",
+    "\u53cd\u5411",
+    "\u6e29\u5ea6",
+    "\u5b9a\u4f4d",
+)
 _MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
 _BINARY = (
     (b"\xd0\xcf\x11\xe0", "an old Excel workbook (.xls) or one with a password; save it as .xlsx without a password"),
@@ -112,6 +122,8 @@ def _decode(path: Path, content: bytes, encodings: Sequence[str]) -> tuple[str, 
     chosen = [marked] if marked else [_without_mark(content[:HEAD_BYTES]) or "", *encodings]
     for encoding in filter(None, chosen):
         try:
+            if encoding == "cp1252" and _is_chinese(content[:HEAD_BYTES]):
+                return "gb18030", content.decode("gb18030")
             return encoding, content.decode(encoding).lstrip("\ufeff")
         except UnicodeDecodeError as error:
             if encoding.startswith("utf-16"):
@@ -120,6 +132,12 @@ def _decode(path: Path, content: bytes, encodings: Sequence[str]) -> tuple[str, 
                 line = content[: error.start].count(b"\n") + 1
                 raise InputError("is not UTF-8 text though its mark says so", file=path, line=line) from error
     raise InputError("is text in no known encoding; save it as UTF-8", file=path)
+
+
+def _is_chinese(head: bytes) -> bool:
+    """Whether text that is not UTF-8 shows words of a measurement in the code page of China."""
+    text = head.decode("gb18030", errors="ignore")
+    return sum(text.count(word) for word in _CHINESE) >= 1
 
 
 def _without_mark(head: bytes) -> str | None:
