@@ -672,3 +672,31 @@ def test_words_that_could_change_a_table_are_refused(tmp_path, line):
     with pytest.raises(InputError) as caught:
         read(tmp_path, SPF.replace("STOPRE", line), name="KOMP.SPF")
     assert caught.value.line == 6
+
+
+@pytest.mark.parametrize(
+    ("controller", "words"),
+    [
+        (
+            "pmac",
+            [
+                "- Motors that are not X, Y or Z and get a table: 4.",
+                "NOT KNOWN whether they have one",
+                "motors 1 (X), 2 (Y), 3 (Z)",
+                "I51",
+            ],
+        ),
+        ("twincat-lists", ["- Of other axes: nothing.", "The compensation lists of X, Y and Z as a whole"]),
+        ("siemens-eec", ["of other axes: none", "The encoder table of AX1, measuring system 1"]),
+        ("siemens-cec-eec", ["- Of other axes: NOT KNOWN", "- Tables 0 ... "]),
+    ],
+)
+def test_preflight_says_what_the_files_overwrite(tmp_path, controller, words):
+    settings = "[controllers.pmac]\ncounts_per_mm = 1000.0\n"
+    settings += '[controllers.siemens-cec-eec]\nmult_mode = "S1"\nsign = "error"\n'
+    machine_with(tmp_path, settings)
+    (tmp_path / "e.errors.csv").write_text(SMALL_ERRORS)
+    machine, errors = read_machine(tmp_path / "machine.toml"), compgen.read_errors(tmp_path / "e.errors.csv")
+    told = compgen.export(machine, errors, controller, allow_unverified=True).preflight
+    section = told.split("## What the files overwrite")[1].split("\n## ")[0]
+    assert all(word in section for word in words), section

@@ -31,6 +31,7 @@ def pmac_notes(machine: Machine, settings: PmacSettings, tables: PmacTables) -> 
         ],
         "has_sheets": any(isinstance(table, Sheet) for table in tables.tables),
         "owners": sorted(table.motor for table in tables.tables),
+        "overwrites": _overwrites(settings, tables),
     }
 
 
@@ -46,13 +47,29 @@ def _parameters(settings: PmacSettings, tables: PmacTables) -> list[dict[str, ob
     return [{"name": name, "value": value, "meaning": meaning} for name, value, meaning in rows]
 
 
+def _overwrites(settings: PmacSettings, tables: PmacTables) -> list[str]:
+    """Say which tables and variables the file overwrites, those of motors without an axis first."""
+    own = sorted(table.motor for table in tables.tables if table.motor in settings.motors)
+    others = sorted(table.motor for table in tables.tables if table.motor not in settings.motors)
+    names = {motor: letter for letter, motor in zip(AXES, settings.motors, strict=True)}
+    first = "Of motors that are not X, Y or Z: nothing."
+    if others:
+        first = (
+            f"Motors that are not X, Y or Z and get a table: {', '.join(map(str, others))}. NOT KNOWN whether they have one: "
+            "list them first, a table that is there is lost."
+        )
+    found = [first, f"The tables of motors {', '.join(f'{motor} ({names[motor]})' for motor in own)}."]
+    variables = ["I51 (it acts on the tables of all motors)", *(f"I{motor}86" for motor in sorted(tables.constants))]
+    return [*found, f"The variables {', '.join(variables)}."]
+
+
 def _warnings(machine: Machine, settings: PmacSettings, tables: PmacTables) -> list[str]:
     found: list[str] = []
     owners = [table.motor for table in tables.tables if table.motor not in settings.motors]
     if owners:
         found.append(
-            f"motors {', '.join(map(str, sorted(owners)))} have no axis here and own tables of other motors: a table of "
-            "their own would be lost"
+            f"the file keeps tables of X, Y and Z at the motors {', '.join(map(str, sorted(owners)))}, which the machine file "
+            "does not have as axes: a table that one of them has on the control is lost"
         )
     if any(isinstance(table, Sheet) for table in tables.tables):
         found.append(

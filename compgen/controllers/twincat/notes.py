@@ -22,6 +22,11 @@ def twincat_notes(machine: Machine, settings: TwincatSettings, tables: TwincatTa
         "ssfk_sign": settings.ssfk_sign,
         "parameters": _parameters(settings, tables),
         "warnings": _warnings(settings, tables),
+        "overwrites": [
+            "Of other axes: nothing.",
+            "The compensation lists of X, Y and Z as a whole: what the old list of one of them holds beside these tables, e.g. a "
+            "table over a rotary axis, is lost.",
+        ],
     }
 
 
