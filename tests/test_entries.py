@@ -200,6 +200,52 @@ def test_a_single_wrong_value_in_tables_made_in_another_way_is_found(gantry):
     assert any(reason.startswith("correction X at X -400 ") for reason in result.reasons), result.reasons
 
 
+def test_another_rounding_in_a_coarse_format_is_no_wrong_value(gantry):
+    """Squarenesses of 5 urad more move at most 8 um; in steps of 30 um that shows at single nodes, by one step."""
+    machine, errors = gantry
+    other = changed_errors(errors, lambda curve: curve.value, lambda value: value + 5e-6)
+    result = verify(machine, exported_tables(machine, other, "fanuc-3d"), errors)
+    assert result.accepted, result.reasons
+
+
+def uncertain(errors, value_mm):
+    """The same errors with a standard uncertainty of every linear one."""
+    linear = {name for name in errors.curves if name[1] in "XYZ"}
+    curves = {
+        name: replace(curve, u=np.full(len(curve.u), value_mm if name in linear else 0.0))
+        for name, curve in errors.curves.items()
+    }
+    return ErrorTable(curves, errors.squareness)
+
+
+def test_the_uncertainty_excuses_no_few_numbers_of_a_list(gantry):
+    """Four neighbours in a TwinCAT plane, 2.5 um off: u = 1 um explains a table that was made anew, not these."""
+    machine, errors = gantry
+    tables = exported_tables(machine, errors, "twincat-lists")
+    key, item = next((key, item) for key, item in tables.tables.lists.items() if item.plane is not None)
+    values = np.array(item.plane.values)
+    values[3, 4:8] += 25.0
+    plane = replace(item.plane, values=values)
+    lists = {**tables.tables.lists, key: replace(item, plane=plane)}
+    changed = replace(tables, tables=replace(tables.tables, lists=lists))
+    reasons = verify(machine, changed, uncertain(errors, 1e-3)).reasons
+    assert any("the errors ask for" in reason for reason in reasons)
+    assert not verify(machine, tables, uncertain(errors, 1e-3)).reasons
+
+
+def test_a_wrong_position_that_sorts_the_rows_anew_is_one_wrong_number(gantry):
+    """The last node of a curve becomes the first, as with a minus too much; u = 1 um explains none of it."""
+    machine, errors = gantry[0], uncertain(gantry[1], 1e-3)
+    tables = exported_tables(machine, errors, "etalon-exchange")
+    item = tables.tables.fields["EXX"]
+    nodes, values = np.roll(item.nodes_mm[0], 1), np.roll(item.values, 1)
+    nodes[0] = nodes[1] - 100.0
+    fields = {**tables.tables.fields, "EXX": replace(item, nodes_mm=(nodes,), values=values)}
+    changed = replace(tables.tables, fields=fields)
+    assert count_changed(changed, tables.tables) == 2
+    assert verify(machine, replace(tables, tables=changed), errors).reasons
+
+
 # --- numbers ---------------------------------------------------------------------------------------------------------
 
 
@@ -221,6 +267,16 @@ def test_changed_numbers_are_counted_wherever_they_are():
     assert count_changed({**one, "more": np.ones(7)}, {**other, "n": 8}) == 8
     assert count_changed({"a": np.ones(3)}, {"a": np.ones(4)}) == 4
     assert count_changed({}, {}) == 0
+
+
+def test_a_run_that_moved_by_one_place_counts_as_one_number():
+    values = np.arange(9.0)
+    for run in (np.roll(values[2:7], 1), np.roll(values[2:7], -1), np.array([3.0, 4.0, 5.0, 6.0, 55.0])):
+        moved = np.concatenate([values[:2], run, values[7:]])
+        assert count_changed({"a": moved}, {"a": values}) == 1
+        texts = [Held(tuple(Decimal(str(value)) for value in part), np.zeros(1)) for part in (moved, values)]
+        assert count_changed(*texts) == 1
+    assert count_changed({"a": values[::-1]}, {"a": values}) == 8
 
 
 def test_one_number_is_changed_and_no_other():

@@ -13,6 +13,7 @@ So the tables are made anew from the errors, with the same settings, and numbers
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from decimal import Decimal
@@ -41,6 +42,8 @@ BoolArray = NDArray[np.bool_]
 
 #: Tables that differ from those made anew in no more numbers than these were edited by hand ...
 FEW_CHANGED = 2
+#: From so many on, numbers of a list that differ are looked at for a run that moved; two may be rounded in another way.
+LEAST_RUN = 3
 #: ... and in no more than this share of those that depend on the errors, they were edited or made of nearly the same
 #: errors and rounded.
 CHANGED_SHARE = 0.2
@@ -53,10 +56,14 @@ GOAL_SHARE = 0.5
 ROUNDED_SHARE = 0.05
 #: A format that rounds by more than the goal hides differences: this share of the range without the linear part.
 COARSE_SHARE = 0.1
-#: Standard uncertainties of the errors that explain a difference where more than a few numbers differ.
+#: Standard uncertainties of the errors that explain a difference where more than a few numbers differ; no more than
+#: another rounding, unless in every list that differs at least this share of those that depend on the errors does:
+#: another measurement moves whole curves.
 CHANGED_UNCERTAINTIES = 3.0
+WHOLE_SHARE = 0.5
 #: In tables made in another way a step of the difference is suspect that is this many times as large as all others,
-#: where there are enough of these, and exceeds this part of the goal and so many standard uncertainties.
+#: where there are enough of these, and exceeds this part of the goal, the format's rounding and so many standard
+#: uncertainties.
 SPIKE_RATIO, LEAST_OTHERS = 5.0, 4
 SPIKE_SHARE, SPIKE_UNCERTAINTIES = 0.6, 4.0
 #: Largest full grid of table nodes for tables of fewer numbers; beyond it planes, and lines beyond these.
@@ -98,13 +105,53 @@ def numbers_changed(one: object, other: object) -> dict[str, BoolArray]:
         elif values.shape != others.shape:
             changed[place] = np.ones(max(values.size, others.size), dtype=np.bool_)
         else:
-            changed[place] = ~np.isclose(values, others, rtol=1e-9, atol=1e-15, equal_nan=True)
+            changed[place] = ~_same(values, others)
     return changed
 
 
 def count_changed(one: object, other: object) -> int:
-    """Return how many numbers of two sets of tables differ."""
-    return sum(int(part.sum()) for part in numbers_changed(one, other).values())
+    """Return how many numbers of two sets of tables differ; a run of numbers that moved by one place counts as one."""
+    return sum(_changed_by_list(one, other).values())
+
+
+def _changed_by_list(one: object, other: object) -> dict[str, int]:
+    """How many numbers differ in each array, and in each list of single numbers."""
+    first, second, changed = numbers_of(one), numbers_of(other), numbers_changed(one, other)
+    lists: dict[str, list[str]] = {}
+    for place in changed:
+        lists.setdefault(_list_of(place), []).append(place)
+    found = {}
+    for name, places in lists.items():
+        count = sum(int(changed[place].sum()) for place in places)
+        if count >= LEAST_RUN:
+            values, others = (
+                np.concatenate([part[place] for place in places if place in part] or [np.zeros(0)])
+                for part in (first, second)
+            )
+            count = 1 if _moved_by_one(values, others) else count
+        found[name] = count
+    return found
+
+
+def _list_of(place: str) -> str:
+    """The list that holds the number at a place such as ``.tables[0].values[7]``, without its number in the list."""
+    return re.sub(r"\[\d+\]$", "", place)
+
+
+def _moved_by_one(values: FloatArray, others: FloatArray) -> bool:
+    """Whether a run of numbers is that of ``others`` moved by one place, up or down, with any number at its end.
+
+    One wrong position does that to tables that are read in the order of their positions.
+    """
+    if values.shape != others.shape:
+        return False
+    changed = np.flatnonzero(~_same(values, others))
+    run, right = (part[changed[0] : changed[-1] + 1] for part in (values, others))
+    return bool(_same(run[1:], right[:-1]).all() or _same(run[:-1], right[1:]).all())
+
+
+def _same(values: FloatArray, others: FloatArray) -> BoolArray:
+    return np.isclose(values, others, rtol=1e-9, atol=1e-15, equal_nan=True)
 
 
 def with_number(tables: Any, place: str, index: int, step: float) -> Any:
@@ -196,16 +243,16 @@ class _Sample:
 class EntryCheck:
     """Given tables beside those that the errors of a judge give with the same settings.
 
-    ``made`` is None where the control cannot make tables of these errors. ``changed`` is how many numbers differ,
-    ``depends`` which numbers depend on the errors at all (positions do not), by place. ``reversal_known`` says whether
-    the reversal is part of ``made``.
+    ``made`` is None where the control cannot make tables of these errors. ``changed`` is how many numbers differ in each
+    list, ``depends`` which numbers depend on the errors at all (positions do not), by place. ``reversal_known`` says
+    whether the reversal is part of ``made``.
     """
 
     machine: Machine
     judge: Judge
     given: ReadTables
     made: ReadTables | None
-    changed: int
+    changed_in: Mapping[str, int]
     depends: Mapping[str, BoolArray]
     reversal_known: bool
 
@@ -229,8 +276,21 @@ class EntryCheck:
         return self._few_differ or (self.made is not None and 0 < self.changed <= CHANGED_SHARE * self._depend)
 
     @property
+    def changed(self) -> int:
+        """How many numbers differ."""
+        return sum(self.changed_in.values())
+
+    @property
     def _depend(self) -> int:
         return sum(int(part.sum()) for part in self.depends.values())
+
+    @property
+    def _whole_lists_differ(self) -> bool:
+        """Whether the tables may be of another measurement: not where single numbers in a list differ from the others."""
+        depend: dict[str, int] = {}
+        for place, part in self.depends.items():
+            depend[_list_of(place)] = depend.get(_list_of(place), 0) + int(part.sum())
+        return all(count >= WHOLE_SHARE * depend.get(name, 0) for name, count in self.changed_in.items() if count)
 
     @property
     def _few_differ(self) -> bool:
@@ -312,8 +372,10 @@ class EntryCheck:
         if not self._numbers_differ:
             return []
         coarse = COARSE_SHARE * self.judge.bent_mm if self.judge.resolution_mm > goal else 0.0
-        limit = max(GOAL_SHARE * goal, coarse) + CHANGED_UNCERTAINTIES * self._u_mm(sample)
-        return sample.worst(np.abs(sample.miss_mm) - limit)
+        explained = CHANGED_UNCERTAINTIES * self._u_mm(sample)
+        if not self._whole_lists_differ:  # errors that hardly show in these steps explain one rounding more
+            explained = np.minimum(explained, self.judge.resolution_mm)
+        return sample.worst(np.abs(sample.miss_mm) - max(GOAL_SHARE * goal, coarse) - explained)
 
     def _u_mm(self, sample: _Sample) -> FloatArray:
         flat = sample.position_mm.reshape(-1, 3)
@@ -321,7 +383,8 @@ class EntryCheck:
 
     def _spikes(self, sample: _Sample) -> list[str]:
         """Name for each axis a single place where the difference changes far more than anywhere else along an axis."""
-        limit = SPIKE_SHARE * self.judge.goal_mm
+        # Where another rounding shows, it shows at single places, by as much as the errors of both tables differ.
+        limit = SPIKE_SHARE * self.judge.goal_mm + self.judge.resolution_mm
         miss = sample.miss_mm
         if np.max(np.abs(miss)) <= 0.5 * limit:
             return []
@@ -436,7 +499,8 @@ def entry_check(
         if held is not None and held.curves:
             tables = control.with_reversal(machine, settings, tables, held)
     except (CompgenError, OverflowError):  # these errors are too large for the control: others than it was made of
-        return EntryCheck(machine, judge, given, None, 0, {}, reversal_known=False)
+        return EntryCheck(machine, judge, given, None, {}, {}, reversal_known=False)
     known = held is not None and bool(held.curves)
     made = replace(given, tables=tables, files=(), contradictions=())
-    return EntryCheck(machine, judge, given, made, count_changed(given.tables, tables), depends, reversal_known=known)
+    changed = _changed_by_list(given.tables, tables)
+    return EntryCheck(machine, judge, given, made, changed, depends, reversal_known=known)
