@@ -138,7 +138,10 @@ def test_damaged_own_files_options_that_convert_and_unknown_sheets_are_usage_err
 def test_from_a_foreign_measurement_to_accepted_tables_in_one_command(capsys, tmp_path, machine, name):
     words = ["run", machine, GOLDEN / name, "--controller", "isg-csv", "--smoothness", "0", "--json", "--out"]
     code, out, _ = call(capsys, *words, tmp_path / "refused")  # the runs of the golden example scatter widely
-    assert (code, [item["code"] for item in json.loads(out)["objections"] if item["blocking"]]) == (1, ["residual_too_large"])
+    assert (code, [item["code"] for item in json.loads(out)["objections"] if item["blocking"]]) == (
+        1,
+        ["residual_too_large"],
+    )
     code, out, err = call(capsys, *words, tmp_path / "o", "--allow-misfit")
     assert code == 0, err
     facts = json.loads(out)
