@@ -10,6 +10,8 @@ import numpy as np
 from compgen.core.csvio import FloatArray
 from compgen.core.kernels import FAST, loop
 from compgen.identify.state import IntArray
+from compgen.model.compiled import rotation_factors
+from compgen.model.rotation import SERIES_BELOW
 
 
 @loop(fastmath=False)
@@ -17,14 +19,8 @@ def _rotation(eps: FloatArray, rotation: FloatArray, jacobian: FloatArray) -> No
     """Rotation matrix and left Jacobian of SO(3), each (3, 3), of a rotation vector (3,) in rad."""
     x, y, z = eps[0], eps[1], eps[2]
     square = x * x + y * y + z * z
-    if square > 1e-4:
-        angle = np.sqrt(square)
-        first = np.sin(angle) / angle
-        second = (1.0 - np.cos(angle)) / square
-    else:
-        first = 1.0 - square / 6.0 * (1.0 - square / 20.0)
-        second = 0.5 - square / 24.0 * (1.0 - square / 30.0)
-    third = 1.0 / 6.0 - square / 120.0
+    first, second = rotation_factors(square)
+    third = (1.0 - first) / square if square >= SERIES_BELOW else 1.0 / 6.0 - square / 120.0 * (1.0 - square / 42.0)
     rotation[0, 0], rotation[1, 1], rotation[2, 2] = 0.0, 0.0, 0.0
     rotation[2, 1], rotation[0, 2], rotation[1, 0] = x, y, z
     rotation[1, 2], rotation[2, 0], rotation[0, 1] = -x, -y, -z

@@ -11,7 +11,8 @@ from compgen.core.csvio import FloatArray
 from compgen.core.names import SQUARENESS_NAMES
 from compgen.identify.grid import Grid
 from compgen.identify.state import State
-from compgen.model.exact import level_rotations, passing_order
+from compgen.model.exact import passing_order
+from compgen.model.rotation import level_rotations
 
 
 @dataclass(frozen=True)

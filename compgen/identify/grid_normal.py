@@ -15,7 +15,7 @@ from compgen.identify.grid import Grid
 from compgen.identify.grid_moments import Moments
 from compgen.identify.motion import MotionMap
 from compgen.identify.state import IntArray, State
-from compgen.model.exact import cross_matrices
+from compgen.model.rotation import cross_matrices
 
 #: Place of the entries of w u u^T and w u in the ten moments, one row for each component of u.
 _ENTRIES = np.array([[0, 3, 4, 6], [3, 1, 5, 7], [4, 5, 2, 8]])

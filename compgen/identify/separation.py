@@ -23,7 +23,8 @@ from compgen.core.csvio import FloatArray
 from compgen.core.names import ERROR_INDEX
 from compgen.identify.parameters import ErrorParameters
 from compgen.identify.state import State
-from compgen.model.exact import cross_matrices, exact_columns, level_rotations, tip_position
+from compgen.model.exact import exact_columns, tip_position
+from compgen.model.rotation import cross_matrices, level_rotations
 
 CHUNK_POINTS = 2048
 #: The unknown rotation of the frame is counted in mm at this lever, as the solver counts angles.

@@ -8,7 +8,7 @@ import numpy as np
 
 from compgen.core.csvio import FloatArray
 from compgen.errors import UndeterminedError
-from compgen.model.exact import cross_matrices
+from compgen.model.rotation import cross_matrices
 
 #: A mirror image is believed when it fits this much better than the proper placement.
 MIRROR_RATIO = 0.5

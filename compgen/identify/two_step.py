@@ -24,7 +24,8 @@ from compgen.identify.rank import describe_rank
 from compgen.identify.separation import LEVER_MM, SeparationProblem, frame_rotation
 from compgen.identify.solver import Solution, factorise, solve
 from compgen.identify.state import IntArray, State
-from compgen.model.exact import cross_matrices, tip_position
+from compgen.model.exact import tip_position
+from compgen.model.rotation import cross_matrices
 
 MOST_ROUNDS = 20
 #: With fewer readings kept than this share, model and readings do not belong together.

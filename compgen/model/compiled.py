@@ -15,6 +15,7 @@ import numpy as np
 from numba import types
 
 from compgen.core.kernels import Function, compile_for
+from compgen.model.rotation import SERIES_BELOW
 
 Row = tuple[float, float, float, float]
 
@@ -211,17 +212,23 @@ def grid_kernel(tilted: bool) -> Callable[..., None]:
 
 
 @_inline
-def _turned(eps: Row, v: Row) -> Row:
-    """R(eps) v - v by Rodrigues' formula; series below 0.01 rad, whose next term is below 1e-21."""
-    a, b, c, _ = eps
-    square = a * a + b * b + c * c
-    if square < 1e-4:
+def rotation_factors(square: Any) -> Any:
+    """f1 and f2 of :mod:`compgen.model.rotation` for the square of one angle."""
+    if square < SERIES_BELOW:
         first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
         second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
     else:
         angle = np.sqrt(square)
         first = np.sin(angle) / angle
         second = 2.0 * (np.sin(0.5 * angle) / angle) ** 2
+    return first, second
+
+
+@_inline
+def _turned(eps: Row, v: Row) -> Row:
+    """R(eps) v - v."""
+    a, b, c, _ = eps
+    first, second = rotation_factors(a * a + b * b + c * c)
     once = b * v[2] - c * v[1], c * v[0] - a * v[2], a * v[1] - b * v[0]
     twice = b * once[2] - c * once[1], c * once[0] - a * once[2], a * once[1] - b * once[0]
     return (

@@ -19,39 +19,8 @@ from compgen.core.csvio import FloatArray
 from compgen.core.error_table import ErrorTable
 from compgen.core.machine import Machine
 from compgen.core.names import ERROR_INDEX, ERRORS
+from compgen.model.rotation import rotate, rotation_derivative
 from compgen.model.volumetric import tool_of
-
-
-def _sine_ratios(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """sin(a)/a and (1 - cos(a))/a^2, without loss of digits for small angles."""
-    return np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-
-
-def rotate(eps_rad: FloatArray, vector: FloatArray) -> FloatArray:
-    """Turn vectors (n, 3) by rotation vectors (n, 3) in rad (Rodrigues' formula)."""
-    first, second = _sine_ratios(np.linalg.norm(eps_rad, axis=1))
-    once = np.cross(eps_rad, vector)
-    return vector + first[:, None] * once + second[:, None] * np.cross(eps_rad, once)
-
-
-def _turn_columns(eps_rad: FloatArray, columns: FloatArray) -> FloatArray:
-    """Turn every column of (n, 3, k) by the rotation vectors (n, 3)."""
-    first, second = _sine_ratios(np.linalg.norm(eps_rad, axis=1))
-    eps = eps_rad[:, :, None]
-    once = np.cross(eps, columns, axis=1)
-    return columns + first[:, None, None] * once + second[:, None, None] * np.cross(eps, once, axis=1)
-
-
-def _rotation_derivative(eps_rad: FloatArray, turned: FloatArray) -> FloatArray:
-    """d(R(eps) v)/d eps = -[R v]x J_l(eps), shape (n, 3, 3); ``turned`` is R v. J_l: left Jacobian of SO(3)."""
-    angle = np.linalg.norm(eps_rad, axis=1)
-    _, second = _sine_ratios(angle)
-    third = 1 / 6 - angle**2 / 120  # (a - sin a)/a^3, exact to 1e-9 for a < 0.03 rad
-    identity = np.broadcast_to(np.eye(3), (len(eps_rad), 3, 3))
-    eps = eps_rad[:, :, None]
-    once = np.cross(eps, identity, axis=1)
-    left = identity + second[:, None, None] * once + third[:, None, None] * np.cross(eps, once, axis=1)
-    return -np.cross(turned[:, :, None], left, axis=1)
 
 
 def _squareness_vectors(machine: Machine, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -120,7 +89,7 @@ def exact_columns(
         linear, angular = slice(6 * axis, 6 * axis + 3), slice(6 * axis + 3, 6 * axis + 6)
         if tool_side:
             turned = rotate(eps, tip)
-            columns = _turn_columns(eps, columns)
+            columns = rotate(eps, columns)
             tip = travel[axis] + delta + turned
         else:
             tip = tip + travel[axis] + delta
@@ -128,53 +97,21 @@ def exact_columns(
         _add_squareness(machine, columns, turns[axis], travel[axis], axis)
         if not tool_side:
             tip = turned = rotate(eps, tip)
-            columns = _turn_columns(eps, columns)
-        columns[:, :, angular] += _rotation_derivative(eps, turned)
+            columns = rotate(eps, columns)
+        columns[:, :, angular] += rotation_derivative(eps, turned)
     return tip, columns
 
 
 def _add_squareness(machine: Machine, columns: FloatArray, turn: FloatArray, travel: FloatArray, axis: int) -> None:
     """Add the derivative of the travel vector of ``axis`` by the squareness errors that turn it."""
     if axis == 0 and machine.squareness_reference == "Y":
-        columns[:, :, ERROR_INDEX["EC0Y"]] -= _rotation_derivative(turn, travel)[:, :, 2]
+        columns[:, :, ERROR_INDEX["EC0Y"]] -= rotation_derivative(turn, travel)[:, :, 2]
     elif axis == 1 and machine.squareness_reference == "X":
-        columns[:, :, ERROR_INDEX["EC0Y"]] += _rotation_derivative(turn, travel)[:, :, 2]
+        columns[:, :, ERROR_INDEX["EC0Y"]] += rotation_derivative(turn, travel)[:, :, 2]
     elif axis == 2:
-        derivative = _rotation_derivative(turn, travel)
+        derivative = rotation_derivative(turn, travel)
         columns[:, :, ERROR_INDEX["EA0Z"]] += derivative[:, :, 0]
         columns[:, :, ERROR_INDEX["EB0Z"]] += derivative[:, :, 1]
-
-
-def rotation_matrices(eps_rad: FloatArray) -> FloatArray:
-    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3) in rad."""
-    return level_rotations(eps_rad)[0]
-
-
-def level_rotations(eps_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotation matrices and left Jacobians J_l of SO(3), each (n, 3, 3), of rotation vectors (n, 3) in rad.
-
-    R(eps + d) = R(J_l d) R(eps) to first order in d.
-    """
-    square = np.einsum("ij,ij->i", eps_rad, eps_rad)
-    if square.size and square.max() > 1e-4:
-        first, second = _sine_ratios(np.sqrt(square))
-    else:  # the series is exact to the last digit for angles below 0.01 rad
-        first = 1 - square / 6 * (1 - square / 20)
-        second = 0.5 - square / 24 * (1 - square / 30)
-    cross = cross_matrices(eps_rad)
-    twice = cross @ cross
-    identity = np.eye(3)
-    rotation = identity + first[:, None, None] * cross + second[:, None, None] * twice
-    jacobian = identity + second[:, None, None] * cross + (1 / 6 - square / 120)[:, None, None] * twice
-    return rotation, jacobian
-
-
-def cross_matrices(vectors: FloatArray) -> FloatArray:
-    """Matrices (n, 3, 3) of the cross product with vectors (n, 3) from the left."""
-    matrices = np.zeros((len(vectors), 3, 3))
-    matrices[:, 2, 1], matrices[:, 0, 2], matrices[:, 1, 0] = vectors.T
-    matrices[:, 1, 2], matrices[:, 2, 0], matrices[:, 0, 1] = -vectors.T
-    return matrices
 
 
 def travel_directions(machine: Machine, squareness_rad: FloatArray) -> tuple[FloatArray, FloatArray]:

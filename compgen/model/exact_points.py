@@ -21,12 +21,12 @@ from compgen.core.machine import Machine
 from compgen.model import kernels
 from compgen.model.evaluate import blocks, checked_out, checked_points
 from compgen.model.exact import passing_order, travel_directions
+from compgen.model.rotation import rotation_factors
 from compgen.model.tables import AxisTable, AxisTables, motion_tables
 from compgen.model.volumetric import tool_of
 
 #: From so many points on, loading the kernels pays for a single call.
 _POINTS_FOR_KERNELS = 5_000_000
-_SERIES_BELOW = 1e-4  # rad^2: there the next term of the series is below 1e-21
 _SQUARENESS = ("EC0Y", "EB0Z", "EA0Z")
 
 Vector = list[FloatArray]
@@ -101,13 +101,7 @@ def _motion(table: AxisTable, coordinate: FloatArray) -> tuple[Vector, Vector]:
 
 def _turned(eps: Vector, nominal: Vector, error: Vector) -> Vector:
     """R(eps) x - x for x = nominal + error, by Rodrigues' formula; components (m,)."""
-    square = eps[0] * eps[0] + eps[1] * eps[1] + eps[2] * eps[2]
-    if np.max(square, initial=0.0) < _SERIES_BELOW:
-        first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
-        second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
-    else:
-        angle = np.sqrt(square)
-        first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    first, second = rotation_factors(eps[0] * eps[0] + eps[1] * eps[1] + eps[2] * eps[2])
     once = _cross(eps, [n + e for n, e in zip(nominal, error, strict=True)])
     return [first * a + second * b for a, b in zip(once, _cross(eps, once), strict=True)]
 
