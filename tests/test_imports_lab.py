@@ -597,3 +597,17 @@ def test_what_a_person_would_ask_about_is_asked(tmp_path, text, what):
     path = written(tmp_path, text, "t.csv")
     with pytest.raises(InputError, match=what):
         open_measurement([path])
+
+
+def test_runs_without_a_direction_that_differ_like_two_directions_are_asked_for(tmp_path):
+    path = written(tmp_path, sheet([f"Run {k}" for k in (1, 2, 3, 4)]))
+    (doubt,) = import_file(path, ImportOptions(axis="X")).doubts
+    assert "--directions alternate" in doubt
+    item = import_file(path, ImportOptions(axis="X", directions="alternate"))
+    assert item.doubts == ()
+    assert_is_the_example(item.data)
+    alike = "Position [mm];Run 1;Run 2;Run 3;Run 4\n-800;1,0;1,2;1,3;1,1\n-400;2,2;2,0;2,1;2,2\n0;5,1;5,2;5,0;5,1\n"
+    item = import_file(written(tmp_path, alike), ImportOptions(axis="X"))
+    assert item.doubts == ()
+    assert any("no run names a direction" in note for note in item.notes)
+    assert item.data.direction.tolist() == [1] * 12

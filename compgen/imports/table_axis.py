@@ -76,7 +76,7 @@ def axis_readings(findings: Findings, *, angular: bool = False) -> tuple[dict[st
     for letter in dict.fromkeys(letters):
         own = np.flatnonzero(np.array(letters) == letter)
         line = np.array(findings.table.lines, dtype=np.int64)[rows.row[own]]
-        direction, run = _directions(findings, target[own], rows.run[own], rows.label[own])
+        direction, run = _directions(findings, target[own], rows.run[own], rows.label[own], value[own])
         beside = {name: values[rows.row[own]] for name, values in further.covariates.items()}
         by_rows = not rows.label[own].any() and findings.options.directions != "alternate"
         in_time = by_rows and bool(np.all(np.diff(rows.run[own]) >= 0))
@@ -395,7 +395,9 @@ def _axis_said(key: str, text: str) -> str | None:
     return found.pop() if len(found) == 1 else None
 
 
-def _directions(findings: Findings, target: FloatArray, run: IntArray, label: IntArray) -> tuple[IntArray, IntArray]:
+def _directions(
+    findings: Findings, target: FloatArray, run: IntArray, label: IntArray, value: FloatArray
+) -> tuple[IntArray, IntArray]:
     """Direction of travel and number of the cycle: labels, against the order of the rows where that tells."""
     chosen = findings.options.directions
     one_way = run if run.any() else _sweeps(target)
@@ -407,6 +409,14 @@ def _directions(findings: Findings, target: FloatArray, run: IntArray, label: In
         if len(set(zip(one_way.tolist(), target.tolist(), strict=True))) < len(target):
             one_way = _sweeps(target, one_way)  # a run that goes forth and back
         direction = motion(target, one_way)
+        if len(findings.runs) > 1 and chosen is None:
+            if _alternate(target, run, value):
+                findings.doubts.append(
+                    "no run names a direction, and odd and even runs differ as two directions do; say --directions alternate "
+                    "(odd runs up, even runs down) or motion (all in the order of the rows)"
+                )
+            else:
+                findings.notes.append("no run names a direction: all are taken as made in the order of the rows")
         findings.understood.setdefault("directions_from", "the order of the rows")
         if not direction.all():
             header = shown(", ".join(findings.table.header), 200)
@@ -427,6 +437,23 @@ def _directions(findings: Findings, target: FloatArray, run: IntArray, label: In
         )
     findings.understood.setdefault("directions_from", "the labels" if chosen != "motion" else "the order of the rows")
     return label, run if run.any() else cycles(label, _repeats(target, label))
+
+
+def _alternate(target: FloatArray, run: IntArray, value: FloatArray) -> bool:
+    """Whether odd and even runs differ by more than four standard uncertainties of their scatter: a reversal, most likely."""
+    keys = np.round(target / SAME_TARGET_MM).astype(np.int64)
+    gaps, squares, freedom = [], 0.0, 0
+    for key in np.unique(keys):
+        odd, even = (value[(keys == key) & (run % 2 == part)] for part in (1, 0))
+        if not len(odd) or not len(even):
+            continue
+        gaps.append(odd.mean() - even.mean())
+        squares += float(np.sum((odd - odd.mean()) ** 2) + np.sum((even - even.mean()) ** 2))
+        freedom += len(odd) + len(even) - 2
+    if not freedom or len(gaps) < 2:
+        return False
+    scatter = float(np.sqrt(squares / freedom))
+    return bool(abs(float(np.mean(gaps))) > 4.0 * scatter * 2.0 / np.sqrt(len(value)))
 
 
 def _sweeps(target: FloatArray, run: IntArray | None = None) -> IntArray:
