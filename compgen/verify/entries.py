@@ -346,12 +346,11 @@ class EntryCheck:
         self, tables: ReadTables, position_mm: FloatArray, tool_mm: FloatArray | None, side: float | None
     ) -> FloatArray:
         """Correction at points (n, 3) after travel in one direction, the mean of both without one, shape (n, 3)."""
-        if tool_mm is None and side is None:
-            return tables.mean_correction(self.machine, position_mm)
         tools = None if tool_mm is None else np.array(np.broadcast_to(tool_mm, position_mm.shape))
-        approach = None if side is None else np.full_like(position_mm, side)
-        added = tables.correction(self.machine, Points(position_mm, tools, approach))
-        return added if side is None else added - tables.anchor_offset_mm(self.machine)
+        if side is None:
+            return tables.mean_correction(self.machine, position_mm, tools)
+        added = tables.correction(self.machine, Points(position_mm, tools, np.full_like(position_mm, side)))
+        return added - tables.anchor_offset_mm(self.machine)
 
     # --- what is wrong with them ----------------------------------------------------------------------------------
 

@@ -30,9 +30,9 @@ def in_both_directions(points: Points) -> Points:
     return Points(np.vstack([points.position_mm] * 2), tool_mm, np.vstack([up, -up]))
 
 
-def mean_correction(correction: Correction, position_mm: FloatArray) -> FloatArray:
+def mean_correction(correction: Correction, position_mm: FloatArray, tool_mm: FloatArray | None = None) -> FloatArray:
     """Return the mean of the corrections after positive and after negative travel of all axes, shape (n, 3), mm."""
-    both = correction(in_both_directions(Points(position_mm)))
+    both = correction(in_both_directions(Points(position_mm, tool_mm)))
     return np.asarray(0.5 * (both[: len(position_mm)] + both[len(position_mm) :]))
 
 

@@ -73,15 +73,20 @@ class ReadTables:
         """Return what the control adds to the command at each point, shape (n, 3), mm."""
         return np.asarray(self.controller.emulate(machine, self.settings, self.tables, points))
 
-    def mean_correction(self, machine: Machine, position_mm: FloatArray) -> FloatArray:
-        """Return what the control adds at positions (n, 3), the mean of both directions of travel, shape (n, 3), mm."""
+    def mean_correction(
+        self, machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | None = None
+    ) -> FloatArray:
+        """Return what the control adds at positions (n, 3), the mean of both directions of travel, shape (n, 3), mm.
+
+        ``tool_mm`` are the tool offsets (n, 3), None for the machine's own.
+        """
         if not self.controller.bidirectional:
-            return self.correction(machine, Points(position_mm))
+            return self.correction(machine, Points(position_mm, tool_mm))
 
         def added(points: Points) -> FloatArray:
             return self.correction(machine, points)
 
-        return mean_correction(added, position_mm) - self.anchor_offset_mm(machine)
+        return mean_correction(added, position_mm, tool_mm) - self.anchor_offset_mm(machine)
 
     def anchor_offset_mm(self, machine: Machine) -> FloatArray:
         """Return the mean of both directions where an anchored control's tables are zero, shape (3,), mm.
