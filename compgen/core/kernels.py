@@ -34,7 +34,7 @@ def kernel_choice() -> str:
     """Value of ``COMPGEN_KERNELS``: auto, compiled or plain; InputError for anything else."""
     choice = os.environ.get(VARIABLE, "").strip().lower() or AUTO
     if choice not in (AUTO, COMPILED, PLAIN):
-        raise InputError(f"{VARIABLE} is {choice!r}; set it to auto, compiled or plain", field=VARIABLE)
+        raise InputError(f"{VARIABLE} is {choice!r}; set it to auto, compiled or plain")
     return choice
 
 
@@ -53,8 +53,7 @@ def use_compiled(size: int, enough: int) -> bool:
         return True
     if choice == COMPILED:
         raise InputError(
-            f"{VARIABLE} is 'compiled', but numba cannot be imported; install compgen[fast] or set it to auto or plain",
-            field=VARIABLE,
+            f"{VARIABLE} is 'compiled', but numba cannot be imported; install compgen[fast] or set it to auto or plain"
         )
     return False
 
