@@ -611,3 +611,10 @@ def test_runs_without_a_direction_that_differ_like_two_directions_are_asked_for(
     assert item.doubts == ()
     assert any("no run names a direction" in note for note in item.notes)
     assert item.data.direction.tolist() == [1] * 12
+
+
+def test_a_single_target_and_empty_runs_are_answered(tmp_path):
+    item = import_file(written(tmp_path, "X-Achse Fehler\nPosition [mm];vor [µm];zurück [µm]\n0;5,0;7,5\n", "t.csv"))
+    assert item.data.deviation_mm.tolist() == [0.005, 0.0075]
+    with pytest.raises(InputError, match="the columns of the runs are empty"):
+        import_file(written(tmp_path, "X-Achse Fehler\nPosition [mm];Nr;vor [µm]\n0;1;\n9;2;\n", "t.csv"))

@@ -98,6 +98,8 @@ class Slope:
 
 def slope_of(target: FloatArray, reading: FloatArray) -> Slope:
     """Compare readings with targets, both (n,): the size of the slope is a ratio of units, its sign a sign."""
+    if np.ptp(target) == 0.0:  # a single target shows no slope
+        return Slope(0.0, float(np.mean(reading)), None, 1)
     slope, offset = np.polyfit(target, reading, 1).tolist()
     for ratio in (1.0, 1e3, 1e-3, 25.4, 1.0 / 25.4, 1e4):
         if abs(abs(slope) / ratio - 1.0) < SLOPE_TOLERANCE:

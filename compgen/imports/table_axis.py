@@ -236,6 +236,8 @@ def _wide(findings: Findings, columns: Sequence[RunColumn]) -> _Rows:
         parts.append((row, np.full(len(row), column.number), label, values[row]))
         if not len(row):
             findings.notes.append(f"{column.name!r} is empty")
+    if not any(len(part[0]) for part in parts):
+        raise findings.table.grid.fail("the columns of the runs are empty", findings.table.header_line)
     _statistics(findings, columns)
     row, run, label, value = (np.concatenate([part[k] for part in parts]) for k in range(4))
     first = columns[0]
