@@ -523,6 +523,27 @@ def test_an_older_copy_that_is_written_over_the_open_file_is_noticed(tmp_path):
     store.close()
 
 
+def test_a_backup_of_the_same_rows_that_is_written_over_the_open_file_is_noticed(tmp_path):
+    """Its pages lie in another order, and the write-ahead log of the store would be laid over them."""
+    path = tmp_path / "recal.sqlite"
+    store = open_store(str(path))
+    machine = store.add_machine("mill")
+    processed(store, machine, 1)
+    checkpointed(path)
+    with sqlite3.connect(path) as connection:  # as an older program made it
+        connection.execute("PRAGMA user_version = 0")
+    connection.close()
+    checkpointed(path)
+    store.close()
+    store = open_store(str(path))
+    store.version()
+    backup(str(path), tmp_path / "copy.sqlite")
+    decisions.approve(store, machine, 1, "ada")  # in the write-ahead log only
+    shutil.copyfile(tmp_path / "copy.sqlite", path)
+    with pytest.raises(StoreError, match="was moved, removed or replaced"):
+        store.version()
+
+
 def test_another_store_that_is_written_over_the_open_file_is_noticed(tmp_path):
     stores = []
     for number, seed in enumerate((1, 5)):

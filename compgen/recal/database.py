@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import time
 from collections.abc import Callable
 from functools import lru_cache
@@ -156,16 +157,34 @@ def _may_pass(error: sa.exc.SQLAlchemyError) -> bool:
     return not any(word in text for word in lasting)
 
 
-def upgrade(engine: sa.Engine) -> None:
-    """Bring the schema to :data:`HEAD`; InputError for a store that a newer program made."""
+def upgrade(engine: sa.Engine) -> int:
+    """Bring the schema to :data:`HEAD`; InputError for a store that a newer program made.
+
+    Returns
+    -------
+    The number that the file of an SQLite store has alone, so that another file in its place is noticed; else 0.
+    """
     with engine.connect().execution_options(reading=True) as connection:
-        if _revision(connection) == HEAD:
-            return
+        number = _number(connection)
+        if _revision(connection) == HEAD and number is not None:
+            return number
     with engine.begin() as connection:
         if connection.dialect.name == "postgresql":
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(UPGRADE_LOCK)))
         if _revision(connection) != HEAD:
             _migrate(connection)
+        number = _number(connection)
+        if number is None:
+            number = 1 + secrets.randbelow(2**31 - 1)
+            connection.exec_driver_sql(f"PRAGMA user_version = {number}")
+    return number
+
+
+def _number(connection: sa.Connection) -> int | None:
+    """Return the number of the file, None where it has none yet, 0 where the store is not a file."""
+    if connection.dialect.name != "sqlite":
+        return 0
+    return int(connection.exec_driver_sql("PRAGMA user_version").scalar() or 0) or None
 
 
 def _revision(connection: sa.Connection) -> str | None:

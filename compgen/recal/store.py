@@ -53,9 +53,9 @@ class Store:
     to an open file that nobody finds any more is lost, and what goes into another store spoils both.
     """
 
-    def __init__(self, engine: sa.Engine, url: str, clock: Clock | None = None) -> None:
+    def __init__(self, engine: sa.Engine, url: str, clock: Clock | None = None, number: int = 0) -> None:
         self.engine, self.url, self._clock = engine, url, clock
-        self._file = _File(Path(str(engine.url.database))) if engine.dialect.name == "sqlite" else None
+        self._file = _File(Path(str(engine.url.database)), number) if engine.dialect.name == "sqlite" else None
 
     def close(self) -> None:
         """Give the connections back."""
@@ -381,15 +381,16 @@ class Store:
 class _File:
     """The file of an SQLite store as it was opened, for finding out whether another one came into its place.
 
-    A copy may also be written over it (``cp``), which leaves place and number of the file. In a store rows are only
-    added, so those that were in the file must still be there as they were. It is looked into when its time changed.
+    A copy may also be written over it (``cp``), which leaves its place on the disk. Every file has a number of its own, also
+    a backup; and in a store rows are only added, so those that were in the file must still be there as they were, which an
+    older raw copy does not have. The file is looked into when its time changed.
     """
 
     #: Tables whose newest rows are compared.
     TABLES = ("measurements", "decisions", "events")
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, number: int) -> None:
+        self._path, self._number = path, number
         self._place, self._written = self._look()
         self._rows: dict[str, Any] = {}
         self._has_rows()
@@ -425,6 +426,9 @@ class _File:
         try:
             address = f"{self._path.absolute().as_uri()}?mode=ro&immutable=1"
             with closing(sqlite3.connect(address, uri=True)) as connection:
+                number = connection.execute("PRAGMA user_version").fetchone()[0]
+                if number not in (0, self._number):  # 0: it is in the log still
+                    return False
                 if connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
                     return not self._rows  # a new store whose tables are in the log still
                 for table in self.TABLES:
@@ -477,8 +481,8 @@ def open_store(url: str, *, clock: Clock | None = None) -> Store:
         if it cannot be reached after some attempts.
     """
     engine = engine_of(url)
-    retried(lambda: upgrade(engine), url)
-    return Store(engine, url, clock)
+    number = retried(lambda: upgrade(engine), url)
+    return Store(engine, url, clock, number)
 
 
 def _where(query: sa.Select[Any], table: sa.Table, machine: MachineRecord | None) -> sa.Select[Any]:
