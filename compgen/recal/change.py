@@ -25,9 +25,9 @@ from compgen.model.volumetric import volumetric_error
 
 #: Points along each axis of the grid on which the change is looked at.
 POINTS = 6
-#: A change is like a field if what the two differ by, beyond the noise, is at most this share of the field (rms): the
-#: machine may have drifted as well since.
-ALIKE = 0.5
+#: A change is like a field if it differs from it by at most the first share of the field (rms) beyond the noise, or by at
+#: most the second one where it holds the field just once, give or take the third: then a drift of another shape came on top.
+ALIKE, DRIFTED, ONCE = 0.25, 0.5, 0.1
 #: Probabilities below this are said as that: the number of independent directions is hardly known.
 LEAST_P = 1e-9
 
@@ -111,7 +111,7 @@ def likeness(
     noise = sum(float(np.sum((keep @ factor) ** 2)) for factor in factors)
     free = _directions(machine, new[0], position_mm, keep)
     best: Likeness | None = None
-    nearest = ALIKE
+    nearest = DRIFTED
     signed = [
         *((name, 1, field) for name, field in added.items()),
         *((name, -1, field) for name, field in missing.items()),
@@ -123,7 +123,8 @@ def likeness(
             continue  # too small to be told from nothing, or the other way round
         apart = float(np.sum((moved - sign * known) ** 2))
         share = float(np.sqrt(max(apart - noise, 0.0) / square))
-        if share <= nearest:
+        once = abs(sign * product / square - 1.0) <= ONCE
+        if share <= (nearest if once else min(nearest, ALIKE)):
             nearest = share
             correlation = product / float(np.sqrt(square * (moved @ moved)))
             p_value = min(1.0, len(signed) * (0.5 * min(float(np.sqrt(apart / square)), 2.0)) ** free)
