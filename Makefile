@@ -13,7 +13,7 @@ COMPILE = uv pip compile --quiet --all-extras --universal --python-version 3.11 
 .DELETE_ON_ERROR:
 
 demo: .venv/ready
-	$(BIN)/compgen run zha-gantry examples/zha-gantry.lengths.csv $(foreach name,$(CONTROLLERS),--controller $(name)) --out demo-out
+	$(BIN)/volcomp run zha-gantry examples/zha-gantry.lengths.csv $(foreach name,$(CONTROLLERS),--controller $(name)) --out demo-out
 	$(BIN)/python examples/against_truth.py demo-out
 
 test: lint system

@@ -1,4 +1,4 @@
-"""Blind axis sessions (ISO 230-2) through ``compgen diagnose``: right names, false alarms, honesty. Seeded; prints a table.
+"""Blind axis sessions (ISO 230-2) through ``volcomp diagnose``: right names, false alarms, honesty. Seeded; prints a table.
 
     python benchmarks/axis_diagnosis.py [--sets 300] [--seed 5000] [--workers 2] [--kinds null,warmup] [--details FILE]
 

@@ -1,4 +1,4 @@
-"""Blind sets through ``compgen diagnose``: right names, false alarms, honesty. Seeded; prints a table.
+"""Blind sets through ``volcomp diagnose``: right names, false alarms, honesty. Seeded; prints a table.
 
     python benchmarks/diagnosis.py [--sets 40] [--seed 5000] [--workers 2] [--kinds null,single] [--plans standard]
 

@@ -9,7 +9,7 @@ curve, written as a quadratic form (the form that suits it best). The smoothness
 "no bound active": bounds are there and none is touched. "active": 0.8 of the largest value and 0.6 of the largest slope
 of each curve, so that every curve touches bounds.
 
-"with covariance" is what ``compgen run`` does: ``fit`` with the joint covariance of the nodes, the whole call (zeroing,
+"with covariance" is what ``volcomp run`` does: ``fit`` with the joint covariance of the nodes, the whole call (zeroing,
 search for the smoothness, solution, uncertainties, report), and its solution at the smoothness found, alone. The others get
 the programs of that smoothness and only solve.
 """

@@ -1,4 +1,4 @@
-"""Public ISO 230-2 measurements through ``compgen diagnose`` (python benchmarks/public_axis_diagnosis.py FOLDER...).
+"""Public ISO 230-2 measurements through ``volcomp diagnose`` (python benchmarks/public_axis_diagnosis.py FOLDER...).
 
 FOLDERs are checkouts of the repositories that docs/real-measurements.md names; nothing of them is part of this project.
 Each ``.dat`` file is read as the commands read it and diagnosed; reports that print their readings (rounded) are taken

@@ -1,4 +1,4 @@
-"""Kills ``compgen recal run`` at random moments (kill -9) and looks whether anything is lost, half done or done twice.
+"""Kills ``volcomp recal run`` at random moments (kill -9) and looks whether anything is lost, half done or done twice.
 
     python benchmarks/recal_faults.py [--kills 200] [--seed 1] [--store postgresql://USER@HOST/EMPTY]
 

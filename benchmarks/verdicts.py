@@ -116,7 +116,7 @@ def texts_of(machine: Machine, errors: ErrorTable, name: str) -> tuple[dict[str,
 
 
 def read_texts(machine: Machine, name: str, texts: dict[str, str]) -> ReadTables:
-    """Parse texts as ``compgen verify`` does."""
+    """Parse texts as ``volcomp verify`` does."""
     control = CONTROLLERS[name]
     settings = control.read_settings(machine)
     sources = [SourceFile(Path(file), text) for file, text in texts.items()]

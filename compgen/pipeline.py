@@ -280,7 +280,7 @@ def identify_bare(
     if active is None or not isinstance(measurement, Lengths | Deviations):
         raise InputError(
             "tables that were active (--active) can be taken out of lengths and deviations only; measure anything else with "
-            "the compensation off, and say so (no --active; in `compgen recal` active_table = none or measured_with = bare)"
+            "the compensation off, and say so (no --active; in `volcomp recal` active_table = none or measured_with = bare)"
         )
     wider, moved, report = without_active(machine, measurement, active)
     result = identify_measurement(wider, moved, options)

@@ -87,7 +87,7 @@ def test_every_help_has_units_and_an_example_that_parses(name):
     assert outcome.exit_code == 0
     assert any(unit in outcome.output for unit in ("mm", "um", "urad"))
     example = outcome.output.split("Example:")[1].split("Options:")[0].split()
-    assert example[:2] == ["compgen", name]
+    assert example[:2] == ["volcomp", name]
     command = cli.commands[name]
     with command.make_context(name, example[2:]):
         pass
@@ -660,7 +660,7 @@ def test_the_console_script_refuses_bad_input(tmp_path):
 
 @pytest.mark.parametrize("words", [("controllers",), ("controllers", "--json"), ("machines",)])
 def test_a_reader_that_stops_early_gets_no_verdict_and_no_traceback(words):
-    """As in ``compgen controllers | head -1``: the exit code is none of those that state a result."""
+    """As in ``volcomp controllers | head -1``: the exit code is none of those that state a result."""
     script = Path(sys.executable).with_name("compgen")
     read_end, write_end = os.pipe()
     os.close(read_end)

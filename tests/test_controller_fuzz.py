@@ -284,7 +284,7 @@ def test_a_good_beginning_with_much_garbage_behind_is_refused_in_time(name, head
 
 @pytest.mark.parametrize("name", ALL)
 def test_the_command_says_file_and_line_and_exits_with_2(name, machine, good, small_machine_file, tmp_path, capsys):
-    """``compgen read`` on a cut table: one message, no traceback, nothing written."""
+    """``volcomp read`` on a cut table: one message, no traceback, nothing written."""
     toml = tmp_path / "m.toml"
     shipped = SHIPPED.source.read_text()
     sections = shipped[shipped.index("[controllers.") :]

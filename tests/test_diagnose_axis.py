@@ -275,7 +275,7 @@ def test_the_extended_machine_takes_the_reversal_away(gantry, tmp_path, capsys):
     assert run_command(cli, ["diagnose", "zha-gantry", str(path), "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert "out/extended.toml" in said
-    assert "compgen run" in said
+    assert "volcomp run" in said
     assert not [line for line in said.splitlines() if line.startswith(("#", "* ", "|")) or "**" in line]
     extended = read_machine(tmp_path / "out/extended.toml")
     values = {item.name: item.summary() for item in active_effects(extended)}

@@ -1,4 +1,4 @@
-"""``compgen recal history --drift`` and ``recheck`` on a store: figures, page, points, tolerances, wrong input."""
+"""``volcomp recal history --drift`` and ``recheck`` on a store: figures, page, points, tolerances, wrong input."""
 
 import json
 from datetime import UTC, datetime, timedelta

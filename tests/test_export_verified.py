@@ -1,4 +1,4 @@
-"""``compgen export`` reads its files back: it never exits with 0 on tables that ``compgen verify`` refuses."""
+"""``volcomp export`` reads its files back: it never exits with 0 on tables that ``volcomp verify`` refuses."""
 
 import json
 from dataclasses import replace

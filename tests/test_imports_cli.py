@@ -1,4 +1,4 @@
-"""`compgen import`, and commands that are given foreign files: from file to tables in one command."""
+"""`volcomp import`, and commands that are given foreign files: from file to tables in one command."""
 
 import json
 import re

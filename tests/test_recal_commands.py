@@ -304,7 +304,7 @@ def test_without_a_version_nothing_is_approved_where_nobody_is_shown_it(waiting,
     assert waiting.call("approve", "mill", *more) == 2
     said = capsys.readouterr()
     assert "version 1 (pending) from a.deviations.csv, measured 2" in said.err + said.out
-    assert "compgen recal approve mill 1" in said.err + said.out
+    assert "volcomp recal approve mill 1" in said.err + said.out
     assert waiting.decided() == ["propose"]
 
 

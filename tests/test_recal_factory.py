@@ -1,4 +1,4 @@
-"""A factory of three simulated machines over twelve months under ``compgen recal``, held against its own truth.
+"""A factory of three simulated machines over twelve months under ``volcomp recal``, held against its own truth.
 
 The example in ``examples/factory`` runs once; every test looks at another side of the same year.
 """

@@ -50,7 +50,7 @@ def test_a_lost_store_processes_nothing_and_overwrites_nothing(second, listing, 
     second.measure("third", drifted(small_errors, 70.0), seed=3, active_table="none")
     outcome = second.run()
     assert (outcome.state, outcome.processed) == ("failed", ())
-    assert "was never active by this store" in outcome.messages[0] and "compgen recal adopt mill" in outcome.messages[0]
+    assert "was never active by this store" in outcome.messages[0] and "volcomp recal adopt mill" in outcome.messages[0]
     assert listing(second.out) == before
     assert second.tables() == []
 

@@ -1,4 +1,4 @@
-"""``compgen recal reprocess``: a stored measurement gives one more version; nothing that was there changes."""
+"""``volcomp recal reprocess``: a stored measurement gives one more version; nothing that was there changes."""
 
 import importlib.util
 import json

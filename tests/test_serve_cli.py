@@ -1,4 +1,4 @@
-"""``compgen serve`` as a program: users, unsafe options, a server that starts and stops; decisions reach the folders."""
+"""``volcomp serve`` as a program: users, unsafe options, a server that starts and stops; decisions reach the folders."""
 
 import json
 import os

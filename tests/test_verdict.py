@@ -93,7 +93,7 @@ def test_a_step_between_runs_is_not_accepted_and_names_the_next_command(stepped)
     codes = {item["code"]: item for item in result["objections"]}
     assert codes["step_between_runs"]["blocking"] is True
     assert "misfit" in codes
-    assert str(path) in result["next_command"] and result["next_command"].startswith("compgen diagnose ")
+    assert str(path) in result["next_command"] and result["next_command"].startswith("volcomp diagnose ")
     assert not (out / "volcomp0.csv").exists() and (out / "NOT-ACCEPTED-volcomp0.csv").exists()
     assert any("step between runs" in reason and "--allow-misfit" in reason for reason in result["reasons"])
 

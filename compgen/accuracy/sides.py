@@ -85,7 +85,7 @@ def read_side(
     u_um: float | None = None,
     reader: Reader = read_measurement,
 ) -> Side:
-    """Read an error file, a measurement, or predicted errors at points (the output of ``compgen predict``).
+    """Read an error file, a measurement, or predicted errors at points (the output of ``volcomp predict``).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The command line: ``compgen --help``."""
+"""The command line: ``volcomp --help``."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def cli() -> None:
 
     \b
     Example:
-      compgen run zha-gantry lengths.csv --controller isg-csv --out tables/
+      volcomp run zha-gantry lengths.csv --controller isg-csv --out tables/
     """
     load_plugins()
 

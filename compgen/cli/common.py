@@ -128,7 +128,7 @@ def out_option(command: Command) -> Command:
 
 def controller_option(*, multiple: bool = False) -> Callable[[Command], Command]:
     """Add --controller NAME."""
-    text = "Name of the control; `compgen controllers` lists them." + (
+    text = "Name of the control; `volcomp controllers` lists them." + (
         " May be given several times." if multiple else ""
     )
     return click.option("--controller", "controller", required=True, metavar="NAME", multiple=multiple, help=text)

@@ -1,4 +1,4 @@
-"""``compgen accuracy`` and ``compgen compare``."""
+"""``volcomp accuracy`` and ``volcomp compare``."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def accuracy_command(
 
     \b
     Example:
-      compgen accuracy zha-gantry identified/identified.errors.csv --out accuracy/
+      volcomp accuracy zha-gantry identified/identified.errors.csv --out accuracy/
     """
     OutputFolder(out)
     placed = _alignment(alignment, rigid=remove_rigid_motion)
@@ -234,7 +234,7 @@ def compare_command(
 
     \b
     Example:
-      compgen compare zha-gantry before.errors.csv after.errors.csv --out compared/
+      volcomp compare zha-gantry before.errors.csv after.errors.csv --out compared/
     """
     OutputFolder(out)
     if bool(tables) != (controller is not None):

@@ -1,4 +1,4 @@
-"""``compgen diagnose --each``: every measurement by itself, in this process, in several, or on a cluster."""
+"""``volcomp diagnose --each``: every measurement by itself, in this process, in several, or on a cluster."""
 
 from __future__ import annotations
 

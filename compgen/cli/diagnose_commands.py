@@ -1,4 +1,4 @@
-"""``compgen diagnose``."""
+"""``volcomp diagnose``."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def diagnose_command(
 
     \b
     Example:
-      compgen diagnose zha-gantry lengths.csv --out diagnosis/
+      volcomp diagnose zha-gantry lengths.csv --out diagnosis/
     """
     OutputFolder(out)
     names = tuple(name.strip() for name in effects.split(",") if name.strip()) if effects else ()

@@ -1,4 +1,4 @@
-"""``compgen export``, ``compgen read`` and ``compgen verify``."""
+"""``volcomp export``, ``volcomp read`` and ``volcomp verify``."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def export_command(
 
     \b
     Example:
-      compgen export zha-gantry fitted/fitted.errors.csv --controller siemens-cec --out tables/
+      volcomp export zha-gantry fitted/fitted.errors.csv --controller siemens-cec --out tables/
     """
     OutputFolder(out)
     table, beside = open_errors(errors), {}
@@ -157,7 +157,7 @@ def read_command(
 
     \b
     Example:
-      compgen read zha-gantry tables/volcomp0.csv --controller isg-csv --points p.points.csv --out correction.csv
+      volcomp read zha-gantry tables/volcomp0.csv --controller isg-csv --points p.points.csv --out correction.csv
     """
     where = read_points(points)
     parsed = read_tables(machine, tables, controller, foreign=True)
@@ -212,7 +212,7 @@ def verify_command(
 
     \b
     Example:
-      compgen verify zha-gantry tables/volcomp0.csv --controller isg-csv --errors identified.errors.csv --out check/
+      volcomp verify zha-gantry tables/volcomp0.csv --controller isg-csv --errors identified.errors.csv --out check/
     """
     OutputFolder(out)
     where = read_points(points) if points else None

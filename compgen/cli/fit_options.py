@@ -1,4 +1,4 @@
-"""What ``compgen fit`` and ``compgen run`` may be told about the fit, and where the fit finds the covariance."""
+"""What ``volcomp fit`` and ``volcomp run`` may be told about the fit, and where the fit finds the covariance."""
 
 from __future__ import annotations
 

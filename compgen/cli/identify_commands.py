@@ -1,4 +1,4 @@
-"""``compgen identify`` and ``compgen fit``."""
+"""``volcomp identify`` and ``volcomp fit``."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def identify_command(
 
     \b
     Example:
-      compgen identify zha-gantry examples/zha-gantry.lengths.csv --out identified/
+      volcomp identify zha-gantry examples/zha-gantry.lengths.csv --out identified/
     """
     if replicates is None and (workers > 1 or cluster is not None):
         raise InputError("--workers and --cluster share out the replicates of --self-check, which is not given")
@@ -252,11 +252,11 @@ def fit_command(
 
     ERRORS is an *.errors.csv file (um, urad), or the exchange file of a laser tracer's software (Etalon, variant Vendor;
     mm, rad). Writes fitted.errors.csv and fit.json to DIR. If the covariance that
-    compgen identify wrote lies beside ERRORS, its correlations count, else nodes are taken as independent.
+    volcomp identify wrote lies beside ERRORS, its correlations count, else nodes are taken as independent.
 
     \b
     Example:
-      compgen fit zha-gantry identified/identified.errors.csv --max-abs linear=20 --out fitted/
+      volcomp fit zha-gantry identified/identified.errors.csv --max-abs linear=20 --out fitted/
     """
     OutputFolder(out)
     table = open_errors(errors)

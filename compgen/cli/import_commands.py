@@ -1,4 +1,4 @@
-"""``compgen import``: what a foreign file holds, before anything is computed, and its contract file."""
+"""``volcomp import``: what a foreign file holds, before anything is computed, and its contract file."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def import_command(
 
     \b
     Example:
-      compgen import x-axis.rtl --machine zha-gantry --out imported/
+      volcomp import x-axis.rtl --machine zha-gantry --out imported/
     """
     target = OutputFolder(out) if out is not None else None
     kind = own_kind(file)

@@ -1,4 +1,4 @@
-"""``compgen controllers``, ``machines``, ``effects`` and ``instruments``: what is there."""
+"""``volcomp controllers``, ``machines``, ``effects`` and ``instruments``: what is there."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def controllers_command(name: str | None, as_json: bool) -> int:
 
     \b
     Example:
-      compgen controllers siemens-cec
+      volcomp controllers siemens-cec
     """
     if name is not None:
         _show_card(name, as_json)
@@ -87,7 +87,7 @@ def effects_command(name: str | None, as_json: bool) -> int:
 
     \b
     Example:
-      compgen effects backlash_X
+      volcomp effects backlash_X
     """
     if name is not None:
         _show_effect(name, as_json)
@@ -137,7 +137,7 @@ def instruments_command(as_json: bool) -> int:
 
     \b
     Example:
-      compgen instruments
+      volcomp instruments
     """
     return _list_readers(SIMULATED_INSTRUMENTS, as_json)
 
@@ -171,7 +171,7 @@ def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
 
     \b
     Example:
-      compgen machines
+      volcomp machines
     """
     local = Path("machines")
     files = machine_files((*((local,) if local.is_dir() else ()), *machines))

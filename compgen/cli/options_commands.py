@@ -1,4 +1,4 @@
-"""``compgen options``, and what ``--explain`` of export and run writes."""
+"""``volcomp options``, and what ``--explain`` of export and run writes."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def options_command(
 
     \b
     Example:
-      compgen options zha-gantry identified/identified.errors.csv --tool 0,0,-150
+      volcomp options zha-gantry identified/identified.errors.csv --tool 0,0,-150
     """
     if out is not None:
         OutputFolder(out)

@@ -1,4 +1,4 @@
-"""``compgen plan``."""
+"""``volcomp plan``."""
 
 from __future__ import annotations
 
@@ -94,12 +94,12 @@ def plan_command(
 
     Writes plan.json and plan.errors.csv (um, urad; values zero, u_value predicted) to DIR, with --suggest also
     suggested.stations.csv, with --target-um proposed.points.csv (mm). Says which effects beside the geometric errors the plan
-    can never see (compgen effects), and what to measure in addition. Without --u-length-um 0.1 um + 0.15 um/m is
+    can never see (volcomp effects), and what to measure in addition. Without --u-length-um 0.1 um + 0.15 um/m is
     assumed. Exit code 1 if an unknown is not determined, or no trajectory reaches the target.
 
     \b
     Example:
-      compgen plan zha-gantry --stations identified/stations.csv --grid --out plan/
+      volcomp plan zha-gantry --stations identified/stations.csv --grid --out plan/
     """
     OutputFolder(out)
     noise = planned_noise(IdentifyOptions(u_length_um, u_length_um_per_m))

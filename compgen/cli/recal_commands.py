@@ -1,4 +1,4 @@
-"""``compgen recal``: run, watch, status, history; what a command needs is imported when it runs."""
+"""``volcomp recal``: run, watch, status, history; what a command needs is imported when it runs."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def recal() -> None:
 
     \b
     Example:
-      compgen recal add mill-1 --machine mill-1.toml --inbox inbox/mill-1 --controller siemens-cec \\
+      volcomp recal add mill-1 --machine mill-1.toml --inbox inbox/mill-1 --controller siemens-cec \\
                     --out tables/mill-1 --measured-with active
-      compgen recal run
-      compgen recal approve mill-1 1
+      volcomp recal run
+      volcomp recal approve mill-1 1
     """
 
 
@@ -49,7 +49,7 @@ def needed() -> None:
 
     missing = [name for module, name in NEEDED.items() if importlib.util.find_spec(module) is None]
     if missing:
-        raise InputError(f"compgen recal needs {', '.join(missing)}; install compgen[recal]")
+        raise InputError(f"volcomp recal needs {', '.join(missing)}; install compgen[recal]")
 
 
 def job_option(command: Command) -> Command:
@@ -113,8 +113,8 @@ def run_command(
 
     \b
     Example:
-      compgen recal run --job /etc/compgen/recal.toml --json
-      compgen recal run --workers 8
+      volcomp recal run --job /etc/compgen/recal.toml --json
+      volcomp recal run --workers 8
     """
     from compgen.recal.fleet import run_fleet
 
@@ -167,7 +167,7 @@ def watch_command(
 
     \b
     Example:
-      compgen recal watch --job /etc/compgen/recal.toml
+      volcomp recal watch --job /etc/compgen/recal.toml
     """
     from compgen.recal.fleet import open_fleet, work_of
     from compgen.recal.watch import Watch
@@ -205,7 +205,7 @@ def status_command(machines: tuple[str, ...], job: Job, as_json: bool) -> int:
 
     \b
     Example:
-      compgen recal status --json
+      volcomp recal status --json
     """
     from compgen.recal.overview import status
 
@@ -251,8 +251,8 @@ def history_command(machine: str | None, job: Job, drift: bool, report: Path | N
 
     \b
     Example:
-      compgen recal history mill-1 --json
-      compgen recal history mill-1 --drift --report mill-1.html
+      volcomp recal history mill-1 --json
+      volcomp recal history mill-1 --drift --report mill-1.html
     """
     from compgen.recal.overview import history
 

@@ -1,4 +1,4 @@
-"""``compgen recal approve``, ``reject``, ``rollback`` and ``adopt``."""
+"""``volcomp recal approve``, ``reject``, ``rollback`` and ``adopt``."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def approve_command(
 
     \b
     Example:
-      compgen recal approve mill-1 3 --reason "checked with the ball bar"
+      volcomp recal approve mill-1 3 --reason "checked with the ball bar"
     """
     from compgen.recal.actions import approve
 
@@ -85,7 +85,7 @@ def _asked(store: Store, name: str, *, may_ask: bool) -> tuple[int, int]:
     what += measured.measured_at.isoformat(timespec="minutes")
     if not (may_ask and sys.stdin.isatty() and sys.stderr.isatty()):
         raise InputError(
-            f"{what}, waits; without a terminal say which version you mean: compgen recal approve {name} {table.version}",
+            f"{what}, waits; without a terminal say which version you mean: volcomp recal approve {name} {table.version}",
             field="VERSION",
         )
     active = decisions.active_table(store, machine)
@@ -108,7 +108,7 @@ def reject_command(machine: str, version: int | None, job: Job, actor: str | Non
 
     \b
     Example:
-      compgen recal reject mill-1 3 --reason "a fixture was loose"
+      volcomp recal reject mill-1 3 --reason "a fixture was loose"
     """
     from compgen.recal.actions import reject
 
@@ -128,7 +128,7 @@ def rollback_command(machine: str, job: Job, to: int | None, actor: str | None, 
 
     \b
     Example:
-      compgen recal rollback mill-1 --reason "parts out of tolerance since Monday"
+      volcomp recal rollback mill-1 --reason "parts out of tolerance since Monday"
     """
     from compgen.recal.actions import rollback
 
@@ -148,7 +148,7 @@ def adopt_command(machine: str, job: Job, actor: str | None, reason: str, as_jso
 
     \b
     Example:
-      compgen recal adopt mill-1 --reason "store restored from the backup of Sunday"
+      volcomp recal adopt mill-1 --reason "store restored from the backup of Sunday"
     """
     from compgen.recal.actions import adopt
 

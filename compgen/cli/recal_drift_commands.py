@@ -1,4 +1,4 @@
-"""``compgen recal history MACHINE --drift``, ``compgen recal recheck`` and ``compgen recal exclude``."""
+"""``volcomp recal history MACHINE --drift``, ``volcomp recal recheck`` and ``volcomp recal exclude``."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _write(path: Path, drift: Drift) -> Path:
 
 @recal.command("recheck")
 @click.argument("machine")
-@click.option("--stations", required=True, metavar="FILE", help="Stations file of compgen plan or identify.")
+@click.option("--stations", required=True, metavar="FILE", help="Stations file of volcomp plan or identify.")
 @click.option("--error", required=True, metavar="NAME", help="Error whose change is to be seen, e.g. EC0Y.")
 @click.option("--change", required=True, type=NUMBER, metavar="SIZE", help="Its size, um or urad.")
 @click.option("--power", default=0.9, show_default=True, type=NUMBER, help="Probability of seeing it.")
@@ -84,7 +84,7 @@ def recheck_command(
 
     \b
     Example:
-      compgen recal recheck mill-1 --stations stations.csv --error EC0Y --change 10 --points recheck.points.csv
+      volcomp recal recheck mill-1 --stations stations.csv --error EC0Y --change 10 --points recheck.points.csv
     """
     from compgen.core.names import ERROR_NAMES, error_named
     from compgen.core.text import nearest
@@ -133,7 +133,7 @@ def exclude_command(
 
     \b
     Example:
-      compgen recal exclude mill-1 5 --reason "the sign of the deviations was wrong"
+      volcomp recal exclude mill-1 5 --reason "the sign of the deviations was wrong"
     """
     from compgen.recal.exclude import exclude
 

@@ -1,4 +1,4 @@
-"""``compgen recal reprocess``: identify and export again from a stored measurement."""
+"""``volcomp recal reprocess``: identify and export again from a stored measurement."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def reprocess_command(
 
     \b
     Example:
-      compgen recal reprocess mill-1 --reason "pitch of X corrected in the machine file"
-      compgen recal reprocess mill-1 --active-table v2 --reason "v2 was on, says the log of the control"
+      volcomp recal reprocess mill-1 --reason "pitch of X corrected in the machine file"
+      volcomp recal reprocess mill-1 --active-table v2 --reason "v2 was on, says the log of the control"
     """
     from compgen.recal.reprocess import Wish, reprocess
 

@@ -1,4 +1,4 @@
-"""``compgen recal add``, ``export-units``, ``backup`` and ``restore``: the job file, its units, the store as a whole."""
+"""``volcomp recal add``, ``export-units``, ``backup`` and ``restore``: the job file, its units, the store as a whole."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _PATH = click.Path(path_type=Path)
 @click.option("--program", default=None, metavar="PATH", help="The compgen command; default: the one that runs now.")
 @json_option
 def export_units_command(job: Job, out: Path, program: str | None, as_json: bool) -> int:
-    """Write systemd service and timer units and crontab lines that drive `compgen recal run` by the job's schedules.
+    """Write systemd service and timer units and crontab lines that drive `volcomp recal run` by the job's schedules.
 
     \b
     Example:
-      compgen recal export-units --out units/
+      volcomp recal export-units --out units/
     """
     from compgen.pipeline import write_all
     from compgen.recal.units import units
@@ -50,7 +50,7 @@ def backup_command(file: Path, job: Job, as_json: bool) -> int:
 
     \b
     Example:
-      compgen recal backup backups/2026-06-01.sqlite
+      volcomp recal backup backups/2026-06-01.sqlite
     """
     from compgen.recal.backup import backup
 
@@ -66,7 +66,7 @@ def restore_command(file: Path, job: Job, as_json: bool) -> int:
 
     \b
     Example:
-      compgen recal restore backups/2026-06-01.sqlite --job recal.toml
+      volcomp recal restore backups/2026-06-01.sqlite --job recal.toml
     """
     from compgen.recal.backup import restore
 
@@ -106,7 +106,7 @@ def add_command(name: str, job_file: Path, as_json: bool, controllers: tuple[str
 
     \b
     Example:
-      compgen recal add mill-1 --machine mill-1.toml --inbox inbox --controller siemens-cec --out tables \\
+      volcomp recal add mill-1 --machine mill-1.toml --inbox inbox --controller siemens-cec --out tables \\
                     --measured-with bare --schedule "30 6 * * mon"
     """
     needed()
@@ -117,7 +117,7 @@ def add_command(name: str, job_file: Path, as_json: bool, controllers: tuple[str
         print_json({"accepted": True, "job": str(job_file), "machine": added.name})
     else:
         stdout.print(
-            f"{added.name}: added to {job_file}; `compgen recal run --job {job_file}` looks into {added.inbox}"
+            f"{added.name}: added to {job_file}; `volcomp recal run --job {job_file}` looks into {added.inbox}"
         )
     return 0
 

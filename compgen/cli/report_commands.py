@@ -1,4 +1,4 @@
-"""``compgen report``."""
+"""``volcomp report``."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
 
     \b
     Example:
-      compgen report tables/ --dcc certificate.toml --dcc-schema dcc.xsd
+      volcomp report tables/ --dcc certificate.toml --dcc-schema dcc.xsd
     """
     from compgen.report.html import write_report
     from compgen.report.html.terminal import short_text

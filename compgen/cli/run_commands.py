@@ -1,4 +1,4 @@
-"""``compgen run``: the whole chain."""
+"""``volcomp run``: the whole chain."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def run_command(
 
     \b
     Example:
-      compgen run zha-gantry examples/zha-gantry.lengths.csv --controller isg-csv --out tables/
+      volcomp run zha-gantry examples/zha-gantry.lengths.csv --controller isg-csv --out tables/
     """
     with progress(quiet=as_json) as show:
         result = run(

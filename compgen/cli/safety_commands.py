@@ -1,4 +1,4 @@
-"""``compgen diff``, ``compgen merge`` and ``compgen crash-test``."""
+"""``volcomp diff``, ``volcomp merge`` and ``volcomp crash-test``."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def diff_command(
 
     \b
     Example:
-      compgen diff zha-gantry new/NC_CEC.INI --against old/NC_CEC.INI --controller siemens-cec --out diff/
+      volcomp diff zha-gantry new/NC_CEC.INI --against old/NC_CEC.INI --controller siemens-cec --out diff/
     """
     OutputFolder(out)
     first = read_tables(machine, tables, controller, foreign=True)
@@ -146,7 +146,7 @@ def merge_command(
 
     \b
     Example:
-      compgen merge zha-gantry old/NC_CEC.INI --controller siemens-cec --errors fitted.errors.csv --out merged/
+      volcomp merge zha-gantry old/NC_CEC.INI --controller siemens-cec --errors fitted.errors.csv --out merged/
     """
     OutputFolder(out)
     active = read_active(machine, old, controller_old or controller)
@@ -208,7 +208,7 @@ def crash_test_command(
 
     \b
     Example:
-      compgen crash-test zha-gantry fitted.errors.csv --controller siemens-cec
+      volcomp crash-test zha-gantry fitted.errors.csv --controller siemens-cec
     """
     table = open_errors(errors)
     results: list[CrashTest] = []

@@ -1,4 +1,4 @@
-"""``compgen serve``: the dashboard, and who may log in."""
+"""``volcomp serve``: the dashboard, and who may log in."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def serve_command(
 
     \b
     Example:
-      compgen serve add-user meyer --users users.json
-      compgen serve --job recal.toml --decide --users users.json
+      volcomp serve add-user meyer --users users.json
+      volcomp serve --job recal.toml --decide --users users.json
     """
     if context.invoked_subcommand is not None:
         return 0
@@ -135,7 +135,7 @@ def add_user(name: str, users: Path | None, store: str | None, password_stdin: b
 
     \b
     Example:
-      compgen serve add-user meyer --users users.json
+      volcomp serve add-user meyer --users users.json
     """
     file = _users(users, store)
     from compgen.serve.users import check_name
@@ -159,7 +159,7 @@ def remove_user(name: str, users: Path | None, store: str | None) -> int:
 
     \b
     Example:
-      compgen serve remove-user meyer --users users.json
+      volcomp serve remove-user meyer --users users.json
     """
     file = _users(users, store)
     file.remove(name)
@@ -176,7 +176,7 @@ def list_users(users: Path | None, store: str | None, as_json: bool) -> int:
 
     \b
     Example:
-      compgen serve users --users users.json
+      volcomp serve users --users users.json
     """
     names = _users(users, store).names()
     if as_json:

@@ -1,4 +1,4 @@
-"""``compgen simulate`` and ``compgen predict``."""
+"""``volcomp simulate`` and ``volcomp predict``."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
 
     \b
     Example:
-      compgen simulate zha-gantry --scenario examples/zha-gantry.scenario.toml --out simulated/
+      volcomp simulate zha-gantry --scenario examples/zha-gantry.scenario.toml --out simulated/
     """
     with progress(quiet=as_json) as show:
         show("simulating")
@@ -95,11 +95,11 @@ def predict_command(
     ERRORS is an *.errors.csv file (um, urad). With --exact the effects of the machine file that move the tip are added
     where the points hold their columns (approach_x ..., temp_..., time_s, feed_mm_min, load_kg). FILE gets the points plus
     ex_um, ey_um, ez_um, and with --uncertainty
-    u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that compgen identify wrote.
+    u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that volcomp identify wrote.
 
     \b
     Example:
-      compgen predict zha-gantry fitted/fitted.errors.csv --points p.points.csv --out predicted.csv
+      volcomp predict zha-gantry fitted/fitted.errors.csv --points p.points.csv --out predicted.csv
     """
     where = read_points(points)
     table = open_errors(errors)
@@ -130,7 +130,7 @@ def _effects_mm(machine: Machine, points: Points) -> FloatArray:
     """How the effects of the machine file move the tip at the points, (n, 3), mm; warns of columns that are missing."""
     moved_mm, missing = displacement_of(active_effects(machine), readings_of_points(machine, points))
     if missing:
-        message = f"the points lack the columns of {', '.join(missing)}: left out (compgen effects NAME lists them)"
+        message = f"the points lack the columns of {', '.join(missing)}: left out (volcomp effects NAME lists them)"
         warnings.warn(message, CompgenWarning, stacklevel=2)
     return moved_mm
 

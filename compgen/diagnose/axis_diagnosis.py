@@ -868,7 +868,7 @@ class AxisDiagnosis:
         if not sections or self.machine.source is None:
             return ""
         text = read_text(self.machine.source).rstrip("\n")
-        return "\n".join([text, "", "", "# found by compgen diagnose in axis runs", *sections])
+        return "\n".join([text, "", "", "# found by volcomp diagnose in axis runs", *sections])
 
     def removed_csv(self) -> str:
         """What was taken off which reading, um: one row for each reading in the order of time."""

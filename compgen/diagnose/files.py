@@ -33,8 +33,8 @@ def next_steps(files: Container[str], machine: str, measurement: str, out: str) 
         return ""
     return (
         f"{out}/extended.toml is the machine file with these effects; it takes them off the next measurement, for example\n"
-        f"  compgen run {out}/extended.toml {measurement} --controller NAME --out tables/\n"
-        f"in place of\n  compgen run {machine} {measurement} --controller NAME --out tables/"
+        f"  volcomp run {out}/extended.toml {measurement} --controller NAME --out tables/\n"
+        f"in place of\n  volcomp run {machine} {measurement} --controller NAME --out tables/"
     )
 
 

@@ -108,7 +108,7 @@ def extended_toml(machine: Machine, analysis: Analysis, found: Refit, groups: Se
         fitted = found.parameters.get(group, ())
         values = [p.value * own.si_per_unit for p, own in zip(fitted, item.effect.card.parameters, strict=True)]
         u = ", ".join(f"{p.name} {p.u:.2g}" for p in fitted)
-        lines += ["", f"# found by compgen diagnose: {one_line(item.effect.card.title)}; standard uncertainty {u}"]
+        lines += ["", f"# found by volcomp diagnose: {one_line(item.effect.card.title)}; standard uncertainty {u}"]
         lines.append(section_text(item.effect, found.fit.readings, np.array(values)).rstrip("\n"))
     return "\n".join(lines) + "\n"
 

@@ -99,7 +99,7 @@ def _read(machine: Machine, known: dict[str, Effect], name: str, raw: tomlio.Sec
         names = [other for other, effect in {**catalogue((ANY_STATION,)), **known}.items() if effect.card.parameters]
         hint = nearest(name, names)
         raise InputError(
-            f"{name!r} is no effect; {hint}; compgen effects lists all",
+            f"{name!r} is no effect; {hint}; volcomp effects lists all",
             file=raw.path,
             line=_line(raw),
             field=f"[{raw.name}]",

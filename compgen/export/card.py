@@ -34,7 +34,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class ControlCard:
-    """Everything that ``compgen controllers NAME`` says; ``problem`` is why not all settings could be found."""
+    """Everything that ``volcomp controllers NAME`` says; ``problem`` is why not all settings could be found."""
 
     format: Format
     settings: tuple[Setting, ...]

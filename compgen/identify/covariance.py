@@ -293,7 +293,7 @@ def read_covariance(path: str | Path, errors: str | Path | None = None) -> Covar
 
 def _members(source: Path, content: bytes) -> dict[str, NDArray[np.generic]]:
     if not content.startswith(b"PK"):
-        raise InputError("is not a covariance file (*.covariance.npz, written by compgen identify)", file=source)
+        raise InputError("is not a covariance file (*.covariance.npz, written by volcomp identify)", file=source)
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             members = {name: archive[name] for name in archive.files}

@@ -110,8 +110,8 @@ def _explained(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> 
     for name, label in labels_of(lengths.labels, lengths.origin, lengths.position_mm, lengths.station).items():
         if label.min() < label.max() and _split_by(machine, lengths, options, label) is not None:
             found = f"with dead lengths of its own for each {name} the readings fit: there is a step between {name}s"
-            return f"; {found}; `compgen diagnose` shows it"
-    return "; `compgen diagnose` looks for what the model lacks"
+            return f"; {found}; `volcomp diagnose` shows it"
+    return "; `volcomp diagnose` looks for what the model lacks"
 
 
 def _split_by(machine: Machine, lengths: Lengths, options: IdentifyOptions, label: IntArray) -> Identification | None:

@@ -51,7 +51,7 @@ def open_measurement(
     Raises
     ------
     InputError
-        for a foreign file that leaves something open (unit, sign, axis, direction), with what ``compgen import`` needs.
+        for a foreign file that leaves something open (unit, sign, axis, direction), with what ``volcomp import`` needs.
     """
     kinds = [own_kind(Path(path)) for path in paths]
     if axis is not None and any(kinds):
@@ -141,7 +141,7 @@ def _settled(path: Path, axis: str | None = None) -> Imported:
     item = import_file(path, ImportOptions(axis=axis))
     item.check_settled()
     facts = "; ".join([f"{item.format}, {item.kind}", *item.notes])
-    warnings.warn(f"{path} was taken as: {facts} ('compgen import' shows all)", CompgenWarning, stacklevel=3)
+    warnings.warn(f"{path} was taken as: {facts} ('volcomp import' shows all)", CompgenWarning, stacklevel=3)
     return item
 
 

@@ -97,7 +97,7 @@ class Imported:
         """Raise InputError if something is in doubt, or the file holds two measurements."""
         if self.doubts:
             raise InputError(
-                f"leaves open: {'; '.join(self.doubts)}. 'compgen import' shows what was understood and takes what is "
+                f"leaves open: {'; '.join(self.doubts)}. 'volcomp import' shows what was understood and takes what is "
                 "missing; give its result to this command",
                 file=self.path,
             )
@@ -105,7 +105,7 @@ class Imported:
         if self.beside is not None:
             names = ", ".join(self.beside.names)
             raise InputError(
-                f"holds runs of axes and errors as well ({names}): 'compgen import --out DIR' writes a file of each; or take one "
+                f"holds runs of axes and errors as well ({names}): 'volcomp import --out DIR' writes a file of each; or take one "
                 "of them, with --ignore SHEET for the other",
                 file=self.path,
             )

@@ -1,4 +1,4 @@
-"""Predicted errors at given points: what ``compgen predict`` computes."""
+"""Predicted errors at given points: what ``volcomp predict`` computes."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from compgen.core.machine import Machine
 from compgen.core.text import nearest, one_line
 from compgen.errors import InputError
 
-#: Columns of the ``stations.csv`` of ``compgen identify`` that a plan does not need.
+#: Columns of the ``stations.csv`` of ``volcomp identify`` that a plan does not need.
 _OF_IDENTIFY = (
     *(f"u_{axis}_um" for axis in "xyz"),
     "dead_length_mm",
@@ -65,7 +65,7 @@ def planned_stations(positions: Mapping[str, Sequence[float]]) -> PlannedStation
 
 
 def read_stations(path: str | Path) -> PlannedStations:
-    """Read a stations file: ``station, x_mm, y_mm, z_mm``, optional ``setup``; that of ``compgen identify`` will do.
+    """Read a stations file: ``station, x_mm, y_mm, z_mm``, optional ``setup``; that of ``volcomp identify`` will do.
 
     A station with several set-ups has a row for each, at one place.
     """

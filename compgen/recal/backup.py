@@ -89,7 +89,7 @@ def restore(path: Path, url: str) -> dict[str, int]:
         try:
             with path.open("rb") as stream:
                 if stream.read(len(MAGIC)) != MAGIC:
-                    raise InputError("is not a backup (written by `compgen recal backup`)", file=path)
+                    raise InputError("is not a backup (written by `volcomp recal backup`)", file=path)
             shutil.copyfile(path, copy)
         except OSError as error:
             raise InputError(f"cannot be copied: {error.strerror or error}", file=path) from error

@@ -190,7 +190,7 @@ def version_said(text: str) -> int | str | None:
 def how_to_state(name: str, measurement: MeasurementRecord, tables: str) -> str:
     """Say how a person states which tables were on; ``tables`` is a version, "none" or how to write either."""
     return (
-        f"state it: `compgen recal reprocess {name} --measurement {measurement.id} --active-table {tables} --reason TEXT`, "
+        f"state it: `volcomp recal reprocess {name} --measurement {measurement.id} --active-table {tables} --reason TEXT`, "
         f"or `# active_table = {tables}` in the next file"
     )
 

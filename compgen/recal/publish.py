@@ -168,7 +168,7 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
     """Leave a folder alone whose store or machine is another one, or whose store was newer than this one."""
     known = {version_name(table): table for table in tables if table.state in ("active", "retired")}
     then = (
-        f"give the right store (`store` in the job file) or a newer backup; if this store is right, `compgen recal adopt "
+        f"give the right store (`store` in the job file) or a newer backup; if this store is right, `volcomp recal adopt "
         f"{machine.name} --reason TEXT` sets aside what the folder holds"
     )
     if seen.pointer is not None and seen.pointer not in known:
@@ -190,7 +190,7 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
     if ledger["machine"] != machine.name:
         raise InputError(
             f"is the folder of machine {ledger['machine']}, not of {machine.name}; give {machine.name} a folder of its own, "
-            f"or, if the machine was renamed, `compgen recal adopt {machine.name} --reason TEXT`",
+            f"or, if the machine was renamed, `volcomp recal adopt {machine.name} --reason TEXT`",
             file=folder,
         )
     history, count = lineage(store, machine), ledger["decisions"]

@@ -90,7 +90,7 @@ def _chosen(store: Store, machine: MachineRecord, wanted: str | None) -> Measure
     """Return the measurement with this number, or SHA-256 that begins like this; without either the newest."""
     known = store.measurements(machine)
     if not known:
-        raise InputError(f"the store holds no measurement of {machine.name}; `compgen recal run` takes them in")
+        raise InputError(f"the store holds no measurement of {machine.name}; `volcomp recal run` takes them in")
     if wanted is None:
         return known[-1]
     text = wanted.strip().lower()

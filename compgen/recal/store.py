@@ -155,7 +155,7 @@ class Store:
         """Return the machine ``name``; InputError if the store does not know it."""
         found = self.read(lambda connection: _machine_named(connection, name))
         if found is None:
-            raise InputError(f"the store knows no machine {name!r}; it is added by its first `compgen recal run`")
+            raise InputError(f"the store knows no machine {name!r}; it is added by its first `volcomp recal run`")
         return found
 
     def machines(self) -> list[MachineRecord]:

@@ -1,4 +1,4 @@
-"""Files by which a scheduler of the system drives ``compgen recal run``: systemd service and timer, lines of a crontab.
+"""Files by which a scheduler of the system drives ``volcomp recal run``: systemd service and timer, lines of a crontab.
 
 Machines with the same schedule share one timer; a machine without one is looked at every hour.
 """
@@ -22,7 +22,7 @@ def units(job: Job, program: str) -> Mapping[str, str]:
     for name, machine in job.machines.items():
         groups.setdefault(machine.schedule or HOURLY, []).append(name)
     files: dict[str, str] = {}
-    lines = ["# crontab of compgen recal; exit code 1: something is held back or failed, see `compgen recal status`"]
+    lines = ["# crontab of volcomp recal; exit code 1: something is held back or failed, see `volcomp recal status`"]
     for number, (schedule, names) in enumerate(groups.items(), start=1):
         whole = len(groups) == 1
         unit = NAME if whole else f"{NAME}-{number}"

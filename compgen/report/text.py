@@ -1,4 +1,4 @@
-"""Readable summaries for the terminal, and the JSON of ``compgen run``."""
+"""Readable summaries for the terminal, and the JSON of ``volcomp run``."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def verification_table(results: Sequence[Verification]) -> Group:
 
 
 def run_json(result: RunResult) -> dict[str, Any]:
-    """Return the object that ``compgen run --json`` prints; with one control its ``result.json`` plus the rest."""
+    """Return the object that ``volcomp run --json`` prints; with one control its ``result.json`` plus the rest."""
     summaries = [item.verification.summary() for item in result.results]
     common = {
         "accepted": result.accepted,

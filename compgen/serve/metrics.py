@@ -104,7 +104,7 @@ class ServeMetrics:
 
 
 class WatchMetrics:
-    """What ``compgen recal watch`` counts; give :meth:`count` to it as ``on_outcome``."""
+    """What ``volcomp recal watch`` counts; give :meth:`count` to it as ``on_outcome``."""
 
     def __init__(self, store: Store | None = None) -> None:
         self.registry = CollectorRegistry(auto_describe=False)

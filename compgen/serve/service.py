@@ -88,7 +88,7 @@ def _job(service: Service, path: Path) -> Job:
 
 
 def approve(service: Service, machine: MachineRecord, version: int, wish: Wish, *, override: bool) -> DecisionRecord:
-    """Approve as ``compgen recal approve`` does; the files follow where there is a job file."""
+    """Approve as ``volcomp recal approve`` does; the files follow where there is a job file."""
     if service.settings.job is not None:
         job, seen = _job(service, service.settings.job), wish.seen
         return actions.approve(job, machine.name, version, wish.actor, wish.reason, override=override, seen=seen)
@@ -97,7 +97,7 @@ def approve(service: Service, machine: MachineRecord, version: int, wish: Wish, 
 
 
 def reject(service: Service, machine: MachineRecord, version: int, wish: Wish) -> DecisionRecord:
-    """Reject as ``compgen recal reject`` does."""
+    """Reject as ``volcomp recal reject`` does."""
     if service.settings.job is not None:
         job = _job(service, service.settings.job)
         return actions.reject(job, machine.name, version, wish.actor, wish.reason, seen=wish.seen)
@@ -105,7 +105,7 @@ def reject(service: Service, machine: MachineRecord, version: int, wish: Wish) -
 
 
 def rollback(service: Service, machine: MachineRecord, to: int, wish: Wish) -> DecisionRecord:
-    """Roll back as ``compgen recal rollback`` does."""
+    """Roll back as ``volcomp recal rollback`` does."""
     if service.settings.job is not None:
         job = _job(service, service.settings.job)
         return actions.rollback(job, machine.name, wish.actor, wish.reason, to=to, seen=wish.seen)

@@ -87,7 +87,7 @@ def check_settings(settings: Settings) -> Settings:
         )
     if settings.login and settings.users is None:
         raise InputError(
-            "needs a file of users; give --users FILE and add one with `compgen serve add-user`", field="--users"
+            "needs a file of users; give --users FILE and add one with `volcomp serve add-user`", field="--users"
         )
     for name in settings.names:
         if not HOST_NAME.fullmatch(name):

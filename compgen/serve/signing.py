@@ -134,7 +134,7 @@ def _allowed(machine_id: int) -> MachineRecord:
     if not own().settings.decide:
         abort(403, "This dashboard only reads.")
     if not own().may_decide(g.session.user):
-        abort(403, "You may read, but not decide; `compgen serve add-user` without --reader changes that.")
+        abort(403, "You may read, but not decide; `volcomp serve add-user` without --reader changes that.")
     return the_machine(machine_id)
 
 

@@ -101,10 +101,10 @@ class Users:
             raise InputError(f"cannot be read as a file of users: {error}", file=self.path) from error
         users = data.get("users") if isinstance(data, dict) else None
         if not isinstance(users, dict) or not all(isinstance(item, str) for item in users.values()):
-            raise InputError("is not a file of users; make one with `compgen serve add-user`", file=self.path)
+            raise InputError("is not a file of users; make one with `volcomp serve add-user`", file=self.path)
         readers = data.get("readers", [])
         if not isinstance(readers, list) or not all(isinstance(item, str) for item in readers):
-            raise InputError("says wrongly who only reads; make it anew with `compgen serve add-user`", file=self.path)
+            raise InputError("says wrongly who only reads; make it anew with `volcomp serve add-user`", file=self.path)
         return users, frozenset(readers)
 
     def _write(self, users: Mapping[str, str], readers: frozenset[str]) -> None:

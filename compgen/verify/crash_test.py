@@ -81,7 +81,7 @@ class CrashTest:
         return sum(trial.outcome == outcome for trial in self.trials)
 
     def summary(self) -> dict[str, object]:
-        """Return the object that ``compgen crash-test --json`` prints for this control."""
+        """Return the object that ``volcomp crash-test --json`` prints for this control."""
         return {
             "controller": self.controller,
             "passed": self.passed,

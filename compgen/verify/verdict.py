@@ -222,7 +222,7 @@ def _objections(result: Identification, taken_away_um: float | None) -> Iterator
 
 def blocking_reasons(objections: Sequence[Objection]) -> list[str]:
     """Return why objections leave the tables not accepted, with what to do."""
-    hint = "; `compgen diagnose` looks for what the model lacks, --allow-misfit accepts the tables nevertheless"
+    hint = "; `volcomp diagnose` looks for what the model lacks, --allow-misfit accepts the tables nevertheless"
     return [item.text + (hint if item.code in MISFIT_CODES else "") for item in objections if item.blocking]
 
 

@@ -1,9 +1,9 @@
-"""Twelve months of a factory of three simulated machines under ``compgen recal``.
+"""Twelve months of a factory of three simulated machines under ``volcomp recal``.
 
     python examples/factory/factory.py OUT [--seed N]
 
 writes OUT/recal.toml, machine files, scenarios, inboxes, tables and reports, prints what happened month by month, and what
-the history says in the end. Any ``compgen recal`` command works on OUT/recal.toml afterwards.
+the history says in the end. Any ``volcomp recal`` command works on OUT/recal.toml afterwards.
 """
 
 import argparse
@@ -45,7 +45,7 @@ class Year:
         return self.now
 
     def run(self, name: str) -> MachineOutcome:
-        """One `compgen recal run` of one machine."""
+        """One `volcomp recal run` of one machine."""
         return run_jobs(self.job, [name], clock=self.clock).outcomes[0]
 
     def tables(self, name: str) -> list[TableRecord]:
@@ -215,7 +215,7 @@ def _undone(year: Year, name: str, at: datetime) -> Row:
 
 
 def drift_of(store: Store, job: Job, name: str) -> Drift:
-    """What `compgen recal history NAME --drift` says."""
+    """What `volcomp recal history NAME --drift` says."""
     return drift_of_store(store, store.machine(name), DriftSettings(job.machine(name).tolerances))
 
 

@@ -191,7 +191,7 @@ class Factory:
         return ErrorTable(curves, table.squareness)
 
     def scenario(self, name: str, at: datetime, part: str = "") -> compgen.Scenario:
-        """Write the scenario of one measurement, which `compgen simulate` reads as well, and return it."""
+        """Write the scenario of one measurement, which `volcomp simulate` reads as well, and return it."""
         title = f"{name}-{at:%Y-%m-%d}{part}"
         seed = [self.seed, NAMES.index(name), at.toordinal(), len(part)]
         number = int(np.random.SeedSequence(seed).generate_state(1)[0])

@@ -1,4 +1,4 @@
-"""Apache Airflow: one task per machine of a job file. Exit code 1 of `compgen recal run` asks for a person.
+"""Apache Airflow: one task per machine of a job file. Exit code 1 of `volcomp recal run` asks for a person.
 
 For Airflow 2.6 and later; in Airflow 3 the operator is imported from airflow.providers.standard.operators.bash.
 Put this file into the folder of the DAGs; COMPGEN and JOB are paths on the worker.
