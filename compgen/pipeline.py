@@ -257,7 +257,7 @@ def _with_objections(verification: Verification, identification: Identification,
 def _diagnosis_of(machine: Machine, measurements: Sequence[str | Path], folder: str | Path) -> str:
     """Return the command that looks for what the model lacks."""
     source = machine.name if machine.source is None else str(machine.source)
-    words = ["compgen", "diagnose", source, *map(str, measurements), "--out", str(Path(folder) / "diagnosis")]
+    words = ["volcomp", "diagnose", source, *map(str, measurements), "--out", str(Path(folder) / "diagnosis")]
     return shlex.join(words)
 
 
