@@ -16,8 +16,8 @@ from unittest.mock import patch
 import numpy as np
 import timing
 from scipy.interpolate import BSpline, make_interp_spline
-from volcomp import load_machine, read_errors
 
+from compgen import load_machine, read_errors
 from compgen.core.kernels import PLAIN, VARIABLE
 from compgen.core.names import ERROR_INDEX, error_named
 from compgen.model.evaluate import load_kernels, volumetric_error_at, volumetric_error_on_grid

@@ -76,7 +76,7 @@ def test_no_file_imports_from_a_later_stage():
     ("where", "text", "caught"),
     [
         ("core/a.py", "from compgen.model import c_matrix", True),
-        ("core/a.py", "from volcomp import model", True),
+        ("core/a.py", "from compgen import model", True),
         ("core/a.py", "import compgen.model.exact as e", True),
         ("core/a.py", "from ..model import exact", True),
         ("core/a.py", "from .. import model", True),
@@ -91,8 +91,8 @@ def test_no_file_imports_from_a_later_stage():
             False,
         ),
         ("model/__init__.py", "from .exact import rotate\nfrom ..errors import InputError", False),
-        ("core/a.py", "from volcomp import errors, resources\nimport numpy", False),
-        ("cli/a.py", "from volcomp import report, verify", False),
+        ("core/a.py", "from compgen import errors, resources\nimport numpy", False),
+        ("cli/a.py", "from compgen import report, verify", False),
         ("__init__.py", "from compgen.cli import main", False),
     ],
 )
