@@ -206,7 +206,7 @@ def test_nodes_beyond_the_travel_continue_the_curve(controller, reference_mm):
 def test_the_lever_of_an_axis_own_travel_is_held_between_the_nodes():
     axes = tuple(Axis(r, np.linspace(*r, 6)) for r in ((-300.0, 900.0), (0.0, 800.0), (-400.0, 0.0)))
     machine = Machine("m", Chain("WXYFZT"), axes, reference_point_mm=(0.0, 0.0, 0.0))
-    settings = Section({"sign": "error"}, path=None, name="controllers.siemens-cec")
+    settings = Section({"sign": "error", "mult_mode": "S1"}, path=None, name="controllers.siemens-cec")
     machine = replace(machine, controllers={"siemens-cec": settings})
     nodes = axes[0].nodes_mm
     value = 60e-6 * np.sin(nodes / 170.0)
