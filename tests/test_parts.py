@@ -1,6 +1,7 @@
 """Features of parts that a machine made: what they determine of its errors, in frames of unknown pose."""
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -301,3 +302,15 @@ def test_a_slip_in_the_fixture_halfway_is_found_in_the_residuals(mill, tmp_path)
     path = part(tmp_path / "p.part.csv", points, made)
     found = identify_measurement(mill, read_measurement([path]), IdentifyOptions(u_deviation_um=1.0, reject=False))
     assert found.misfit.summary()["causes"]
+
+
+def test_the_condition_is_that_of_the_readings(mill, tmp_path):
+    """A plate that covers the travel is better conditioned than one that covers half of it; neither is a constant."""
+    found = []
+    for reach in (330.0, 160.0):
+        points, _ = drilled(12, reach=reach)
+        path = part(tmp_path / f"{reach:g}.part.csv", points, displaced(*points.T))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CompgenWarning)
+            found.append(identify_measurement(mill, read_measurement([path])).condition)
+    assert 1.0 < found[0] < found[1] < 1e6

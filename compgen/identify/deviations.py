@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 
 from compgen.core.csvio import FloatArray
-from compgen.core.deviations import DEVIATION_COLUMNS, Deviations
+from compgen.core.deviations import Deviations
 from compgen.core.machine import Machine
 from compgen.core.names import MM_PER_UM
 from compgen.core.threads import one_thread
@@ -23,7 +23,7 @@ from compgen.identify.effects import without_effects
 from compgen.identify.free_pose import identify_with_free_pose, needs_free_pose
 from compgen.identify.misfit import Series, labels_of, misfit_of
 from compgen.identify.noise import IdentifyOptions
-from compgen.identify.outliers import Rejected, accepted_readings
+from compgen.identify.outliers import accepted_readings, rejected_components
 from compgen.identify.parameters import ErrorParameters, common_tool, parameters_for_tools
 from compgen.identify.rank import describe_rank
 from compgen.identify.result import Identification, worst_uncertainty
@@ -207,7 +207,9 @@ def _result(
         u_length_um_per_m=0.0,
         u_scale=u_scale,
         unobservable=unobservable(layout),
-        rejected=_rejected(deviations, components, residual, accepted),
+        rejected=rejected_components(
+            deviations, *np.divmod(components.index, 3), residual, components.sigma_mm, accepted
+        ),
         rank=problem.size,
         unknowns=problem.size,
         condition=1.0 / solution.factor.rcond,
@@ -244,18 +246,3 @@ def _of_the_errors(factor: Factor, errors: int) -> Factor:
     matrix, rest = factor.matrix[:errors, :errors], factor.matrix[errors:, :errors]
     reduced = matrix - rest.T @ np.linalg.solve(factor.matrix[errors:, errors:], rest)
     return factorise(0.5 * (reduced + reduced.T))
-
-
-def _rejected(
-    deviations: Deviations, components: _Components, residual_mm: FloatArray, accepted: NDArray[np.bool_]
-) -> tuple[Rejected, ...]:
-    found = []
-    for k in np.flatnonzero(~accepted).tolist():
-        row, component = divmod(int(components.index[k]), 3)
-        file, line = deviations.origin[row] if deviations.origin else ("", 0)
-        where = ", ".join(f"{value:g}" for value in deviations.position_mm[row])
-        size_um = float(-residual_mm[k]) / MM_PER_UM
-        many = abs(residual_mm[k]) / components.sigma_mm[k]
-        reason = f"differs from the model by {size_um:+.1f} um, {many:.0f} standard deviations; disturbed reading?"
-        found.append(Rejected(row, DEVIATION_COLUMNS[component], f"({where}) mm", size_um, reason, str(file), line))
-    return tuple(found)

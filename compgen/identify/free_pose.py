@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from compgen.core.csvio import FloatArray
-from compgen.core.deviations import DEVIATION_COLUMNS, Deviations
+from compgen.core.deviations import Deviations
 from compgen.core.error_table import Curve, ErrorTable
 from compgen.core.machine import Axis, Machine
 from compgen.core.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
@@ -32,7 +32,7 @@ from compgen.core.parts import PART, aligned, setups_of
 from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify.misfit import Series, labels_of, misfit_of
 from compgen.identify.noise import IdentifyOptions
-from compgen.identify.outliers import Rejected, accepted_readings
+from compgen.identify.outliers import accepted_readings, rejected_components
 from compgen.identify.parameters import ErrorParameters, error_parameters
 from compgen.identify.result import Identification, worst_uncertainty
 from compgen.identify.tables import metadata_of
@@ -227,6 +227,7 @@ class _Solution:
     u_scale: FloatArray
     residual_mm: FloatArray
     rank: int
+    condition: float
     unreached: Mapping[str, FloatArray]
     left_out: tuple[str, ...]
     partly: tuple[str, ...]
@@ -286,6 +287,7 @@ def _solve(
     target = np.concatenate([readings.deviation_mm * used, np.zeros(len(bends))])
     scale = np.linalg.norm(whole, axis=0)
     scale = np.where(scale > 1e-9 * scale.max(), scale, scale.max())  # a column of rounding stays one
+    values = np.linalg.svd(whole / scale, compute_uv=False)
     inverse = np.linalg.pinv(whole / scale, rcond=RCOND) / scale[:, None]
     found = inverse @ target
     unknowns = unit * (shown @ found[: shown.shape[1]])
@@ -309,6 +311,7 @@ def _solve(
         u_poses[:, 6] if free_scale else np.zeros(len(u_poses)),
         residual,
         rank,
+        float(values[0] / values[values > RCOND * values[0]][-1]),
         _unreached(layout, readings.position_mm[accepted]),
         left_out=tuple(name for name in names if name not in kept),
         partly=partly,
@@ -491,10 +494,12 @@ def _result(
                 for name in solution.partly
             ]
         ),
-        rejected=_rejected(deviations, readings, solution.residual_mm, accepted),
+        rejected=rejected_components(
+            deviations, readings.row, readings.component, -solution.residual_mm, readings.sigma_mm, accepted
+        ),
         rank=solution.rank,
         unknowns=solution.rank,
-        condition=1.0 / RCOND,
+        condition=solution.condition,
         iterations=1,
         worst_u=worst_uncertainty(errors),
         layout=layout,
@@ -581,20 +586,3 @@ def _poses(
             )
         )
     return found
-
-
-def _rejected(
-    deviations: Deviations, readings: _Readings, residual_mm: FloatArray, accepted: NDArray[np.bool_]
-) -> tuple[Rejected, ...]:
-    found = []
-    for k in np.flatnonzero(~accepted).tolist():
-        row = int(readings.row[k])
-        file, line = deviations.origin[row] if deviations.origin else ("", 0)
-        where = ", ".join(f"{value:g}" for value in deviations.position_mm[row])
-        size_um = float(residual_mm[k]) / MM_PER_UM
-        many = abs(residual_mm[k]) / readings.sigma_mm[k]
-        reason = f"differs from the model by {size_um:+.1f} um, {many:.0f} standard deviations; disturbed reading?"
-        found.append(
-            Rejected(row, DEVIATION_COLUMNS[readings.component[k]], f"({where}) mm", size_um, reason, str(file), line)
-        )
-    return tuple(found)

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.core.csvio import FloatArray
+from compgen.core.deviations import DEVIATION_COLUMNS, Deviations
 from compgen.core.lengths import Lengths
+from compgen.core.names import MM_PER_UM
 from compgen.identify.parameters import ErrorParameters
 from compgen.identify.segments import Segment
 from compgen.identify.state import IntArray, State
@@ -210,3 +212,25 @@ def _point_name(lengths: Lengths, expected: _Expected, pose: int) -> str:
     row = int(np.flatnonzero(expected.pose == pose)[0])
     where = ", ".join(f"{value:g}" for value in lengths.position_mm[row])
     return f"point {lengths.point[row]} at ({where}) mm"
+
+
+def rejected_components(
+    deviations: Deviations,
+    row: IntArray,
+    component: IntArray,
+    residual_mm: FloatArray,
+    sigma_mm: FloatArray,
+    accepted: NDArray[np.bool_],
+) -> tuple[Rejected, ...]:
+    """Name the measured components (k,) that were rejected: row and component of each, residual as model minus measured."""
+    found = []
+    for k in np.flatnonzero(~accepted).tolist():
+        at = int(row[k])
+        file, line = deviations.origin[at] if deviations.origin else ("", 0)
+        where = ", ".join(f"{value:g}" for value in deviations.position_mm[at])
+        size_um = float(-residual_mm[k]) / MM_PER_UM
+        many = abs(residual_mm[k]) / sigma_mm[k]
+        reason = f"differs from the model by {size_um:+.1f} um, {many:.0f} standard deviations; disturbed reading?"
+        name = DEVIATION_COLUMNS[component[k]]
+        found.append(Rejected(at, name, f"({where}) mm", size_um, reason, str(file), line))
+    return tuple(found)
