@@ -2,14 +2,20 @@
 # make test   sets up, checks style and types, runs the tests
 # make pins   writes the pinned dependencies again (CONTRIBUTING.md)
 # make bench  prints the ratios against named peers
+# make coverage    runs the tests and prints their branch coverage
+# make docs        builds the documentation site in docs-out/; make docs-links follows its links to other sites
 PYTHON ?= python3
 BIN := .venv/bin
 CONTROLLERS := isg-csv etalon-exchange siemens-eec siemens-cec fanuc-pitch
 
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-COMPILE = uv pip compile --quiet --all-extras --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
+DOCS := .venv-docs/bin
 
-.PHONY: demo test lint system bench pins clean
+PIP_INSTALL := -m pip install --quiet --disable-pip-version-check
+PIP := $(BIN)/python $(PIP_INSTALL)
+PIP_DOCS := $(DOCS)/python $(PIP_INSTALL)
+COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
+
+.PHONY: demo test lint system bench coverage docs docs-links pins clean
 .DELETE_ON_ERROR:
 
 demo: .venv/ready
@@ -18,6 +24,10 @@ demo: .venv/ready
 
 test: lint system
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -ra
+
+# as the tests of `make test`; the figures are those of all processes together
+coverage: .venv/ready-dev system
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -q --cov=compgen --cov-branch --cov-report=term
 
 # programs of the system that some tests run against; those tests are skipped by name where they cannot be installed
 system:
@@ -43,15 +53,34 @@ lint: .venv/ready-dev
 	$(PIP) --require-hashes -r requirements-dev.txt
 	@touch $@
 
+# the site has an environment of its own: nothing of it is installed for the demo or the tests
+.venv-docs/ready: .venv/bin/python requirements.txt requirements-docs.txt pyproject.toml
+	@[ -x $(DOCS)/python ] || $(BIN)/python -m venv .venv-docs
+	$(PIP_DOCS) --require-hashes -r requirements.txt
+	$(PIP_DOCS) --require-hashes -r requirements-docs.txt
+	$(PIP_DOCS) --no-build-isolation --no-deps -e .
+	@touch $@
+
+# a warning is an error; links within the site are checked, also their headings
+docs: .venv-docs/ready
+	$(DOCS)/python -m sphinx -W --keep-going -q -b html docs docs-out
+	@echo "docs-out/index.html"
+
+# links to other sites: apart, because it needs the network
+docs-links: .venv-docs/ready
+	$(DOCS)/python -m sphinx -q -b linkcheck docs docs-out/links
+
 # every benchmark, one after the other, that of the diagnosis in short; some minutes on a quiet computer
 bench: .venv/ready-dev
 	for name in identify evaluate fit interval_coverage; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 	$(BIN)/python benchmarks/diagnosis.py --sets 2
+	$(BIN)/python benchmarks/endtoend.py
 
 # pins stay as they are unless UPGRADE names a package: make pins UPGRADE="--upgrade-package numpy"
 pins:
-	$(COMPILE) $(UPGRADE) pyproject.toml requirements.in -o requirements.txt
-	$(COMPILE) $(UPGRADE) -c requirements.txt pyproject.toml requirements-dev.in -o requirements-dev.txt
+	$(COMPILE) $(UPGRADE) --all-extras pyproject.toml requirements.in -o requirements.txt
+	$(COMPILE) $(UPGRADE) --all-extras -c requirements.txt pyproject.toml requirements-dev.in -o requirements-dev.txt
+	$(COMPILE) $(UPGRADE) -c requirements.txt requirements-docs.in -o requirements-docs.txt
 
 clean:
-	rm -rf .venv demo-out
+	rm -rf .venv .venv-docs demo-out docs-out .coverage

@@ -24,7 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-from hidden.axis_sets import KINDS, SHARES, make, outcome  # noqa: E402 - found through the line above
+from hidden.axis_sets import KINDS, NAMELESS, SHARES, make, outcome  # noqa: E402 - found through the line above
 from hidden.score import wilson  # noqa: E402
 
 VISIBLE = 1.5
@@ -81,12 +81,13 @@ def table(results: Sequence[dict]) -> list[str]:
         own = [r for r in results if r["white"] == white]
         for kind in KINDS:
             chosen = [r for r in own if r["kind"] == kind and (r["visible"] or kind == "null")]
-            right = ("clean",) if kind == "null" else ("unknown",) if kind == "unlisted" else ("exact", "alias set")
-            must = {"null": "98", "unlisted": "", "several": ""}.get(kind, "95")
+            right = ("clean",) if kind == "null" else ("unknown",) if kind in NAMELESS else ("exact", "alias set")
+            must = {"null": "98", "unlisted": "", "further": "", "several": ""}.get(kind, "95")
             hits = sum(r["outcome"] in right for r in chosen)
             lines.append(row_of(f"{kind}, {shade}", hits, len(chosen), must, others(chosen, right)))
-    singles = [r for r in results if r["kind"] not in ("null", "several", "unlisted") and r["visible"]]
-    named = [r for r in results if r["kind"] not in ("null", "unlisted") and r["visible"]]
+    nameless = [r for r in results if r["kind"] in NAMELESS and r["visible"]]
+    singles = [r for r in results if r["kind"] not in ("null", "several", *NAMELESS) and r["visible"]]
+    named = [r for r in results if r["kind"] not in ("null", *NAMELESS) and r["visible"]]
     hidden = [r for r in results if r["kind"] != "null"]
     null = [r for r in results if r["kind"] == "null"]
     right = ("exact", "alias set")
@@ -94,6 +95,7 @@ def table(results: Sequence[dict]) -> list[str]:
         ("all null", null, ("clean",), "98"),
         ("all single effects, visible", singles, right, "95"),
         ("all named effects, visible", named, right, ""),
+        ("all effects without a name, visible", nameless, ("unknown",), ""),
     ):
         lines.append(row_of(name, sum(r["outcome"] in good for r in chosen), len(chosen), must, others(chosen, good)))
     wrong = [r for r in hidden if r["outcome"] == "misnamed"]
@@ -113,8 +115,8 @@ def main() -> None:
     parser.add_argument("--details", type=Path, help="one JSON line a set")
     parser.add_argument("--docs", type=Path, help="page whose table is replaced")
     given = parser.parse_args()
-    total = sum(SHARES.values())
-    kinds = given.kinds.split(",") if given.kinds else list(KINDS)
+    kinds = given.kinds.split(",") if given.kinds else [kind for kind in KINDS if kind != "further"]
+    total = sum(share for kind, share in SHARES.items() if kind != "further")
     jobs = [(kind, given.seed + k) for kind in kinds for k in range(round(SHARES[kind] * given.sets / total))]
     with multiprocessing.Pool(given.workers) as pool:
         results = pool.map(work, jobs, chunksize=4)

@@ -18,12 +18,11 @@ import timing
 from scipy.interpolate import BSpline, make_interp_spline
 
 from compgen import load_machine, read_errors
-from compgen.core.kernels import PLAIN, VARIABLE
-from compgen.core.names import ERROR_INDEX, error_named
-from compgen.model.evaluate import load_kernels, volumetric_error_at, volumetric_error_on_grid
-from compgen.model.exact import tip_position
-from compgen.model.exact_points import exact_error_at
-from compgen.model.volumetric import coefficients, factor
+from compgen.data.names import ERROR_INDEX, error_named
+from compgen.kinematics.exact_chain import exact_error_at, tip_position
+from compgen.kinematics.first_order import coefficients, factor
+from compgen.kinematics.kernel_switch import PLAIN, VARIABLE, load_kernels
+from compgen.kinematics.many_points import volumetric_error_at, volumetric_error_on_grid
 
 ROOT = Path(__file__).resolve().parents[1]
 MACHINE = load_machine(ROOT / "machines" / "zha-gantry.toml")

@@ -1,10 +1,12 @@
 """The constrained fit against OSQP, cvxpy and Clarabel on the same problem (python benchmarks/fit.py).
 
-Every side gets the same 18 curves as arrays (positions, data, weights, held nodes, smoothness, bounds) and returns 18
-fitted curves. Timed with compgen is all of it: it lays out the band, factors, solves, checks the bounds and, where one
-is broken, solves the bounded problem to its optimality conditions. The others get their sparse matrices ready made,
-outside the time: OSQP sets up and solves from cold, curve by curve; cvxpy builds, compiles and solves one problem per
-curve, written as a quadratic form (the form that suits it best). The smoothness is given: finding it is no part of it.
+Every side gets the same 18 curves (positions, data, weights, fixed nodes, smoothness, bounds) and returns 18 fitted
+curves. compgen gets its smoothers (weights and the band of the penalty) ready made, as ``fit`` has them when it
+comes to solve; timed is the rest: it lays the curves together, factors, solves, checks the bounds and, where one is broken,
+solves the bounded problem to its optimality conditions. "with its smoothers" builds these from the arrays in the time
+too. The others get their sparse matrices ready made, outside the time: OSQP sets up and solves from cold, curve by curve;
+cvxpy builds, compiles and solves one problem per curve, written as a quadratic form (the form that suits it best). The
+smoothness is given: finding it is no part of it.
 
 "no bound active": bounds are there and none is touched. "active": 0.8 of the largest value and 0.6 of the largest slope
 of each curve, so that every curve touches bounds.
@@ -20,6 +22,7 @@ import argparse
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import clarabel
 import cvxpy as cp
@@ -28,19 +31,19 @@ import osqp
 import scipy.sparse as sp
 import timing
 
-from compgen.core.csvio import FloatArray
-from compgen.core.error_table import Curve, ErrorTable
-from compgen.core.machine import Axis, Chain, Machine
-from compgen.core.names import CURVE_NAMES, SQUARENESS_NAMES, error_named
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.machine import Axis, Chain, Machine
+from compgen.data.names import CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.fit import FitOptions, fit, zero_ends
 from compgen.fit.bounds import Bounds, constraint_rows
-from compgen.fit.curve import prepare, smoothness, solve
-from compgen.fit.smooth import second_difference
-from compgen.fit.solve import solve_curves
-from compgen.fit.stacked import CurveProblem, Stack
-from compgen.model import load_kernels, modelled_errors
+from compgen.fit.fitting import prepare, smoothness, solve
+from compgen.fit.smoother import Smoother, second_difference
+from compgen.fit.stacked import CurveProblem, solve_curves
+from compgen.kinematics import modelled_errors
 
 OURS, OSQP, CVXPY = "compgen", "OSQP cold", "cvxpy+Clarabel"
+FROM_ARRAYS = "compgen with its smoothers"
 WHOLE = "compgen.fit, whole call"
 #: More nodes than this no identification gives; the peers need minutes for them.
 MOST_CORRELATED = 101
@@ -49,35 +52,52 @@ CURVES = 18
 WIDE = 1.5
 
 
-def curves(n: int, *, active: bool, seed: int = 0) -> list[CurveProblem]:
+@dataclass(frozen=True)
+class Case:
+    """One curve with independent nodes, zero at the ``fixed`` nodes and within ``bounds``."""
+
+    position_mm: FloatArray
+    y: FloatArray
+    weight: FloatArray
+    fixed: tuple[int, ...]
+    mu: float
+    bounds: Bounds = Bounds()
+
+    def problem(self) -> CurveProblem:
+        """Build its smoother, as ``fit`` does before it chooses the smoothness."""
+        smoother = Smoother.build(self.position_mm, self.weight, tuple(((node, 1.0),) for node in self.fixed))
+        return CurveProblem(smoother, self.mu, self.position_mm, self.y, self.bounds)
+
+
+def curves(n: int, *, active: bool, seed: int = 0) -> list[Case]:
     """18 curves like those of a machine: every third held at one node inside, the others at both ends."""
     rng = np.random.default_rng(seed)
     return [_curve(rng, n, k, active=active) for k in range(CURVES)]
 
 
-def _curve(rng: np.random.Generator, n: int, k: int, *, active: bool) -> CurveProblem:
+def _curve(rng: np.random.Generator, n: int, k: int, *, active: bool) -> Case:
     position = np.cumsum(rng.uniform(4, 12, n))
     t = (position - position[0]) / np.ptp(position)
     y = 20 * np.sin(2 * np.pi * t + 0.1 * k) + 8 * np.sin(6 * np.pi * t + 0.3) + rng.normal(size=n) * 0.3
-    held = (0, n - 1) if k % 3 else (n // 3,)
+    fixed = (0, n - 1) if k % 3 else (n // 3,)
     y = y - (y[0] + (y[-1] - y[0]) * t if k % 3 else y[n // 3])
-    y[list(held)] = 0.0
+    y[list(fixed)] = 0.0
     mu = 10 ** rng.uniform(-1, 3)
-    problem = CurveProblem(position, y, rng.uniform(0.5, 2, n), held, mu)
-    free = Stack.build([problem]).solve()
+    problem = Case(position, y, rng.uniform(0.5, 2, n), fixed, mu)
+    free = solve_curves([problem.problem()])[0].curve
     largest, steepest = float(np.abs(free).max()), float(np.abs(np.diff(free) / np.diff(position)).max())
     share = (0.8, 0.6) if active else (WIDE, WIDE)
-    return CurveProblem(position, y, problem.weight, held, mu, Bounds(share[0] * largest, share[1] * steepest))
+    return Case(position, y, problem.weight, fixed, mu, Bounds(share[0] * largest, share[1] * steepest))
 
 
 #: P, q, A, limit of one curve.
 Program = tuple[sp.csc_matrix, FloatArray, sp.csc_matrix, FloatArray]
 
 
-def program(problem: CurveProblem) -> Program:
+def program(problem: Case) -> Program:
     """P, q, A, limit of min x^T P x / 2 + q^T x, |A x| <= limit, zeros eliminated; x are the free nodes."""
     n = len(problem.y)
-    free = np.setdiff1d(np.arange(n), problem.held)
+    free = np.setdiff1d(np.arange(n), problem.fixed)
     rows = second_difference(problem.position_mm)
     bend = sp.diags_array([rows[:, 0], rows[:, 1], rows[:, 2]], offsets=[0, 1, 2], shape=(n - 2, n)).tocsc()[:, free]
     quadratic = sp.diags_array(problem.weight[free]) + problem.mu * (bend.T @ bend)
@@ -88,9 +108,9 @@ def program(problem: CurveProblem) -> Program:
     return sp.csc_matrix(quadratic), -problem.weight[free] * problem.y[free], matrix, limit
 
 
-def _whole(problem: CurveProblem, x: FloatArray) -> FloatArray:
+def _whole(problem: Case, x: FloatArray) -> FloatArray:
     curve = np.zeros(len(problem.y))
-    curve[np.setdiff1d(np.arange(len(curve)), problem.held)] = x
+    curve[np.setdiff1d(np.arange(len(curve)), problem.fixed)] = x
     return curve
 
 
@@ -151,7 +171,11 @@ def compare(n: int, runs: int, clock: timing.Clock, *, active: bool, slow: bool)
     """Time one case and print it; ``slow``: with the peers that need seconds here."""
     problems = curves(n, active=active)
     programs = [program(problem) for problem in problems]
-    functions: dict[str, Callable[[], list[FloatArray]]] = {OURS: lambda: ours(problems)}
+    ready = [problem.problem() for problem in problems]
+    functions: dict[str, Callable[[], list[FloatArray]]] = {
+        OURS: lambda: ours(ready),
+        FROM_ARRAYS: lambda: ours([problem.problem() for problem in problems]),
+    }
     if slow or not active:
         functions[OSQP] = lambda: with_osqp(programs)
     if slow or n <= 301:
@@ -162,11 +186,11 @@ def compare(n: int, runs: int, clock: timing.Clock, *, active: bool, slow: bool)
         title = f"{CURVES} curves of {n} nodes, {'active bounds' if active else 'no bound active'}"
         timing.print_comparison(title, comparison, references=(OURS,))
         expected = [_whole(problem, x) for problem, x in zip(problems, referee(programs), strict=True)]
-        far = {OURS: f"{deviation(ours(problems), expected):.1e}"}
-        for name in [name for name in functions if name != OURS]:
+        far = {OURS: f"{deviation(ours(ready), expected):.1e}"}
+        for name in [name for name in functions if name in (OSQP, CVXPY)]:
             whole = [_whole(problem, x) for problem, x in zip(problems, functions[name](), strict=True)]
             far[name] = f"{deviation(whole, expected):.1e}"
-    touched = sum(bool(solution.touched.any()) for solution in solve_curves(problems))
+    touched = sum(bool(solution.touched.any()) for solution in solve_curves(ready))
     print(f"  curves at a bound: {touched}; deviation from the referee, um: {far}")
 
 
@@ -193,7 +217,7 @@ class Correlated:
         self.options = FitOptions()
         self.options = self._bounds((0.8, 0.6) if active else (WIDE, WIDE))
         zeroed = zero_ends(self.machine, self.errors, self.covariance).curves
-        self.prepared = [prepare(name, held, self.options) for name, held in zeroed.items()]
+        self.prepared = [prepare(name, fixed, self.options) for name, fixed in zeroed.items()]
         self.mu = [smoothness(item, self.options).mu for item in self.prepared]
 
     def _bounds(self, share: tuple[float, float]) -> FitOptions:
@@ -219,7 +243,7 @@ class Correlated:
         found = []
         for item, mu in zip(self.prepared, self.mu, strict=True):
             nodes = item.smoother.nodes
-            rows = constraint_rows(item.held.position_mm, item.smoother, *item.bounds.limits, item.bounds.direction)
+            rows = constraint_rows(item.fixed.position_mm, item.smoother, *item.bounds.limits, item.bounds.direction)
             used = np.flatnonzero(np.isfinite(rows.upper))
             quadratic = sp.csc_matrix(item.smoother.matrix(mu)[nodes][:, nodes])
             linear = -item.smoother.load(item.y[:, None])[nodes, 0]
@@ -266,7 +290,6 @@ def main() -> None:
     arguments = parser.parse_args()
     clock = time.process_time if arguments.cpu else time.perf_counter
     print(timing.machine_line(("numpy", "scipy", "osqp", "clarabel", "cvxpy")))
-    print("  compiled loops (COMPGEN_KERNELS=compiled; curves without covariance alone have some):", load_kernels())
     for active in (False, True):
         for n in [nodes for nodes in arguments.nodes if nodes <= MOST_CORRELATED]:
             compare_correlated(n, arguments.runs, clock, active=active)

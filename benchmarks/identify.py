@@ -17,16 +17,15 @@ import timing
 from scipy.linalg.blas import dsyrk
 from scipy.optimize import least_squares
 
-from compgen.core.kernels import PLAIN, VARIABLE
-from compgen.core.lengths import Lengths
-from compgen.core.machine import Axis, Chain, Machine
+from compgen.data.lengths import Lengths
+from compgen.data.machine import Axis, Chain, Machine
 from compgen.identify import identify, joint_covariance, sample_errors
-from compgen.identify.grid_problem import grid_problem
-from compgen.identify.grid_start import start_moments
-from compgen.identify.parameters import ErrorParameters, error_parameters
-from compgen.identify.start import station_start_from_moments
-from compgen.model import load_kernels, modelled_errors
-from compgen.model.exact import exact_columns, tip_position
+from compgen.identify.adjust.grid_problem import grid_problem
+from compgen.identify.adjust.starts import start_moments, station_start_from_moments
+from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
+from compgen.kinematics import load_kernels, modelled_errors
+from compgen.kinematics.exact_chain import exact_columns, tip_position
+from compgen.kinematics.kernel_switch import PLAIN, VARIABLE
 
 STATIONS_MM = np.array(  # Zha & Zhang 2024, Table 6
     [

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from compgen.core.error_table import Curve, ErrorTable
-from compgen.core.lengths import Lengths
-from compgen.core.machine import CHAINS, Axis, Chain, Machine
-from compgen.core.names import SQUARENESS_NAMES, error_named
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.lengths import Lengths
+from compgen.data.machine import CHAINS, Axis, Chain, Machine
+from compgen.data.names import SQUARENESS_NAMES, error_named
 from compgen.identify import Identification, identify
-from compgen.model import modelled_errors
-from compgen.model.exact import tip_position
+from compgen.kinematics import modelled_errors
+from compgen.kinematics.exact_chain import tip_position
 
 NORMAL_95 = 1.959964
 KINDS = ("positioning", "straightness", "angular", "squareness", "stations", "dead lengths")

@@ -22,11 +22,11 @@ from pathlib import Path
 import numpy as np
 from public_iso230 import read_report
 
-from compgen.core.axis_runs import AxisRuns
-from compgen.core.machine import Machine, load_machine
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.machine import Machine, load_machine
 from compgen.diagnose import DiagnoseOptions, diagnose
 from compgen.errors import CompgenError
-from compgen.imports import ImportOptions, import_file
+from compgen.foreign import ImportOptions, import_file
 
 #: Worked by hand with the runs in their order of time: by a part of the file's name; figures before and after.
 BY_HAND = {

@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.accuracy import PositioningTest, axis_statistics, positioning_test
-from compgen.core.axis_runs import AxisRuns
+from compgen.data.axis_runs import AxisRuns
 from compgen.errors import CompgenError
-from compgen.imports import ImportOptions, import_file
+from compgen.foreign import ImportOptions, import_file
 
 Array = NDArray[np.float64]
 #: Our figures by the names of the reports; the unidirectional ones by their labels "forward" and "backward".

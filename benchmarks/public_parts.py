@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from scipy.optimize import leastsq
 
 import compgen
-from compgen.identify import IdentifyOptions, identify_measurement
+from compgen.identify import IdentifyOptions, identify_measurement, joint_covariance
+from compgen.identify.any_measurement import read_measurement
 from compgen.identify.covariance import error_design
-from compgen.identify.measurement import read_measurement
 
 Array = NDArray[np.float64]
 #: The correction that the workshop adopted for its mill, 1e-6 and degrees, and after the repair of 2012.
@@ -106,7 +106,7 @@ def identified(nominal: Array, measured: Array, machine: compgen.Machine, folder
         found = identify_measurement(machine, read_measurement([path]), IdentifyOptions(part_scale="free"))
     print(f"   residual {found.rms_um:.1f} um rms, {len(found.rejected)} of {2 * len(nominal)} coordinates rejected")
     points = compgen.Points(np.column_stack([nominal, np.zeros(len(nominal))]))
-    joint = compgen.joint_covariance(found)
+    joint = joint_covariance(found)
     design = error_design(machine, joint, points.position_mm)[:, :2].reshape(2 * len(nominal), -1)
     x, y = nominal.T
     one, zero = np.ones(len(x)), np.zeros(len(x))

@@ -31,19 +31,20 @@ from typing import Any
 import numpy as np
 
 import compgen
-from compgen.core.deviations import Deviations, format_deviations
-from compgen.core.machine import Machine, load_machine
-from compgen.core.names import error_named
-from compgen.core.threads import one_thread
-from compgen.model.exact import exact_error
-from compgen.model.grid import volume_grid
-from compgen.recal import logs, runner
-from compgen.recal.fleet import run_fleet
-from compgen.recal.job import Job, read_job
-from compgen.recal.overview import status
-from compgen.recal.process import Processed, process
-from compgen.recal.records import MachineRecord, MeasurementRecord, NewResult, TableFile
-from compgen.recal.store import Store, open_store
+from compgen.data.deviations import Deviations, format_deviations
+from compgen.data.machine import Machine, load_machine
+from compgen.data.names import error_named
+from compgen.fleet import logs, runner
+from compgen.fleet.job import Job, read_job
+from compgen.fleet.process import Processed, process
+from compgen.fleet.records import MachineRecord, MeasurementRecord, NewResult, StoredTableFile
+from compgen.fleet.runner import run_fleet
+from compgen.fleet.status import status
+from compgen.fleet.store import Store, open_store
+from compgen.kinematics import modelled_errors
+from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.kernel_switch import one_thread
+from compgen.kinematics.volume_grid import volume_grid
 
 CONTROL = "siemens-cec"
 NOISE_MM = 3e-4
@@ -84,7 +85,7 @@ def measurement_text(machine: Machine, seed: int) -> str:
     """Deviations of a machine with errors of its own on the grid of its nodes, with noise, as a file."""
     draw = np.random.default_rng(seed)
     curves, constants = {}, {}
-    for name in compgen.modelled_errors(machine):
+    for name in modelled_errors(machine):
         error = error_named(name)
         if error.kind == "squareness":
             constants[name] = (draw.normal(0.0, 20e-6), 0.0)
@@ -207,7 +208,7 @@ class StandIn:
             self.result = process(store, job, machine, measurement).result
         mark = f"\n# {machine.name} {measurement.name}\n".encode()
         found = self.result
-        files = tuple(TableFile(item.controller, item.name, item.content + mark) for item in found.files)
+        files = tuple(StoredTableFile(item.controller, item.name, item.content + mark) for item in found.files)
         made = replace(found, files=files, errors_text=found.errors_text + mark, fitted_text=found.fitted_text + mark)
         active = next((table.id for table in store.tables(machine) if table.state == "active"), None)
         return Processed(replace(made, settings_sha256=job.settings_sha256()), active)

@@ -26,15 +26,15 @@ from pathlib import Path
 import numpy as np
 import sqlalchemy as sa
 
-from compgen.core.deviations import Deviations, format_deviations
-from compgen.core.error_table import Curve, ErrorTable
-from compgen.core.machine import load_machine
-from compgen.model.exact import exact_error
-from compgen.model.grid import volume_grid
-from compgen.recal import schema
-from compgen.recal.job import read_job
-from compgen.recal.runner import run_jobs
-from compgen.recal.store import Store, open_store
+from compgen.data.deviations import Deviations, format_deviations
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.machine import load_machine
+from compgen.fleet import database
+from compgen.fleet.job import read_job
+from compgen.fleet.runner import run_jobs
+from compgen.fleet.store import Store, open_store
+from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.volume_grid import volume_grid
 
 MACHINE = """\
 name = "mill"
@@ -151,7 +151,7 @@ def look(site: Site, found: Findings) -> None:
 def _lost_rows(store: Store, found: Findings) -> list[str]:
     """Rows that were there before and are gone or changed."""
     lost = []
-    for table in schema.ALL:
+    for table in database.ALL:
         columns = [column for column in table.c if column.name != "deflated"]
         query = sa.select(*columns)
         now = {repr(tuple(row)) for row in store.read(lambda c, q=query: list(c.execute(q)))}
@@ -206,7 +206,7 @@ def reached(site: Site, child: int, before: tuple[int, int]) -> str:
     try:
         known, kept = len(store.measurements()), len(store.identifications())
         claims: dict[int, str] = {}
-        for row in store.read(lambda c: list(c.execute(sa.select(schema.claims).order_by(schema.claims.c.id)))):
+        for row in store.read(lambda c: list(c.execute(sa.select(database.claims).order_by(database.claims.c.id)))):
             claims[row.measurement_id] = "" if row.kind == "release" else row.owner
         active = next((item for item in store.tables(figures=False) if item.state == "active"), None)
     finally:

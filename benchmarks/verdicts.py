@@ -24,18 +24,17 @@ from pathlib import Path
 import numpy as np
 
 import compgen
-from compgen.controllers import CONTROLLERS, SourceFile
-from compgen.core import tomlio
-from compgen.core.error_table import Curve, ErrorTable
-from compgen.core.machine import CHAINS, Axis, Chain, Machine
-from compgen.core.names import ERROR_NAMES, error_named
-from compgen.core.points import Points
+from compgen.controls import CONTROLLERS, SourceFile
+from compgen.data import toml_files
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.lengths import Points
+from compgen.data.machine import CHAINS, Axis, Chain, Machine
+from compgen.data.names import ERROR_NAMES, error_named
 from compgen.errors import CompgenError
-from compgen.export import export
-from compgen.model import modelled_errors
-from compgen.verify import ReadTables, verify
-from compgen.verify.judge import judge_of
-from compgen.verify.verify import reasons_against
+from compgen.kinematics import modelled_errors
+from compgen.tables import ReadTables, export, verify
+from compgen.tables.judge import judge_of
+from compgen.tables.verification import reasons_against
 
 SHIPPED = compgen.load_machine("zha-gantry")
 FOLDER = Path(__file__).resolve().parents[1]
@@ -58,7 +57,9 @@ def random_machine(rng: np.random.Generator) -> Machine:
         axes.append(Axis((low, low + length), np.linspace(low, low + length, nodes)))
         reference.append(round(low + length * float(rng.choice([0.0, 1.0, 0.5, rng.uniform(0.1, 0.9)])), 1))
     tool = rng.choice([0.0, 1.0]) * np.round(rng.uniform([-40, -40, -200], [40, 40, 100]), 1)
-    pmac = tomlio.Section({"counts_per_mm": float(rng.choice([500, 1000, 2000]))}, path=None, name="controllers.pmac")
+    pmac = toml_files.Section(
+        {"counts_per_mm": float(rng.choice([500, 1000, 2000]))}, path=None, name="controllers.pmac"
+    )
     return Machine(
         name="random",
         chain=Chain(str(rng.choice(CHAINS))),
@@ -117,18 +118,17 @@ def texts_of(machine: Machine, errors: ErrorTable, name: str) -> tuple[dict[str,
 
 def read_texts(machine: Machine, name: str, texts: dict[str, str]) -> ReadTables:
     """Parse texts as ``volcomp verify`` does."""
-    control = CONTROLLERS[name]
-    settings = control.read_settings(machine)
+    control = CONTROLLERS[name](machine)
     sources = [SourceFile(Path(file), text) for file, text in texts.items()]
-    tables = control.parse(machine, settings, sources)
-    others = tuple(control.contradictions(machine, settings, tables, sources))
-    return ReadTables(control, settings, tables, (), others)
+    tables = control.parse(sources)
+    others = tuple(control.contradictions(tables, sources))
+    return ReadTables(control, tables, (), others)
 
 
 def probes(machine: Machine, tables: ReadTables, rng: np.random.Generator) -> Points:
     """Random points and nodes of the tables in random columns, with the machine's own tool and others."""
     low, high = machine.lower_mm, machine.upper_mm
-    nodes = tables.controller.table_nodes_mm(machine, tables.settings, tables.tables)
+    nodes = tables.controller.table_nodes_mm(tables.tables)
     parts = [rng.uniform(low, high, (1500, 3))]
     inside = [part[(part >= a) & (part <= b)] for part, a, b in zip(nodes, low, high, strict=True)]
     if np.prod([len(part) for part in inside]) <= 20_000 and all(len(part) for part in inside):

@@ -7,40 +7,53 @@ The names are loaded on first use, so that a program that needs one of them does
 """
 
 import sys
+import warnings
 from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 #: The public names by the module that defines them.
 _HOMES = {
-    "compgen.controllers": "CONTROLLERS",
-    "compgen.core.deviations": "Deviations format_deviations read_deviations",
-    "compgen.core.error_table": "Curve ErrorTable format_errors read_errors",
-    "compgen.core.lengths": "Lengths format_lengths read_lengths",
-    "compgen.core.machine": "Axis Chain Machine load_machine",
-    "compgen.core.points": "Points format_points read_points",
-    "compgen.core.reversal": "ReversalCurves format_reversal read_reversal",
+    "compgen.controls": "CONTROLLERS",
+    "compgen.data.error_table": "Curve ErrorTable ReversalCurves format_errors read_errors read_reversal",
+    "compgen.data.deviations": "Deviations read_deviations",
+    "compgen.data.lengths": "Lengths Points read_lengths read_points",
+    "compgen.data.machine": "Axis Chain Machine load_machine",
     "compgen.errors": "CompgenError CompgenWarning ConvergenceError InputError UndeterminedError",
-    "compgen.export": "Export export wanted_correction",
+    "compgen.tables": "Export ReadTables Verification export read_tables verify without_rigid_motion",
     "compgen.fit": "FitOptions FitResult fit",
-    "compgen.identify": (
-        "Covariance Identification IdentifyOptions SystematicInputs "
-        "identify identify_deviations joint_covariance predict_uncertainty read_covariance"
-    ),
-    "compgen.model": "c_matrix exact_error modelled_errors observable_errors predict volumetric_error",
+    "compgen.identify": "Identification IdentifyOptions identify",
+    "compgen.kinematics": "c_matrix exact_error observable_errors predict volumetric_error",
     "compgen.pipeline": "RunResult run",
-    "compgen.plan": "Plan PlannedStations plan planned_stations suggest",
+    "compgen.plan": "Plan plan planned_stations",
     "compgen.plugins": "load_plugins",
-    "compgen.simulate": "Scenario Simulation read_scenario simulate write_simulation",
-    "compgen.verify": "ReadTables Residuals Verification read_tables residuals verify without_rigid_motion",
+    "compgen.simulate": "read_scenario simulate write_simulation",
 }
+#: Names that were public until 0.1; they stay where they are defined.
+_DEPRECATED = {
+    "compgen.data.error_table": "format_reversal",
+    "compgen.data.deviations": "format_deviations",
+    "compgen.data.lengths": "format_lengths format_points",
+    "compgen.tables": "Residuals residuals wanted_correction",
+    "compgen.identify": (
+        "Covariance SystematicInputs identify_deviations joint_covariance predict_uncertainty read_covariance"
+    ),
+    "compgen.kinematics": "modelled_errors",
+    "compgen.plan": "PlannedStations suggest",
+    "compgen.simulate": "Scenario Simulation",
+}
+#: Version in which the deprecated names go.
+_REMOVED_IN = "0.3"
 __all__ = sorted(name for names in _HOMES.values() for name in names.split())
 
 
-def _on_first_use(name: str, home: str) -> property:
+def _on_first_use(name: str, home: str, *, deprecated: bool = False) -> property:
     """A public name as a property: importing the sub-package ``compgen.fit`` must not hide the function ``fit``."""
 
     def load(package: ModuleType) -> Any:
+        if deprecated:
+            text = f"compgen.{name} is deprecated and will be removed in {_REMOVED_IN}; use `from {home} import {name}`"
+            warnings.warn(text, DeprecationWarning, stacklevel=2)
         return getattr(import_module(home), name)
 
     def keep(package: ModuleType, value: Any) -> None:
@@ -58,5 +71,10 @@ def __dir__() -> list[str]:
 sys.modules[__name__].__class__ = type(
     "_Package",
     (ModuleType,),
-    {name: _on_first_use(name, home) for home, names in _HOMES.items() for name in names.split()},
+    {
+        name: _on_first_use(name, home, deprecated=table is _DEPRECATED)
+        for table in (_HOMES, _DEPRECATED)
+        for home, names in table.items()
+        for name in names.split()
+    },
 )

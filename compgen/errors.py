@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from compgen.core.text import visible
+from compgen.data.messages import visible
 
 
 class CompgenError(Exception):
-    """Base of every error that compgen raises on purpose; the command line turns it into ``exit_code``."""
+    """Base of every error that compgen raises on purpose; the command line turns it into ``exit_code``.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> try:
+    ...     compgen.load_machine("no-such-machine")
+    ... except compgen.CompgenError as error:
+    ...     print(type(error).__name__, error.exit_code)
+    InputError 2
+    """
 
     exit_code = 2
 
@@ -20,6 +30,13 @@ class InputError(CompgenError, ValueError):
     ----------
     message : what was given, what is allowed, what to do.
     file, line, field : where it stands, as far as it is known; they are put in front of the message.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> error = compgen.InputError("expected a number, found 'ten'", file="mill.toml", line=7, field="nodes")
+    >>> print(error)
+    mill.toml:7: nodes: expected a number, found 'ten'
     """
 
     def __init__(
@@ -40,7 +57,21 @@ class InputError(CompgenError, ValueError):
 
 
 class UndeterminedError(CompgenError):
-    """The data do not determine what was asked for; ``combinations`` says in words what is missing."""
+    """The data do not determine what was asked for; ``combinations`` says in words what is missing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> machine, r = compgen.load_machine("zha-gantry"), compgen.read_lengths("examples/zha-gantry.lengths.csv")
+    >>> k = np.flatnonzero((r.position_mm[:, 1:] == 0.0).all(axis=1))  # readings along one line only
+    >>> few = compgen.Lengths(r.stations, r.station[k], tuple(r.point[i] for i in k), r.position_mm[k], r.length_mm[k])
+    >>> try:
+    ...     compgen.identify(machine, few)
+    ... except compgen.UndeterminedError as error:
+    ...     print(len(error.combinations) > 0)
+    True
+    """
 
     exit_code = 1
 
@@ -50,10 +81,33 @@ class UndeterminedError(CompgenError):
 
 
 class ConvergenceError(CompgenError):
-    """An iteration did not reach its optimum; nothing that it produced may be used."""
+    """An iteration did not reach its optimum; nothing that it produced may be used.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> issubclass(compgen.ConvergenceError, compgen.CompgenError)
+    True
+    """
 
     exit_code = 1
 
 
 class CompgenWarning(UserWarning):
-    """Something the user should know that does not stop the work."""
+    """Something the user should know that does not stop the work.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> import numpy as np
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> errors = compgen.read_errors("examples/zha-gantry.truth.errors.csv")
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", compgen.CompgenWarning)
+    ...     try:
+    ...         compgen.predict(machine, errors, compgen.Points(np.array([[50.0, 0.0, 0.0]])))
+    ...     except compgen.CompgenWarning as warning:
+    ...         print("outside the travel:", str(warning)[:3])
+    outside the travel: EXX
+    """

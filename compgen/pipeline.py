@@ -9,52 +9,49 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
-from compgen.controllers import controller_named
-from compgen.core.csvio import FloatArray, format_csv
-from compgen.core.deviations import Deviations, format_deviations
-from compgen.core.error_table import Curve, ErrorTable, format_errors
-from compgen.core.files import OutputFolder, read_bytes, sha256_of, working_folder
-from compgen.core.lengths import Lengths
-from compgen.core.machine import Machine
-from compgen.core.names import AXES
-from compgen.core.reversal import WORTH_MM, ReversalCurves, format_reversal
+from compgen.controls import controller_named
+from compgen.data.csv_files import FloatArray, format_csv
+from compgen.data.deviations import Deviations, format_deviations
+from compgen.data.display import Bars, Drawable, Overview, Panel
+from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, format_errors, format_reversal
+from compgen.data.files import OutputFolder, read_bytes, sha256_of, working_folder
+from compgen.data.lengths import Lengths
+from compgen.data.machine import Machine
+from compgen.data.names import AXES
 from compgen.effects import with_effects_reversal
 from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
-from compgen.export import REJECTED_PREFIX, Export, Provenance, export, set_aside_superseded, usable_format
 from compgen.fit import FitOptions, FitResult, fit
-from compgen.identify import (
-    Identification,
-    IdentifyOptions,
-    covariance,
-    describe,
-    identify_measurement,
-)
-from compgen.identify.evidence import evidence_files
-from compgen.identify.measurement import Measurement
+from compgen.foreign import given_errors, open_measurement
+from compgen.identify import Identification, IdentifyOptions, covariance, describe, identify_measurement
+from compgen.identify.any_measurement import Measurement, evidence_files
 from compgen.identify.monte_carlo import SelfCheck
-from compgen.identify.reversal import SIGNIFICANT
-from compgen.imports import given_errors, open_measurement
-from compgen.verify import Verification, read_tables, verify
-from compgen.verify.active import ActiveTables, without_active
-from compgen.verify.check_program import check_files
-from compgen.verify.evidence import verification_files
-from compgen.verify.safety import SafetyLimits
-from compgen.verify.verdict import MISFIT_CODES, blocking_reasons, measurement_objections, taken_away_um
+from compgen.identify.reversal_errors import SIGNIFICANT
+from compgen.tables import (
+    REJECTED_PREFIX,
+    Export,
+    Provenance,
+    Verification,
+    export,
+    read_tables,
+    set_aside_superseded,
+    usable_format,
+    verify,
+)
+from compgen.tables.active import ActiveTables, without_active
+from compgen.tables.safety import SafetyLimits
+from compgen.tables.signs import check_files
+from compgen.tables.verification import (
+    MISFIT_CODES,
+    blocking_reasons,
+    measurement_objections,
+    taken_away_um,
+    verification_files,
+)
 
 Progress = Callable[[str], None]
-
-
-class Checks(TypedDict, total=False):
-    """What :func:`run` may be told beyond the stages' options, see there."""
-
-    active: ActiveTables | None
-    limits: SafetyLimits | None
-    instrument: str | Path | None
-    allow_misfit: bool
 
 
 @dataclass(frozen=True)
@@ -66,11 +63,23 @@ class ControllerResult:
     paths: tuple[Path, ...]
 
 
-@dataclass(frozen=True)
-class RunResult:
+@dataclass(frozen=True, repr=False)
+class RunResult(Drawable):
     """Outcome of :func:`run`; ``accepted`` is True if every control's tables are.
 
     ``earlier_report`` says where the report of the tables that were in the folder before is kept.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     result: compgen.RunResult = compgen.run(machine, ["examples/zha-gantry.lengths.csv"], ["isg-csv"], folder)
+    >>> result
+    <RunResult: isg-csv accepted>
+    >>> result.results[0].verification.state
+    'accepted'
     """
 
     identification: Identification
@@ -82,6 +91,24 @@ class RunResult:
     def accepted(self) -> bool:
         """Whether all tables may be loaded."""
         return all(result.verification.accepted for result in self.results)
+
+    def overview(self) -> Overview:
+        """The verdict on the tables of each control."""
+        checked = [item.verification for item in self.results]
+        rows = tuple(
+            (x.controller, f"{x.before.rms_um:.4g}", f"{x.after.rms_um:.4g}", x.state.replace("_", " "))
+            for x in checked
+        )
+        title = "; ".join(f"{x.controller} {x.state.replace('_', ' ')}" for x in checked)
+        return Overview(title, ("control", "before, rms (um)", "after, rms (um)", "verdict"), rows)
+
+    def panels(self) -> Sequence[Panel]:
+        """Root mean square of the error of the tool tip before and after, by control."""
+        checked = [item.verification for item in self.results]
+        names = tuple(item.controller for item in checked)
+        before = Bars("before", names, tuple(item.before.rms_um for item in checked))
+        after = Bars("after", names, tuple(item.after.rms_um for item in checked))
+        return [Panel("error over the volume", "rms (um)", bars=(before, after))]
 
 
 def provenance_of(*paths: str | Path | None) -> Provenance:
@@ -95,7 +122,7 @@ def identification_files(
 ) -> dict[str, str | bytes]:
     """Return the contents of ``identified.errors.csv`` and its covariance, ``stations.csv`` and ``identify.json``.
 
-    Where a reversal was found ``identified.reversal.csv`` stands beside them. The two-step method adds
+    Where a reversal was found, ``identified.reversal.csv`` is added. The two-step method adds
     ``measured.deviations.csv``; deviations as input give no stations.
     """
     stations = result.stations
@@ -113,7 +140,10 @@ def identification_files(
         "residual_rms_um": np.array([item.rms_um for item in stations]),
     }
     summary = {**result.summary(), "inputs": [{"name": name, "sha256": digest} for name, digest in provenance.inputs]}
-    files: dict[str, str | bytes] = {}
+    text = format_errors(result.errors, {"covariance": covariance.FILE_NAME} if result.has_covariance else {})
+    files: dict[str, str | bytes] = {"identified.errors.csv": text}
+    if result.has_covariance:
+        files[covariance.FILE_NAME] = covariance.format_covariance(covariance.joint_covariance(result), text)
     if stations:
         files["stations.csv"] = format_csv(columns, {"machine": result.errors.metadata.get("machine", "")})
     if result.positions is not None:
@@ -123,11 +153,7 @@ def identification_files(
     reversal = identified_reversal(result)
     if reversal is not None:
         files["identified.reversal.csv"] = format_reversal(reversal)
-    return {
-        **_errors_files(result),
-        **files,
-        "identify.json": json.dumps(summary, indent=2) + "\n",
-    }
+    return {**files, "identify.json": json.dumps(summary, indent=2) + "\n"}
 
 
 #: What only some identifications write.
@@ -173,14 +199,6 @@ def _found_reversal(result: Identification) -> ReversalCurves | None:
     return ReversalCurves(curves, {"machine": result.errors.metadata.get("machine", "")}) if curves else None
 
 
-def _errors_files(result: Identification) -> dict[str, str | bytes]:
-    if not result.has_covariance:
-        return {"identified.errors.csv": format_errors(result.errors)}
-    text = format_errors(result.errors, {"covariance": covariance.FILE_NAME})
-    content = covariance.format_covariance(covariance.joint_covariance(result), text)
-    return {"identified.errors.csv": text, covariance.FILE_NAME: content}
-
-
 def fit_files(result: FitResult) -> dict[str, str]:
     """Return the texts of ``fitted.errors.csv`` and ``fit.json``."""
     return {
@@ -197,15 +215,18 @@ def write_all(folder: str | Path, files: Mapping[str, str | bytes]) -> dict[str,
     return output.commit()
 
 
-def export_and_verify(
+def export_and_verify(  # noqa: PLR0913  (options by keyword)
     machine: Machine,
     fitted: ErrorTable,
     identified: ErrorTable,
     controller: str,
     folder: str | Path,
     *,
+    templates: Path | None = None,
+    allow_unverified: bool = False,
+    provenance: Provenance | None = None,
+    reversal: ReversalCurves | None = None,
     limits: SafetyLimits | None = None,
-    **export_options: Any,
 ) -> ControllerResult:
     """Export, write to a temporary folder, read the bytes back from there, verify, and only then write to ``folder``.
 
@@ -214,10 +235,17 @@ def export_and_verify(
     limit that binds) is a reason too.
     """
     OutputFolder(folder)
-    exported = export(machine, fitted, controller, **export_options)
-    reversal: ReversalCurves | None = export_options.get("reversal")
+    exported = export(
+        machine,
+        fitted,
+        controller,
+        templates=templates,
+        allow_unverified=allow_unverified,
+        provenance=provenance,
+        reversal=reversal,
+    )
     verification = verified_export(machine, exported, identified, reversal, limits)
-    beside = check_files(machine, exported, identified, export_options.get("templates"), reversal)
+    beside = check_files(machine, exported, identified, templates, reversal)
     return _write_results(OutputFolder(folder), {"": (exported, verification, beside)})[0][0]
 
 
@@ -229,7 +257,7 @@ def verified_export(
     limits: SafetyLimits | None = None,
     known: covariance.Covariance | None = None,
 ) -> Verification:
-    """Verify what stands in the files after they were written; InputError if they cannot be read.
+    """Verify what the written files contain; InputError if they cannot be read.
 
     What the export itself could not hold (a limit that binds) is a reason too.
     """
@@ -254,13 +282,6 @@ def _with_objections(verification: Verification, identification: Identification,
     return replace(verification, objections=found, reasons=tuple(dict.fromkeys(reasons)))
 
 
-def _diagnosis_of(machine: Machine, measurements: Sequence[str | Path], folder: str | Path) -> str:
-    """Return the command that looks for what the model lacks."""
-    source = machine.name if machine.source is None else str(machine.source)
-    words = ["volcomp", "diagnose", source, *map(str, measurements), "--out", str(Path(folder) / "diagnosis")]
-    return shlex.join(words)
-
-
 def identify_bare(
     machine: Machine,
     measurement: Measurement | ErrorTable,
@@ -269,9 +290,8 @@ def identify_bare(
 ) -> Identification:
     """Identify the machine without the tables that were active while it was measured, if there were any.
 
-    Errors that another program identified are taken as they are given.
-
-    What was taken out stands in ``corrections["active_tables"]`` of the result.
+    Errors that another program identified are used as given. ``corrections["active_tables"]`` of the result says what
+    was taken out.
     """
     if active is None and isinstance(measurement, ErrorTable):
         return given_errors(machine, measurement)
@@ -332,7 +352,7 @@ def failure_reported(folder: str | Path) -> Iterator[None]:
         raise
 
 
-def run(
+def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     machine: Machine,
     measurements: Sequence[str | Path],
     controllers: Sequence[str],
@@ -342,8 +362,11 @@ def run(
     fit_options: FitOptions | None = None,
     templates: Path | None = None,
     allow_unverified: bool = False,
+    active: ActiveTables | None = None,
+    instrument: str | Path | None = None,
+    limits: SafetyLimits | None = None,
+    allow_misfit: bool = False,
     progress: Progress = lambda _: None,
-    **checks: Unpack[Checks],
 ) -> RunResult:
     """Run the whole chain and write everything to ``folder``, after the last step that may find bad input.
 
@@ -351,15 +374,38 @@ def run(
     ----------
     machine : the machine.
     measurements : ``*.lengths.csv``, ``*.deviations.csv``, ``*.sixdof.csv`` files.
-    controllers : names of the controls; with one its files stand in ``folder``, with several each has its own
+    controllers : names of the controls; with one its files are in ``folder``, with several each has its own
         sub-folder.
     folder : output folder.
-    identify_options, fit_options, templates, allow_unverified : handed to the stages.
-    progress : is told the name of each stage as it begins.
-    checks : ``active``, tables that were active while the machine was measured (the new ones take their place),
-        ``limits`` for the steps of the tables, and ``instrument``, the instrument file of six-DOF readings. Where these
-        contradict the machine's chain, nothing is accepted. With ``allow_misfit`` residuals that are too large, or that a
-        step or a drift explains, are a reservation, and no reason to refuse the tables.
+    identify_options, fit_options : how the errors are identified and the curves are fitted.
+    templates : a folder of the user's own templates, searched before the shipped ones.
+    allow_unverified : export formats that no public document fully describes.
+    active : tables that were active while the machine was measured; the new ones take their place.
+    instrument : the instrument file of six-DOF readings.
+    limits : what the steps of the tables must not exceed.
+    allow_misfit : residuals that are too large, or that a step or a drift explains, are a reservation, and no reason to
+        refuse the tables.
+    progress : is told the name of each step as it begins.
+
+    Raises
+    ------
+    InputError
+        for files and settings that are missing or wrong; nothing is written.
+    UndeterminedError, ConvergenceError
+        if the readings do not determine the errors, or no optimum is found; ``identify.json`` gives the reason.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     result = compgen.run(machine, ["examples/zha-gantry.lengths.csv"], ["isg-csv"], folder)
+    ...     names = sorted(path.name for path in result.results[0].paths)
+    >>> result.accepted
+    True
+    >>> [name for name in names if name.startswith("volcomp0")]
+    ['volcomp0.csv', 'volcomp0.lis']
     """
     sub_folders = {name: name if len(set(controllers)) > 1 else "" for name in controllers}
     if not sub_folders:
@@ -369,15 +415,18 @@ def run(
         controller_named(name).read_settings(machine)
         usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
-    measurement = open_measurement(measurements, checks.get("instrument"))
-    provenance = provenance_of(machine.source, *measurements, checks.get("instrument"))
+    measurement = open_measurement(measurements, instrument)
+    provenance = provenance_of(machine.source, *measurements, instrument)
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):
-        identification = identify_bare(machine, measurement, identify_options, checks.get("active"))
+        identification = identify_bare(machine, measurement, identify_options, active)
     progress("fitting smooth curves")
     known = None if not identification.has_covariance else covariance.joint_covariance(identification)
     fitted = fit(machine, identification.errors, fit_options or FitOptions(), covariance=known)
     reversal = identified_reversal(identification)
+    source = str(machine.source or machine.name)  # the command that looks for what the model lacks
+    words = ["diagnose", source, *map(str, measurements), "--out", str(Path(folder) / "diagnosis")]
+    diagnosis = shlex.join(["volcomp", *words])
     checked: dict[str, tuple[Export, Verification, Mapping[str, str]]] = {}
     for name, sub_folder in sub_folders.items():
         progress(f"exporting, reading back and verifying: {name}")
@@ -390,10 +439,10 @@ def run(
             provenance=provenance,
             reversal=reversal,
         )
-        verification = verified_export(machine, exported, identification.errors, reversal, checks.get("limits"), known)
-        verification = _with_objections(verification, identification, allow_misfit=checks.get("allow_misfit", False))
+        verification = verified_export(machine, exported, identification.errors, reversal, limits, known)
+        verification = _with_objections(verification, identification, allow_misfit=allow_misfit)
         if any(item.code in MISFIT_CODES for item in verification.objections):
-            verification = replace(verification, next_command=_diagnosis_of(machine, measurements, folder))
+            verification = replace(verification, next_command=diagnosis)
         beside = check_files(machine, exported, identification.errors, templates, reversal)
         checked[sub_folder] = exported, verification, beside
     evidence = evidence_files(machine, measurement, identification)

@@ -8,13 +8,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from compgen.controllers import CONTROLLERS
-from compgen.core.plugins import PATH_ORIGIN, Kind, load_entry_points, load_file
+from compgen.controls import CONTROLLERS
+from compgen.data.registry import PATH_ORIGIN, Kind, load_entry_points, load_file
 from compgen.effects import FAMILIES
-from compgen.effects.registration import check_family
-from compgen.export.registration import check_control
+from compgen.effects.catalogue import check_family
 from compgen.simulate import EFFECTS, INSTRUMENTS
-from compgen.simulate.registration import check_effect, check_instrument
+from compgen.simulate.run import check_effect, check_instrument
+from compgen.tables.render import check_control
 
 #: What plug-ins may add: word, name of the dict in a file, group of entry points, registry, check.
 KINDS = (
@@ -39,6 +39,16 @@ def load_plugins(paths: Sequence[str | Path] = (), *, installed: bool = True) ->
     ------
     InputError
         with file and line for a plug-in among ``paths`` that cannot be imported or is not complete.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import compgen
+    >>> try:
+    ...     compgen.load_plugins(["my_control.py"], installed=False)
+    ... except compgen.InputError as error:
+    ...     print(Path(error.file).name)
+    my_control.py
     """
     if installed:
         load_entry_points(KINDS)

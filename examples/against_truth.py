@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import compgen
+from compgen.tables import residuals
 
 HERE = Path(__file__).parent
 
@@ -33,7 +34,7 @@ def main(folder: Path) -> None:
     truth = compgen.read_errors(HERE / "zha-gantry.truth.errors.csv")
     print("against the truth, 2000 random points (as it stands):")
     for path in sorted(folder.glob("*/manifest.json")):
-        figures = compgen.residuals(residual_mm(machine, truth, path.parent))
+        figures = residuals(residual_mm(machine, truth, path.parent))
         print(f"  {path.parent.name:16s} max {figures.max_um:9.2f} um   rms {figures.rms_um:9.2f} um")
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import compgen
-from compgen.core.names import error_named
-from compgen.model import modelled_errors
+from compgen.data.names import error_named
+from compgen.kinematics import modelled_errors
 
 ROOT = Path(__file__).resolve().parents[1]
 

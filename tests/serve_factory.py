@@ -3,9 +3,10 @@
 import json
 from datetime import UTC, datetime, timedelta
 
-from compgen.recal import claims, decisions, results
-from compgen.recal.records import NewMeasurement, NewResult, TableFile
-from compgen.recal.store import open_store
+from compgen.fleet import claims, decisions
+from compgen.fleet import claims as results
+from compgen.fleet.records import NewMeasurement, NewResult, StoredTableFile
+from compgen.fleet.store import open_store
 
 EVIL = "<script>document.title='broken'</script>\"'><img src=x onerror=alert(1)>{{7*7}}"
 MACHINE_TOML = b"""\
@@ -67,7 +68,10 @@ def add(store, machine, number, *, approve=False, hold=(), accepted=True, name=N
         summary={},
         program="test",
         active_table_id=None if active is None else active.id,
-        files=[TableFile("isg-csv", file, text), TableFile("isg-csv", "preflight.md", b"# same in every version\n")],
+        files=[
+            StoredTableFile("isg-csv", file, text),
+            StoredTableFile("isg-csv", "preflight.md", b"# same in every version\n"),
+        ],
         accepted=accepted,
         hold=list(hold),
         judgement=judgement(6.0, 1.5),

@@ -10,12 +10,11 @@ from pathlib import Path
 import serve_factory as factory
 from argon2 import PasswordHasher
 
-from compgen.recal.store import open_store
-from compgen.serve import users
-from compgen.serve.app import make_app
-from compgen.serve.server import make_server
-from compgen.serve.settings import Settings
-from compgen.serve.users import Users
+from compgen.fleet.dashboard import settings as users
+from compgen.fleet.dashboard.app import make_app
+from compgen.fleet.dashboard.server import make_server
+from compgen.fleet.dashboard.settings import DashboardSettings, Users
+from compgen.fleet.store import open_store
 
 OWN = "http://localhost:8765"
 PASSWORD = "correct horse battery"
@@ -91,7 +90,7 @@ class Site:
             self.users = Users(folder / "users.json")
             self.clock = Clock()
             options = {"decide": True, "users": self.users.path} | options
-            self.settings = Settings(str(folder / "store.sqlite"), **options)
+            self.settings = DashboardSettings(str(folder / "store.sqlite"), **options)
             self.app = make_app(self.settings, self.store, self.clock)
         self.client = self.app.test_client()
 
@@ -120,7 +119,9 @@ class Served:
     def __init__(self, folder):
         put(folder)
         self.store = open_store(str(folder / "store.sqlite"))
-        self.settings = Settings(str(folder / "store.sqlite"), port=0, decide=True, users=folder / "users.json")
+        self.settings = DashboardSettings(
+            str(folder / "store.sqlite"), port=0, decide=True, users=folder / "users.json"
+        )
         with cheap_hashes():
             self.server = make_server(self.settings)
         self.address = ("127.0.0.1", int(self.server.effective_port))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from compgen.export import export
+from compgen.tables import export
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 

@@ -105,7 +105,7 @@ def pins(name):
     for line in (ROOT / name).read_text().splitlines():
         if entry := re.match(r"([A-Za-z0-9._-]+)(?:\[.*\])?==([^ ;]+)", line):
             package = re.sub("[-_.]+", "-", entry[1]).lower()
-            assert package not in found
+            assert package not in found or " ; " in line  # one version for each range of Python versions
             found[package] = [entry[2], 0]
         elif re.fullmatch(r" +--hash=sha256:[0-9a-f]{64}( \\)?", line):
             found[package][1] += 1
@@ -123,19 +123,22 @@ def test_every_dependency_is_pinned_with_the_hashes_of_its_files():
         *(x for y in extras for x in y),
     ]
     names = {re.sub("[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", text)[0]).lower() for text in wanted} - {"compgen"}
-    run, dev = pins("requirements.txt"), pins("requirements-dev.txt")
+    run, dev, docs = (pins(f"requirements{kind}.txt") for kind in ("", "-dev", "-docs"))
     assert names <= set(run)
     assert {"pytest", "ruff", "mypy"} <= set(dev) - set(run)
     assert all(dev[name] == pin for name, pin in run.items())
-    assert all(count >= 1 for _, count in dev.values())
+    assert all(count >= 1 for _, count in [*dev.values(), *docs.values()])
+    assert {"sphinx", "myst-parser", "furo"} <= set(docs) - set(dev)
+    assert all(docs[name] == run[name] for name in docs.keys() & run.keys())
     assert run["numpy"][1] > 20  # the wheels of all platforms, not of one
 
 
 def test_make_installs_nothing_without_hashes():
     """The only other thing that pip gets is compgen itself, without its dependencies and with the pinned backend."""
     makefile = (ROOT / "Makefile").read_text()
-    assert "pip install" not in makefile.replace(
-        "$(BIN)/python -m pip install --quiet --disable-pip-version-check", "", 1
-    )
-    for line in re.findall(r"^\t\$\(PIP\) (.*)$", makefile, re.MULTILINE):
+    assert "pip install" not in makefile.replace("-m pip install --quiet --disable-pip-version-check", "", 1)
+    assert "PIP_INSTALL" not in re.sub(r"^PIP\w* :=.*$", "", makefile, flags=re.MULTILINE)
+    lines = re.findall(r"^\t\$\(PIP(?:_DOCS)?\) (.*)$", makefile, re.MULTILINE)
+    assert len(lines) == 6
+    for line in lines:
         assert line.startswith("--require-hashes -r ") or line == "--no-build-isolation --no-deps -e ."

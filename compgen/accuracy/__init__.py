@@ -1,29 +1,31 @@
 """Accuracy figures of the standards, with uncertainty, and before against after."""
 
-from compgen.accuracy.budget import Budget
 from compgen.accuracy.compare import CompareOptions, Comparison, compare_errors, compare_fields, compare_runs
-from compgen.accuracy.evaluate import Accuracy, accuracy_of_errors, accuracy_of_runs
-from compgen.accuracy.field import Field, aligned, volume_figures
+from compgen.accuracy.evaluate import Accuracy, accuracy_of_errors, accuracy_of_runs, straightness
+from compgen.accuracy.field import ErrorField, ErrorSource, aligned, error_source, volume_figures
 from compgen.accuracy.figure import ComparedFigure, Figure
-from compgen.accuracy.iso230_2 import PositioningTest, positioning_test
-from compgen.accuracy.match import compare_prediction, compare_sides, with_prediction
-from compgen.accuracy.runs import RunStatistics, axis_statistics, run_statistics
-from compgen.accuracy.sides import Side, read_side
-from compgen.accuracy.source import ErrorSource, error_source
-from compgen.accuracy.straightness import straightness
-from compgen.accuracy.vdi3441 import vdi_3441
+from compgen.accuracy.positioning import (
+    PositioningTest,
+    RunStatistics,
+    SetupBudget,
+    axis_statistics,
+    positioning_test,
+    run_statistics,
+    vdi_3441,
+)
+from compgen.accuracy.sides import Side, compare_prediction, compare_sides, read_side, with_prediction
 
 __all__ = [
     "Accuracy",
-    "Budget",
     "CompareOptions",
     "ComparedFigure",
     "Comparison",
     "ErrorSource",
-    "Field",
+    "ErrorField",
     "Figure",
     "PositioningTest",
     "RunStatistics",
+    "SetupBudget",
     "Side",
     "accuracy_of_errors",
     "accuracy_of_runs",

@@ -1,16 +1,18 @@
-"""Before against after, and predicted against measured: improvement with its significance."""
+"""Before against after, and predicted against measured: points are paired, gauges made equal, improvements tested."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from compgen.accuracy.budget import Budget
+from compgen.accuracy.diagonals import SAME_CORNER_MM, DiagonalRun, accuracy_of_diagonals
 from compgen.accuracy.evaluate import (
+    LINES,
     MOST_IN_PAIRS,
     accuracy_of_runs,
     groups_of_errors,
@@ -18,16 +20,351 @@ from compgen.accuracy.evaluate import (
     statements_of,
     volume_fields,
 )
-from compgen.accuracy.field import Alignment, Field, aligned, volume_figures
-from compgen.accuracy.figure import COVERAGE, ComparedFigure, Figure
-from compgen.accuracy.iso230_2 import LATEST
-from compgen.accuracy.iso_gauge import in_common_gauge
-from compgen.accuracy.pairing import MeasuredField, paired_errors, paired_fields, paired_runs
-from compgen.accuracy.runs import RunStatistics
-from compgen.accuracy.source import ErrorSource
-from compgen.core.machine import Machine
-from compgen.core.names import error_named
+from compgen.accuracy.field import (
+    Alignment,
+    ErrorField,
+    ErrorSource,
+    Spread,
+    aligned,
+    independent_spread,
+    unknown_spread,
+    volume_figures,
+)
+from compgen.accuracy.figure import ComparedFigure, Figure
+from compgen.accuracy.positioning import EDITIONS, LATEST, SAME_TARGET_MM, RunStatistics, SetupBudget
+from compgen.data.csv_files import FloatArray
+from compgen.data.declared import option
+from compgen.data.deviations import Deviations
+from compgen.data.display import Bars, Drawable, Overview, Panel
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.lengths import Lengths
+from compgen.data.machine import Machine
+from compgen.data.names import COVERAGE, ERROR_INDEX, MM_PER_UM, error_named
 from compgen.errors import InputError
+from compgen.identify.covariance import normalized_error
+from compgen.kinematics.curves import hat_matrix
+from compgen.kinematics.first_order import observable_errors, tool_of
+from compgen.kinematics.gauge import LEVER_MM, gauge_directions
+
+# The same points before and after: matched, or refused with what differs, or brought together as the user says.
+
+
+#: Ways to bring different points together.
+ALIGN = ("common", "interpolate", "model")
+#: Positions closer than this are the same one, mm.
+SAME_MM = 1e-3
+
+
+def refuse(what: str, before: Sequence[object], after: Sequence[object], ways: str) -> InputError:
+    """Return the error that says what the two do not share."""
+    only_before, only_after = [x for x in before if x not in set(after)], [x for x in after if x not in set(before)]
+    parts = []
+    for name, only in (("BEFORE", only_before), ("AFTER", only_after)):
+        if only:
+            shown = ", ".join(str(x) for x in only[:3]) + (", ..." if len(only) > 3 else "")
+            parts.append(f"only {name} has {shown}")
+    return InputError(
+        f"BEFORE and AFTER do not have the same {what}: {'; '.join(parts)}. A comparison needs the same points; {ways}",
+        field="--align",
+    )
+
+
+# --- errors --------------------------------------------------------------------------------------------------------
+
+
+def paired_errors(before: ErrorSource, after: ErrorSource, align: str | None) -> tuple[ErrorSource, ErrorSource, str]:
+    """Return both sources with the same errors at the same positions, and what was done in words.
+
+    Raises
+    ------
+    InputError
+        if they differ and ``align`` does not say what to do: ``"common"`` keeps the errors and positions that both have,
+        ``"interpolate"`` takes both linearly at all positions of both within the range that both know.
+    """
+    first, second = before.errors, after.errors
+    if first.names != second.names and align != "common":
+        ways = "--align common compares the errors that both have"
+        raise refuse("errors", first.names, second.names, ways)
+    same = all(
+        _same(first.curves[n].position_mm, second.curves[n].position_mm) for n in first.curves if n in second.curves
+    )
+    if same and first.names == second.names:
+        return before, after, "same errors at the same positions"
+    names = [name for name in first.names if name in second.names]
+    if not names:
+        raise refuse("errors", first.names, second.names, "they have none in common")
+    if not same and align not in ("common", "interpolate"):
+        name = next(
+            n
+            for n in names
+            if n in first.curves and not _same(first.curves[n].position_mm, second.curves[n].position_mm)
+        )
+        texts = [[f"{x:g} mm" for x in table.curves[name].position_mm] for table in (first, second)]
+        ways = "--align interpolate takes both linearly at all positions of both, --align common those that both have"
+        raise refuse(f"positions of {name}", texts[0], texts[1], ways)
+    nodes = {
+        name: _joined(first.curves[name], second.curves[name], str(align)) for name in names if name in first.curves
+    }
+    text = (
+        "linear between positions, all of both within the range that both know"
+        if align == "interpolate"
+        else (f"only what both have: {', '.join(names)}, at common positions")
+    )
+    return resampled(before, names, nodes), resampled(after, names, nodes), text
+
+
+def _same(first: FloatArray, second: FloatArray) -> bool:
+    return len(first) == len(second) and bool(np.all(np.abs(first - second) <= SAME_MM))
+
+
+def _joined(first: Curve, second: Curve, align: str) -> FloatArray:
+    low = max(first.position_mm[0], second.position_mm[0])
+    high = min(first.position_mm[-1], second.position_mm[-1])
+    near = np.abs(first.position_mm[:, None] - second.position_mm[None]).min(axis=1) <= SAME_MM
+    kept = first.position_mm[near]
+    if align == "interpolate":
+        both = np.unique(np.concatenate([first.position_mm, second.position_mm]))
+        both = both[np.concatenate([[True], np.diff(both) > SAME_MM])]
+        kept = both[(both >= low) & (both <= high)]
+    if len(kept) == 0:
+        raise InputError("BEFORE and AFTER have no position in common", field="--align")
+    return np.asarray(kept)
+
+
+def resampled(source: ErrorSource, names: Sequence[str], nodes_mm: dict[str, FloatArray]) -> ErrorSource:
+    """Return some errors of a source, linear between its positions, at new ones; the covariance follows."""
+    curves, squareness, rows = {}, {}, []
+    first = 0
+    for name in source.errors.names:
+        single = name in source.errors.squareness
+        count = 1 if single else len(source.errors.curves[name].value)
+        if name in names:
+            matrix = np.eye(1) if single else hat_matrix(source.errors.curves[name].position_mm, nodes_mm[name])
+            factor = None if source.factor is None else matrix @ source.factor[first : first + count]
+            if single:
+                squareness[name] = source.errors.squareness[name]
+            else:
+                old = source.errors.curves[name]
+                u = np.full(len(matrix), np.nan) if factor is None else np.linalg.norm(factor, axis=1)
+                curves[name] = Curve(nodes_mm[name], matrix @ old.value, u)
+            rows.append(factor)
+        first += count
+    known = [part for part in rows if part is not None]
+    factor = np.vstack(known) if len(known) == len(rows) else None
+    return replace(source, errors=ErrorTable(curves, squareness, source.errors.metadata), factor=factor)
+
+
+# --- measured positions --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MeasuredField:
+    """Deviations as a field, repeats averaged; ``keys`` tells the points apart, ``measured`` the components (3,)."""
+
+    field: ErrorField
+    keys: tuple[tuple[float, ...], ...]
+    measured: tuple[bool, bool, bool]
+
+    def at(self, keys: Sequence[tuple[float, ...]]) -> MeasuredField:
+        """Return the field at some of its points, in the given order."""
+        index = {key: k for k, key in enumerate(self.keys)}
+        rows = np.array([index[key] for key in keys], dtype=np.int64)
+        return MeasuredField(self.field.at_rows(rows), tuple(keys), self.measured)
+
+
+def measured_field(machine: Machine, deviations: Deviations, u_um: float | None = None) -> MeasuredField:
+    """Return measured deviations as a field over distinct points: position, tool, direction of approach.
+
+    Parameters
+    ----------
+    machine : its tool offset counts where the file has none.
+    deviations : the measurement; repeats at a point are averaged.
+    u_um : standard uncertainty of each component in um; default that of the file, else from the scatter of repeats
+        (pooled), else unknown.
+    """
+    tool = tool_of(machine, deviations.tool_mm)
+    tools = np.broadcast_to(tool, deviations.position_mm.shape)
+    approach = np.zeros_like(tools) if deviations.approach is None else deviations.approach
+    place = np.round(np.hstack([deviations.position_mm, tools]) / SAME_MM) * SAME_MM + 0.0
+    keys, index = np.unique(np.hstack([place, approach]), axis=0, return_inverse=True)
+    index = np.asarray(index, dtype=np.int64).ravel()
+    count = np.bincount(index).astype(np.float64)[:, None]
+    error, position, tip = (
+        _means(index, values, count)
+        for values in (np.nan_to_num(deviations.deviation_mm), deviations.position_mm, deviations.position_mm + tools)
+    )
+    spread = _measured_spread(deviations, index, error, count, u_um)
+    x, y, z = (not np.isnan(deviations.deviation_mm[:, k]).all() for k in range(3))
+    return MeasuredField(ErrorField(position, tip, error, spread), tuple(map(tuple, keys.tolist())), (x, y, z))
+
+
+def _means(index: NDArray[np.int64], values: FloatArray, count: FloatArray) -> FloatArray:
+    sums = np.column_stack([np.bincount(index, values[:, k], len(count)) for k in range(3)])
+    return np.asarray(sums / count)
+
+
+def _measured_spread(
+    deviations: Deviations, index: NDArray[np.int64], mean_mm: FloatArray, count: FloatArray, u_um: float | None
+) -> Spread:
+    if u_um is not None:
+        return independent_spread(np.broadcast_to(u_um * MM_PER_UM / np.sqrt(count), mean_mm.shape))
+    if deviations.u_mm is not None:
+        squares = _means(index, np.nan_to_num(deviations.u_mm) ** 2, count)
+        return independent_spread(np.sqrt(squares / count))
+    freedom = len(index) - len(count)
+    if freedom < 1:
+        return unknown_spread
+    rest = np.nan_to_num(deviations.deviation_mm) - mean_mm[index]
+    pooled = np.sqrt(np.sum(rest**2, axis=0) / freedom)
+    return independent_spread(pooled / np.sqrt(count))
+
+
+def paired_fields(
+    before: MeasuredField, after: MeasuredField, align: str | None
+) -> tuple[MeasuredField, MeasuredField, str]:
+    """Return both at the same points; InputError if these differ and ``align`` is not ``"common"``."""
+    if before.measured != after.measured:
+        raise InputError(
+            "BEFORE and AFTER do not measure the same components dx, dy, dz; measure the same, or identify both"
+        )
+    known = set(after.keys)
+    common = [key for key in before.keys if key in known]
+    same = len(common) == len(before.keys) == len(after.keys)
+    if not same and align != "common" or not common:
+        texts = [[_shown(key) for key in side.keys] for side in (before, after)]
+        ways = "--align common takes those that both have, --align model compares the errors identified from each"
+        raise refuse("points", texts[0], texts[1], ways)
+    text = f"same {len(common)} points" if same else f"only the {len(common)} points that both have"
+    return before.at(common), after.at(common), text
+
+
+def _shown(key: tuple[float, ...]) -> str:
+    x, y, z = key[:3]
+    ways = [f"{value:+.0f}" for value in key[6:]]
+    return f"({x:g}, {y:g}, {z:g}) mm" + (f" from {','.join(ways)}" if any(key[6:]) else "")
+
+
+def check_same_positions(before: Lengths, after: Lengths, align: str | None) -> str:
+    """Tracer lengths of the same targets: the stations may differ, the positions not, unless ``align`` is ``"model"``."""
+    sets = []
+    for lengths in (before, after):
+        tools = np.zeros_like(lengths.position_mm) if lengths.tool_mm is None else lengths.tool_mm
+        place = np.unique(np.round(np.hstack([lengths.position_mm, tools]) / SAME_MM) * SAME_MM + 0.0, axis=0)
+        sets.append([f"({x:g}, {y:g}, {z:g}) mm" for x, y, z, *_ in place.tolist()])
+    if sets[0] == sets[1]:
+        return f"lengths to the same {len(sets[0])} positions"
+    if align != "model":
+        ways = "--align model compares the errors identified from each over the volume of the machine"
+        raise refuse("positions", sets[0], sets[1], ways)
+    return "lengths to different positions: the errors identified from each are compared"
+
+
+# --- positioning runs ----------------------------------------------------------------------------------------------
+
+
+def paired_runs(
+    axis: str, before: RunStatistics, after: RunStatistics, align: str | None
+) -> tuple[RunStatistics, RunStatistics, str]:
+    """Return both at the same targets.
+
+    ``"common"`` keeps the targets that both have; ``"interpolate"`` takes means and estimators of AFTER linearly at the
+    targets of BEFORE that lie within its range.
+    """
+    first, second = before.position_mm, after.position_mm
+    if len(first) == len(second) and bool(np.all(np.abs(first - second) <= SAME_TARGET_MM)):
+        return before, after, f"{axis}: same {len(first)} targets"
+    if align == "common":
+        near = np.abs(first[:, None] - second[None]) <= SAME_TARGET_MM
+        rows, columns = np.nonzero(near)
+        if len(rows) < 2:
+            raise InputError(
+                f"{axis}: BEFORE and AFTER have {len(rows)} targets in common; two are needed", field="--align"
+            )
+        return _picked(before, rows), _picked(after, columns), f"{axis}: the {len(rows)} targets that both have"
+    if align == "interpolate":
+        rows = np.flatnonzero((first >= second[0]) & (first <= second[-1]))
+        if len(rows) < 2:
+            raise InputError(f"{axis}: fewer than two targets of BEFORE lie within AFTER", field="--align")
+        at = first[rows]
+        values = np.vstack([np.interp(at, second, row) for row in after.values])
+        count = np.vstack([np.interp(at, second, row) for row in after.count])
+        text = f"{axis}: AFTER taken linearly at {len(rows)} targets of BEFORE"
+        return _picked(before, rows), RunStatistics(at, values, count), text
+    texts = [[f"{x:g} mm" for x in side] for side in (first, second)]
+    ways = (
+        "--align common takes the targets that both have, --align interpolate takes AFTER linearly at those of BEFORE"
+    )
+    raise refuse(f"targets of {axis}", texts[0], texts[1], ways)
+
+
+def _picked(statistics: RunStatistics, rows: np.ndarray) -> RunStatistics:
+    return RunStatistics(statistics.position_mm[rows], statistics.values[:, rows], statistics.count[:, rows])
+
+
+# One gauge for all tables that are compared: what no measurement shows must not count as a change.
+#
+# Constants and slopes of curves can be traded for squareness and a placement of the workpiece without any effect on the
+# machine (:mod:`compgen.kinematics.gauge`). Both sides of a comparison
+# are brought to the same choice, each by itself: straightness
+# zero at both ends of the travel, positioning and angular errors zero at the reference point, the rest in the squareness.
+
+
+def in_common_gauge(source: ErrorSource) -> ErrorSource:
+    """Return the source in the common gauge: the same E = C P up to a rigid motion; the covariance follows.
+
+    Angular errors that one tool does not show are left alone: who states them knows them from elsewhere.
+    """
+    machine, errors = source.machine, source.errors
+    shown = observable_errors(machine)
+    names = [n for n in errors.names if n in shown and (n in errors.squareness or len(errors.curves[n].value) > 1)]
+    directions = _as_values(errors, gauge_directions(machine, names))
+    if not directions.shape[1]:
+        return source
+    conditions = _conditions(machine, errors, names)
+    effect = conditions @ directions
+    scale = np.linalg.norm(effect, axis=0)
+    used = scale > 1e-12 * scale.max(initial=0.0)
+    amounts = np.linalg.pinv(effect[:, used] / scale[used], rcond=1e-10) / scale[used][:, None]
+    change = -directions[:, used] @ amounts @ conditions
+    values = errors.values()
+    factor = None if source.factor is None else source.factor + change @ source.factor
+    return replace(source, errors=errors.with_values(values + change @ values), factor=factor)
+
+
+def _as_values(errors: ErrorTable, directions: FloatArray) -> FloatArray:
+    """Directions (d, 21, 2) of constants and slopes as changes of the table's values (k, d)."""
+    rows = []
+    for name in errors.names:
+        constant, slope = directions[:, ERROR_INDEX[name]].T
+        nodes = np.zeros(1) if name in errors.squareness else errors.curves[name].position_mm
+        rows.append(constant + nodes[:, None] * slope)
+    return np.vstack(rows)
+
+
+def _conditions(machine: Machine, errors: ErrorTable, names: Sequence[str]) -> FloatArray:
+    """Matrix (c, k) that takes from the values of a table what the common gauge makes zero; angles times a lever, mm."""
+    count = len(errors.values())
+    rows, first = [], 0
+    for name in errors.names:
+        if name in errors.squareness:
+            first += 1
+            continue
+        error, nodes = error_named(name), errors.curves[name].position_mm
+        if name not in names:
+            first += len(nodes)
+            continue
+        axis = machine.axes[error.axis]
+        where = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
+        block = np.zeros((len(where), count))
+        lever = 1.0 if error.kind == "linear" else LEVER_MM
+        block[:, first : first + len(nodes)] = lever * hat_matrix(nodes, np.array(where))
+        rows.append(block)
+        first += len(nodes)
+    return np.vstack(rows) if rows else np.zeros((0, count))
+
+
+# Before against after, and predicted against measured: improvement with its significance.
+
 
 Overall = Literal["better", "worse", "not separated", "smaller", "larger", "same"]
 #: Figures that decide over a volume, over axis runs (the first that is there), and over errors of single axes.
@@ -50,15 +387,27 @@ class CompareOptions:
     budgets : what the set-up adds to the uncertainties of axis runs, by axis.
     """
 
-    align: str | None = None
-    alignment: Alignment | None = None
-    line: str = "ls"
-    edition: int = LATEST
-    budgets: Mapping[str, Budget] | None = None
+    align: str | None = option(
+        None,
+        "How to bring different points together: common keeps those that both have, interpolate takes them linearly, "
+        "model compares the errors identified from each. Default: different points are refused.",
+        choices=ALIGN,
+    )
+    alignment: Alignment | None = option(
+        None,
+        "Volume: axes (default for errors): zero at the reference point, X and Y along their end points; as-given "
+        "(default for measured positions).",
+        choices=("as-given", "axes"),
+    )
+    line: str = option("ls", "Reference line of straightness.", choices=tuple(LINES))
+    edition: int = option(
+        LATEST, "Edition of ISO 230-2; that of 1988 has 3 s in place of 2 s.", choices=tuple(map(str, EDITIONS))
+    )
+    budgets: Mapping[str, SetupBudget] | None = None
 
 
 @dataclass(frozen=True)
-class Agreement:
+class PredictionAgreement:
     """Predicted against measured.
 
     Parameters
@@ -66,7 +415,7 @@ class Agreement:
     figures : figures of both fields; those of the measured one hold the noise of the measurement.
     difference : figures of measured minus predicted, and the difference at single points decides:
     beyond : share of its components with E_n above 1, (k = 2); nan where an uncertainty is not known.
-    allowed : the largest share that chance explains: 5 % and twice its standard deviation for so many components.
+    allowed : the largest share that chance explains: 5 % and twice its standard deviation for that many components.
     components : how many components were looked at.
     """
 
@@ -98,15 +447,15 @@ class Agreement:
         }
 
 
-@dataclass(frozen=True)
-class Comparison:
+@dataclass(frozen=True, repr=False)
+class Comparison(Drawable):
     """Figures before and after by group and key, those that decide, and in words what was compared and how."""
 
     kind: str
     groups: Mapping[str, Mapping[str, ComparedFigure]]
     decisive: tuple[tuple[str, str], ...]
     statements: tuple[str, ...]
-    prediction: Agreement | None = None
+    prediction: PredictionAgreement | None = None
 
     @property
     def verdict(self) -> Overall:
@@ -134,6 +483,28 @@ class Comparison:
             "prediction": None if self.prediction is None else self.prediction.summary(),
         }
 
+    def overview(self) -> Overview:
+        """All figures before and after, and which became better."""
+        rows = tuple(
+            (f"{group} {key}", f"{x.before.value:.3f}", f"{x.after.value:.3f}", x.before.unit, x.verdict)
+            for group, figures in self.groups.items()
+            for key, x in figures.items()
+        )
+        title = f"{self.kind}: {self.verdict}, {len(rows)} figures before and after"
+        return Overview(title, ("figure", "before", "after", "unit", "verdict"), rows, self.statements)
+
+    def panels(self) -> Sequence[Panel]:
+        """The figures of each group before and after, um and urad apart."""
+        panels = []
+        for group, figures in self.groups.items():
+            for unit in ("um", "urad"):
+                shown = {key: item for key, item in figures.items() if item.before.unit == unit}
+                if shown:
+                    before = Bars("before", tuple(shown), tuple(item.before.value for item in shown.values()))
+                    after = Bars("after", tuple(shown), tuple(item.after.value for item in shown.values()))
+                    panels.append(Panel(group, unit, bars=(before, after)))
+        return panels
+
 
 def paired_figures(
     before: Mapping[str, Mapping[str, Figure]], after: Mapping[str, Mapping[str, Figure]]
@@ -149,7 +520,7 @@ def paired_figures(
 def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOptions | None = None) -> Comparison:
     """Compare two sets of errors of one machine: per volume, axis, diagonal and error.
 
-    Both are gauge-aligned first (:func:`compgen.accuracy.iso_gauge.in_common_gauge`), so that what no measurement shows does
+    Both are gauge-aligned first (:func:`compgen.accuracy.compare.in_common_gauge`), so that what no measurement shows does
     not count as a change of single errors. The volume is that of the errors as they are, in the stated alignment, on which
     the gauge has no influence.
 
@@ -169,9 +540,9 @@ def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOpti
         groups.append({"volume": volume_figures(full, pairs), **groups_of_errors(source, chosen.line)})
     statements = [text, *cut, *statements_of(machine, fields[0][0], chosen.line)]
     statements.append(
-        "single errors: AFTER was gauge-aligned to BEFORE (compgen.model.gauge) before they were compared"
+        "single errors: AFTER was gauge-aligned to BEFORE (compgen.kinematics.gauge) before they were compared"
     )
-    statements += said_of_uncertainty(first.known, second.known)
+    statements += uncertainty_statements(first.known, second.known)
     decisive = tuple(("volume", key) for key in DECISIVE_VOLUME)
     return Comparison("errors", paired_figures(groups[0], groups[1]), decisive, tuple(statements))
 
@@ -189,7 +560,7 @@ def _known_part(machine: Machine, source: ErrorSource) -> tuple[Machine, list[st
     return narrowed(machine, lower, upper), ["the curves end within the travel; the volume is the part that they know"]
 
 
-def said_of_uncertainty(*known: bool) -> list[str]:
+def uncertainty_statements(*known: bool) -> list[str]:
     """Say what the verdicts rest on; ``known``: whether each side has uncertainties."""
     if all(known):
         return [
@@ -208,12 +579,17 @@ def compare_fields(
     sides = [_aligned(machine, side, chosen.alignment or "as-given") for side in (first, second)]
     groups = [{"volume": _of_measured(side, first.measured)} for side in sides]
     known = [not math.isnan(side.spread(np.ones_like(side.error_mm))) for side in sides]
-    statements = [text, f"alignment: {sides[0].alignment}", *_components(first.measured), *said_of_uncertainty(*known)]
+    statements = [
+        text,
+        f"alignment: {sides[0].alignment}",
+        *_components(first.measured),
+        *uncertainty_statements(*known),
+    ]
     decisive = tuple(("volume", key) for key in DECISIVE_VOLUME)
     return Comparison("positions", paired_figures(groups[0], groups[1]), decisive, tuple(statements))
 
 
-def _aligned(machine: Machine, side: MeasuredField, alignment: Alignment) -> Field:
+def _aligned(machine: Machine, side: MeasuredField, alignment: Alignment) -> ErrorField:
     if alignment != "as-given" and not all(side.measured):
         raise InputError(
             "a rigid motion can be taken out only where dx, dy and dz were measured; take --alignment as-given"
@@ -221,8 +597,8 @@ def _aligned(machine: Machine, side: MeasuredField, alignment: Alignment) -> Fie
     return aligned(machine, side.field, alignment)
 
 
-def _of_measured(field: Field, measured: tuple[bool, bool, bool]) -> dict[str, Figure]:
-    figures = volume_figures(field, _thinned(field))
+def _of_measured(field: ErrorField, measured: tuple[bool, bool, bool]) -> dict[str, Figure]:
+    figures = volume_figures(field, field.thinned(MOST_IN_PAIRS))
     gone = {f"V_{axis}" for axis, there in zip("XYZ", measured, strict=True) if not there}
     return {key: item for key, item in figures.items() if key not in gone}
 
@@ -232,74 +608,124 @@ def _components(measured: tuple[bool, bool, bool]) -> list[str]:
     return [] if all(measured) else [f"only d{', d'.join(names)} were measured; the other components count as zero"]
 
 
-def _thinned(field: Field, most: int = MOST_IN_PAIRS) -> Field:
-    """Every so-manieth point of a large field, for pairs."""
-    if len(field) <= most:
-        return field
-    rows = np.unique(np.round(np.linspace(0, len(field) - 1, most)).astype(int))
-
-    def spread(weight: np.ndarray) -> float:
-        full = np.zeros_like(field.error_mm)
-        full[rows] = weight
-        return field.spread(full)
-
-    parts = {"position_mm": field.position_mm[rows], "tip_mm": field.tip_mm[rows], "error_mm": field.error_mm[rows]}
-    return replace(field, spread=spread, **parts)
-
-
 def compare_runs(
     before: Mapping[str, RunStatistics], after: Mapping[str, RunStatistics], options: CompareOptions | None = None
 ) -> Comparison:
     """Compare positioning runs axis by axis (ISO 230-2, VDI/DGQ 3441); constants of a set-up drop out of all figures."""
     chosen = options or CompareOptions()
-    if chosen.align == "model" or chosen.alignment is not None:
-        raise InputError(
-            "axis runs have no rigid motion and no model to align by; --align common or interpolate is possible"
-        )
-    axes = [axis for axis in before if axis in after]
-    if set(before) != set(after) and (chosen.align != "common" or not axes):
-        raise InputError(
-            f"BEFORE holds {', '.join(before)}, AFTER {', '.join(after)}; --align common compares the axes that both hold",
-            field="--align",
-        )
+    axes = _shared("axis runs", "axes", before, after, chosen)
     pairs = {axis: paired_runs(axis, before[axis], after[axis], chosen.align) for axis in axes}
-    sides = [
-        accuracy_of_runs({axis: pair[0] for axis, pair in pairs.items()}, chosen.edition, chosen.budgets),
-        accuracy_of_runs({axis: pair[1] for axis, pair in pairs.items()}, chosen.edition, chosen.budgets),
-    ]
-    groups = paired_figures(sides[0].groups, sides[1].groups)
+    first, second = (
+        accuracy_of_runs(runs, chosen.edition, chosen.budgets)
+        for runs in ({axis: pair[0] for axis, pair in pairs.items()}, {axis: pair[1] for axis, pair in pairs.items()})
+    )
+    groups = paired_figures(first.groups, second.groups)
     decisive = tuple((axis, next(key for key in DECISIVE_RUNS if key in groups[axis])) for axis in axes)
-    known = [not any(math.isnan(item.before.u + item.after.u) for g in groups.values() for item in g.values())]
-    statements = (*(pair[2] for pair in pairs.values()), *sides[0].statements, *said_of_uncertainty(*known))
+    statements = (*(pair[2] for pair in pairs.values()), *first.statements, *uncertainty_statements(_all_known(groups)))
     return Comparison("axis runs", groups, decisive, statements)
 
 
-def agreement(predicted: Field, measured: Field) -> Agreement:
+def _shared(
+    kind: str, what: str, before: Mapping[str, object], after: Mapping[str, object], options: CompareOptions
+) -> list[str]:
+    """Names of the axes or diagonals that both sides have; InputError if they differ and nothing says what to do."""
+    if options.align == "model" or options.alignment is not None:
+        raise InputError(
+            f"{kind} have no rigid motion and no model to align by; --align common or interpolate is possible"
+        )
+    names = [name for name in before if name in after]
+    if set(before) != set(after) and (options.align != "common" or not names):
+        raise InputError(
+            f"BEFORE has {', '.join(before)}, AFTER {', '.join(after)}; --align common compares the {what} that both have",
+            field="--align",
+        )
+    return names
+
+
+def _all_known(groups: Mapping[str, Mapping[str, ComparedFigure]]) -> bool:
+    """Whether every figure of both sides has an uncertainty."""
+    return not any(math.isnan(item.before.u + item.after.u) for group in groups.values() for item in group.values())
+
+
+def agreement(predicted: ErrorField, measured: ErrorField) -> PredictionAgreement:
     """Compare a predicted field with the measured one at the same points, both aligned alike."""
-    first, second = (volume_figures(field, _thinned(field)) for field in (predicted, measured))
+    first, second = (volume_figures(field, field.thinned(MOST_IN_PAIRS)) for field in (predicted, measured))
 
     def spread(weight: np.ndarray) -> float:
         return math.hypot(predicted.spread(weight), measured.spread(weight))
 
     rest = replace(measured, error_mm=measured.error_mm - predicted.error_mm, spread=spread)
-    difference = volume_figures(rest, _thinned(rest))
-    beyond, count = _share_beyond(_thinned(rest, MOST_SINGLE))
+    difference = volume_figures(rest, rest.thinned(MOST_IN_PAIRS))
+    beyond, count = _share_beyond(rest.thinned(MOST_SINGLE))
     allowed = CHANCE + 2.0 * math.sqrt(CHANCE * (1.0 - CHANCE) / max(count, 1))
     figures = {key: ComparedFigure(first[key], second[key]) for key in first}
-    return Agreement(figures, {key: difference[key] for key in ("max", "rms", "p95")}, beyond, allowed, count)
+    return PredictionAgreement(figures, {key: difference[key] for key in ("max", "rms", "p95")}, beyond, allowed, count)
 
 
-def _share_beyond(difference: Field) -> tuple[float, int]:
-    """Share of the components of a difference beyond its expanded uncertainty, and the number of components."""
-    beyond = count = 0
-    weight = np.zeros_like(difference.error_mm)
-    for index, value in np.ndenumerate(difference.error_mm):
+def _share_beyond(difference: ErrorField) -> tuple[float, int]:
+    """Share of the components of a difference with E_n above 1, and the number of components."""
+    weight, u = np.zeros_like(difference.error_mm), np.zeros_like(difference.error_mm)
+    for index in np.ndindex(weight.shape):
         weight[index] = 1.0
-        u = difference.spread(weight)
+        u[index] = difference.spread(weight)
         weight[index] = 0.0
-        if math.isnan(u):
-            return math.nan, 0
-        if u > EXACT_MM or abs(value) > EXACT_MM:  # the alignment makes some components exactly zero
-            count += 1
-            beyond += int(abs(value) > COVERAGE * u)
-    return beyond / max(count, 1), count
+    if np.isnan(u).any():
+        return math.nan, 0
+    looked_at = (u > EXACT_MM) | (np.abs(difference.error_mm) > EXACT_MM)  # the alignment makes some exactly zero
+    count = int(looked_at.sum())
+    beyond = normalized_error(difference.error_mm, COVERAGE * u)[looked_at] > 1.0
+    return int(beyond.sum()) / max(count, 1), count
+
+
+# Measured diagonals before against after (ISO 230-6).
+
+
+#: Without an Ed the first of these that a diagonal has decides.
+_DECISIVE = ("E", "E_up", "E_down")
+
+
+def compare_diagonals(
+    machine: Machine,
+    before: Mapping[str, DiagonalRun],
+    after: Mapping[str, DiagonalRun],
+    options: CompareOptions | None = None,
+) -> Comparison:
+    """Compare measured diagonals; Ed and Bd decide, or E of every diagonal where the four are not complete.
+
+    Raises
+    ------
+    InputError
+        for different diagonals or positions, unless the options say how to align them (``common``, ``interpolate``).
+    """
+    chosen = options or CompareOptions()
+    names = _shared("diagonals", "diagonals", before, after, chosen)
+    pairs = {name: _paired(before[name], after[name], chosen.align) for name in names}
+    first, second = (
+        accuracy_of_diagonals(machine, runs, chosen.edition, chosen.budgets)
+        for runs in ({name: pair[0] for name, pair in pairs.items()}, {name: pair[1] for name, pair in pairs.items()})
+    )
+    groups = paired_figures(first.groups, second.groups)
+    together = groups.get("diagonals", {})
+    decisive = tuple(("diagonals", key) for key in together)
+    if not decisive:
+        decisive = tuple((name, next(key for key in _DECISIVE if key in groups[name])) for name in names)
+    statements = (*(pair[2] for pair in pairs.values()), *first.statements, *uncertainty_statements(_all_known(groups)))
+    return Comparison("diagonals", groups, decisive, statements)
+
+
+def _paired(before: DiagonalRun, after: DiagonalRun, align: str | None) -> tuple[DiagonalRun, DiagonalRun, str]:
+    """Both at the same positions; distances of AFTER count from the start of BEFORE."""
+    offset = after.start_mm - before.start_mm
+    along = float(offset @ before.unit)
+    beside = [offset - along * before.unit, after.end_mm - before.end_mm]
+    beside[1] = beside[1] - (beside[1] @ before.unit) * before.unit
+    if max(float(np.linalg.norm(part)) for part in beside) > SAME_CORNER_MM:
+        raise InputError(
+            f"{before.name} is a different line in AFTER; measure it between the same ends",
+            field=f"diagonal {before.name}",
+        )
+    moved = replace(after.statistics, position_mm=after.statistics.position_mm + along)
+    first, second, text = paired_runs(before.name, before.statistics, moved, align)
+    ends = [before.start_mm + first.position_mm[k] * before.unit for k in (0, -1)]
+    sides = [replace(run, start_mm=ends[0], end_mm=ends[1]) for run in (before, after)]
+    return replace(sides[0], statistics=first), replace(sides[1], statistics=second), text

@@ -1,7 +1,7 @@
 """Measured diagonals (ISO 230-6): each evaluated as ISO 230-2 has it, and the largest of the four body diagonals.
 
 With the deviations of the measured from the commanded distance along a diagonal: E, B, M, R of each diagonal as along an
-axis; E_d and B_d are the largest E and B of the four body diagonals. Face diagonals stand by themselves. Differences of the
+axis; E_d and B_d are the largest E and B of the four body diagonals. Face diagonals are evaluated one by one. Differences of the
 diagonals' lengths indicate squareness: NPP - PPP = 2 EC0Y X Y / L over a box X, Y, Z with the diagonal L.
 """
 
@@ -13,17 +13,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from compgen.accuracy.budget import NO_BUDGET, Budget
 from compgen.accuracy.evaluate import Accuracy
 from compgen.accuracy.figure import Figure
-from compgen.accuracy.iso230_2 import LATEST, PositioningTest, positioning_test
-from compgen.accuracy.runs import MEAN_UP, RunStatistics, combine, figure, run_statistics
-from compgen.core.csvio import FloatArray
-from compgen.core.diagonals import BODY_DIAGONALS, Diagonals, along_mm
-from compgen.core.machine import Machine
-from compgen.core.names import AXES, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES
+from compgen.accuracy.positioning import (
+    LATEST,
+    MEAN_UP,
+    NO_BUDGET,
+    PositioningTest,
+    RunStatistics,
+    SetupBudget,
+    combine,
+    figure,
+    positioning_test,
+    run_statistics,
+)
+from compgen.data.axis_runs import BODY_DIAGONALS, Diagonals, along_mm
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES
 from compgen.errors import InputError
-from compgen.model.volumetric import c_matrix
+from compgen.kinematics.first_order import c_matrix
 
 #: Figures of ISO 230-2 that are not evaluated along diagonals.
 _NOT_ALONG = ("A", "A_up", "A_down")
@@ -88,7 +97,7 @@ def accuracy_of_diagonals(
     machine: Machine,
     runs: Mapping[str, DiagonalRun],
     edition: int = LATEST,
-    budgets: Mapping[str, Budget] | None = None,
+    budgets: Mapping[str, SetupBudget] | None = None,
 ) -> Accuracy:
     """Return the figures of each diagonal, of all four (``Ed``, ``Bd``), and what they indicate of squareness.
 
@@ -119,7 +128,7 @@ def accuracy_of_diagonals(
     return Accuracy({**together, **groups}, tuple(statements), targets)
 
 
-def _figures_of(run: DiagonalRun, test: PositioningTest, budget: Budget) -> dict[str, Figure]:
+def _figures_of(run: DiagonalRun, test: PositioningTest, budget: SetupBudget) -> dict[str, Figure]:
     found = {
         key: replace(item, meaning=f"diagonal {run.name}, ISO 230-6: {item.meaning}")
         for key, item in test.figures.items()
@@ -133,7 +142,7 @@ def _figures_of(run: DiagonalRun, test: PositioningTest, budget: Budget) -> dict
     return {**found, "D": figure(statistics, combine(statistics, ends), text, budget)}
 
 
-def budget_along(run: DiagonalRun, budgets: Mapping[str, Budget]) -> Budget:
+def budget_along(run: DiagonalRun, budgets: Mapping[str, SetupBudget]) -> SetupBudget:
     """Return the budget of a diagonal: that of an axis with the expansion coefficients weighted by squared cosines."""
     known = [budgets.get(axis, NO_BUDGET) for axis in AXES]
     squares = run.unit**2
@@ -166,7 +175,7 @@ def _why_no_set(runs: Mapping[str, DiagonalRun]) -> str | None:
 def _largest(
     runs: Mapping[str, DiagonalRun], groups: Mapping[str, Mapping[str, Figure]]
 ) -> tuple[dict[str, Figure], list[str]]:
-    """Ed and Bd with what stands in their way."""
+    """Ed and Bd, or why they cannot be given."""
     one_way = [name for name in BODY_DIAGONALS if not runs[name].statistics.bidirectional]
     if one_way:
         return {}, [f"Ed, Bd: not given; {', '.join(one_way)} measured in one direction only"]

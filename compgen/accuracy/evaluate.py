@@ -1,32 +1,449 @@
-"""All figures of a machine from its errors, or of its axes from positioning runs."""
+"""All figures of a machine from its errors: curves, straightness, squareness, diagonals and reversal."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from compgen.accuracy.budget import NO_BUDGET, Budget
-from compgen.accuracy.errors import (
-    axis_figures,
-    diagonal_figures,
-    error_figures,
-    orientation_figures,
-    straightness_figures,
-)
-from compgen.accuracy.field import Alignment, Field, aligned, volume_figures
+from compgen.accuracy.field import Alignment, ErrorField, ErrorSource, aligned, grid_points, volume_figures
 from compgen.accuracy.figure import Figure
-from compgen.accuracy.iso230_2 import LATEST, positioning_test
-from compgen.accuracy.reversal import KnownReversal, reversal_figures
-from compgen.accuracy.runs import RunStatistics
-from compgen.accuracy.source import ErrorSource, grid_points
-from compgen.accuracy.vdi3441 import vdi_3441
-from compgen.core.csvio import FloatArray
-from compgen.core.machine import Machine
-from compgen.core.names import error_named
-from compgen.model.grid import volume_grid
+from compgen.accuracy.positioning import LATEST, NO_BUDGET, RunStatistics, SetupBudget, positioning_test, vdi_3441
+from compgen.data.axis_runs import BODY_DIAGONALS
+from compgen.data.csv_files import FloatArray
+from compgen.data.display import Bars, Drawable, Overview, Panel, shortened
+from compgen.data.error_table import Curve, ReversalCurves, read_reversal
+from compgen.data.files import read_text
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.errors import InputError
+from compgen.identify import Identification
+from compgen.kinematics.curves import fitted_line, hat_matrix
+from compgen.kinematics.first_order import c_matrix
+from compgen.kinematics.volume_grid import volume_grid
+
+# Straightness against a stated reference line, and squareness of two reference lines (ISO 230-1).
+#
+# Straightness error: largest positive plus size of the largest negative distance from the reference line. The line is
+# through the end points, of least squares, or the one of the minimum zone. What the line takes out of straightness belongs
+# to squareness: squareness is the deviation of the angle between two reference lines from 90 degrees, and both together
+# leave the volumetric error as it is.
+
+
+#: Reference lines by the names of the command line.
+LINES = {"end-point": "end points", "ls": "least squares", "minzone": "minimum zone"}
+
+
+def straightness(position_mm: FloatArray, value_mm: FloatArray, line: str) -> tuple[float, FloatArray]:
+    """Return the straightness error (mm), and its derivative (n,) by the values.
+
+    Parameters
+    ----------
+    position_mm, value_mm : deviations across the axis (n,) at positions (n,), n > 1.
+    line : ``"end-point"``, ``"ls"`` or ``"minzone"``.
+    """
+    _check(position_mm, line)
+    constant, slope = fitted_line(position_mm, value_mm, line)
+    rest = value_mm - constant - slope * position_mm
+    high, low = int(np.argmax(rest)), int(np.argmin(rest))
+    if line == "minzone":
+        return float(np.ptp(rest)), _zone_derivative(position_mm, rest)
+    derivative = np.zeros(len(rest))
+    derivative[high] += 1.0
+    derivative[low] -= 1.0
+    return float(np.ptp(rest)), derivative - (position_mm[high] - position_mm[low]) * slope_weights(position_mm, line)
+
+
+def slope_weights(position_mm: FloatArray, line: str, value: FloatArray | None = None) -> FloatArray:
+    """Derivative (n,) of the slope of a reference line by the values; the minimum zone depends on the values (n,)."""
+    _check(position_mm, line)
+    weights = np.zeros(len(position_mm))
+    if line == "ls":
+        centred = position_mm - position_mm.mean()
+        return np.asarray(centred / (centred @ centred))
+    first, last = int(np.argmin(position_mm)), int(np.argmax(position_mm))
+    if line == "minzone":
+        if value is None:
+            raise ValueError("the line of the minimum zone depends on the values")
+        constant, slope = fitted_line(position_mm, value, line)
+        first, last, _, _ = _contacts(position_mm, value - constant - slope * position_mm)
+    length = position_mm[last] - position_mm[first]
+    weights[first], weights[last] = -1.0 / length, 1.0 / length
+    return weights
+
+
+def _check(position_mm: FloatArray, line: str) -> None:
+    if line not in LINES:
+        raise InputError(f"{line!r} is not a reference line; use one of {', '.join(LINES)}")
+    if len(position_mm) < 2:
+        raise InputError("straightness needs values at two positions or more")
+
+
+def _contacts(position_mm: FloatArray, rest: FloatArray) -> tuple[int, int, int, float]:
+    """Two points on one side of the zone, the one between them on the other, and the sign of the other side."""
+    half = 0.5 * float(np.ptp(rest))
+    tolerance = 1e-9 * max(half, 1e-12) + 1e-15
+    for side in (1.0, -1.0):
+        touching = np.flatnonzero(side * rest >= float(np.max(side * rest)) - tolerance)
+        against = int(np.argmin(side * rest))
+        first, last = int(touching[0]), int(touching[-1])
+        if first != last and position_mm[first] <= position_mm[against] <= position_mm[last]:
+            return first, last, against, -side
+    first, last = int(np.argmin(position_mm)), int(np.argmax(position_mm))
+    return first, last, int(np.argmin(rest)), -1.0
+
+
+def _zone_derivative(position_mm: FloatArray, rest: FloatArray) -> FloatArray:
+    """Width = distance of the single contact from the line through the two others."""
+    first, last, against, side = _contacts(position_mm, rest)
+    share = (position_mm[against] - position_mm[first]) / (position_mm[last] - position_mm[first])
+    derivative = np.zeros(len(rest))
+    derivative[against] += side
+    derivative[first] -= side * (1.0 - share)
+    derivative[last] -= side * share
+    return derivative
+
+
+# Figures of identified errors: each curve by itself, squareness, axes, diagonals, orientation.
+
+
+#: Points along a diagonal.
+ALONG_DIAGONAL = 41
+#: The squareness errors by (axis whose line turns, component, reference axis, its component).
+SQUARENESS_LINES = {"EC0Y": (1, 0, 0, 1), "EB0Z": (2, 0, 0, 2), "EA0Z": (2, 1, 1, 2)}
+
+
+def error_figures(source: ErrorSource, line: str = "ls") -> dict[str, Figure]:
+    """Return one figure for each error of the table, by its name.
+
+    Straightness counts from the reference line ``line``; positioning and angular errors as their range over the travel;
+    squareness as it is in the table, against the lines ``line`` of its straightness curves. None of these depends on
+    the constants, nor straightness and squareness together on the lines, that a table may have.
+    """
+    found = {}
+    for name in source.errors.curves:
+        found[name] = _curve_figure(source, name, line)
+    for name in source.errors.squareness:
+        found[name] = squareness_figure(source, name, line)
+    return found
+
+
+def straightness_figures(source: ErrorSource) -> dict[str, dict[str, Figure]]:
+    """Return every straightness of the table against each of the three reference lines: by error, then by line."""
+    names = [name for name in source.errors.curves if error_named(name).is_straightness]
+    several = [name for name in names if len(source.errors.curves[name].value) > 1]
+    return {name: {line: _curve_figure(source, name, line) for line in LINES} for name in several}
+
+
+def _curve_figure(source: ErrorSource, name: str, line: str) -> Figure:
+    error, curve = error_named(name), source.errors.curves[name]
+    if error.is_straightness and len(curve.value) > 1:
+        value, weight = straightness(curve.position_mm, curve.value, line)
+        meaning = f"straightness {name}, reference line: {LINES[line]}; ISO 230-1"
+    else:
+        value, weight = float(np.ptp(curve.value)), _range_weight(curve.value)
+        what = "mean bidirectional positioning error M (ISO 230-2)" if error.kind == "linear" else "angular error"
+        meaning = f"{what} {name}, range over the travel"
+    u = source.u_of(source.value_gradient(name, weight))
+    return Figure(value / error.si_per_unit, u / error.si_per_unit, error.unit, meaning)
+
+
+def _range_weight(value: FloatArray) -> FloatArray:
+    weight = np.zeros(len(value))
+    weight[int(np.argmax(value))] += 1.0
+    weight[int(np.argmin(value))] -= 1.0
+    return weight
+
+
+def squareness_figure(source: ErrorSource, name: str, line: str = "ls") -> Figure:
+    """Return a squareness error (urad) between the reference lines of its two axes.
+
+    To the value of the table come the slopes that the reference lines have in the straightness curves: moving a line from
+    a curve into the squareness changes neither this figure nor the volumetric error.
+    """
+    value = source.errors.squareness[name][0]
+    gradient = source.value_gradient(name, np.ones(1))
+    for curve_name, factor in _line_curves(source.machine, name):
+        curve = source.errors.curves.get(curve_name)
+        if curve is None or len(curve.value) < 2:
+            continue
+        weights = factor * slope_weights(curve.position_mm, line, curve.value)
+        value += float(weights @ curve.value)
+        gradient = gradient + source.value_gradient(curve_name, weights)
+    meaning = f"squareness {name} between reference lines of {LINES[line]}; ISO 230-1"
+    return Figure(value / RAD_PER_URAD, source.u_of(gradient) / RAD_PER_URAD, "urad", meaning)
+
+
+def _line_curves(machine: Machine, name: str) -> list[tuple[str, float]]:
+    """Straightness curves whose slope acts like a squareness error, and its sign in it (docs/conventions.md).
+
+    A slope a of EXY moves x by a Y, as EC0Y does by -EC0Y Y; a slope of EYX turns the reference line of X the same way.
+    """
+    axis, component, other, across = SQUARENESS_LINES[name]
+    unit = np.zeros((1, 3))
+    unit[0, axis] = 1.0
+    column = c_matrix(machine, unit, np.zeros(3))[0, :, 18 + list(SQUARENESS_LINES).index(name)]
+    sign = 1.0 / column[component] if column[component] else -1.0  # squareness_reference = "Y": dY = -X EC0Y
+    return [(f"E{AXES[component]}{AXES[axis]}", sign), (f"E{AXES[across]}{AXES[other]}", sign)]
+
+
+def axis_figures(source: ErrorSource) -> dict[str, Figure]:
+    """Return for each axis the range of its positioning error along the line through the reference point (``M_X`` ...)."""
+    machine = source.machine
+    found = {}
+    for k, axis in enumerate(AXES):
+        levels = levels_of(source, k)
+        points = np.tile(np.array(machine.reference_point_mm), (len(levels), 1))
+        points[:, k] = levels
+        field = source.field(points)
+        along = field.error_mm[:, k]
+        weight = np.zeros_like(field.error_mm)
+        weight[:, k] = _range_weight(along)
+        meaning = f"mean bidirectional positioning error M of {axis} on the line through the reference point; ISO 230-2"
+        found[f"M_{axis}"] = Figure(float(np.ptp(along)) / MM_PER_UM, field.spread(weight) / MM_PER_UM, "um", meaning)
+    return found
+
+
+def levels_of(source: ErrorSource, axis: int) -> FloatArray:
+    """Return the nodes of the curves of one axis within its travel, and the ends of the travel."""
+    low, high = source.machine.axes[axis].range_mm
+    nodes = [curve.position_mm for name, curve in source.errors.curves.items() if error_named(name).axis == axis]
+    levels = np.unique(np.concatenate([np.array([low, high]), *nodes]))
+    return levels[(levels >= low) & (levels <= high)]
+
+
+def diagonal_figures(source: ErrorSource) -> dict[str, Figure]:
+    """Return E of the four body diagonals of the travel and their largest, ``Ed`` (ISO 230-6), from the errors.
+
+    The deviation at p is u . (e(p) - e(s)) along the unit vector u from the start s; the errors are means of both
+    directions, so there is no reversal B_d here. Errors of opposite sign in two axes cancel on a diagonal: four equal
+    diagonals do not prove a good machine.
+    """
+    machine = source.machine
+    found = {}
+    for name, signs in BODY_DIAGONALS.items():
+        points = diagonal_points(machine, signs)
+        along = points[-1] - points[0]
+        unit = along / np.linalg.norm(along)
+        field = source.field(points)
+        deviation = (field.error_mm - field.error_mm[0]) @ unit
+        weight = _range_weight(deviation)[:, None] * unit
+        value, u = float(np.ptp(deviation)) / MM_PER_UM, field.spread(weight) / MM_PER_UM
+        found[name] = Figure(value, u, "um", f"systematic error E of the diagonal {name}; ISO 230-6")
+    worst = max(found, key=lambda name: found[name].value)
+    text = f"largest systematic error of the body diagonals, {worst}; ISO 230-6"
+    return {**found, "Ed": Figure(found[worst].value, found[worst].u, "um", text)}
+
+
+def diagonal_points(machine: Machine, signs: tuple[int, int, int], count: int = ALONG_DIAGONAL) -> FloatArray:
+    """Points (count, 3) along a body diagonal of the travel, in the direction of ``signs``."""
+    ends = [axis.range_mm if sign > 0 else axis.range_mm[::-1] for axis, sign in zip(machine.axes, signs, strict=True)]
+    return np.column_stack([np.linspace(*pair, count) for pair in ends])
+
+
+def diagonal_deviation(machine: Machine, error_mm: FloatArray, points_mm: FloatArray) -> FloatArray:
+    """Length deviation (n,) along a line of points (n, 3) with errors (n, 3), mm: u . (e(p) - e(s)), ISO 230-6."""
+    along = points_mm[-1] - points_mm[0]
+    return np.asarray((error_mm - error_mm[0]) @ (along / np.linalg.norm(along)))
+
+
+def orientation_figures(source: ErrorSource) -> dict[str, Figure]:
+    """Return the ranges of the tool's orientation V_A, V_B, V_C over the volume (ISO 230-1), urad.
+
+    The tool turns against the workpiece by the sum of the angular errors of all axes, so each range is the sum of the
+    ranges of three curves; constants and squareness do not turn the tool from place to place.
+    """
+    found = {}
+    for letter in "ABC":
+        names = [f"E{letter}{axis}" for axis in AXES]
+        present = [name for name in names if name in source.errors.curves]
+        value, gradient = 0.0, None
+        for name in present:
+            curve = source.errors.curves[name]
+            value += float(np.ptp(curve.value))
+            part = source.value_gradient(name, _range_weight(curve.value))
+            gradient = part if gradient is None else gradient + part
+        u = math.nan if gradient is None else source.u_of(gradient)
+        missing = [name for name in names if name not in present]
+        without = f"; without {', '.join(missing)}, which the table does not hold" if missing else ""
+        meaning = f"volumetric accuracy V_{letter}: range of the tool's orientation about {letter}{without}; ISO 230-1"
+        found[f"V_{letter}"] = Figure(value / RAD_PER_URAD, u / RAD_PER_URAD, "urad", meaning)
+    return found
+
+
+# Reversal in addition to the errors: figures of both directions along the axes (ISO 230-2) and diagonals (ISO 230-6).
+#
+# The errors are the means of both directions; with the reversal B(q) the tip is at e + B/2 after positive travel and at
+# e - B/2 after negative travel. So B is the largest |B(q)| and E the range over both. Along a diagonal in the direction s every
+# axis that moves adds its own reversal: B(p) = u . sum_k s_k B_k(p).
+
+
+#: Key of a curve, position on its axis (mm), factor.
+Term = tuple[tuple[int, int], float, float]
+
+
+@dataclass(frozen=True)
+class KnownReversal:
+    """Reversal of a machine, None where it is not known; ``text`` says where it comes from or why there is none."""
+
+    curves: ReversalCurves | None
+    text: str
+
+
+def identified_reversal(found: Identification) -> KnownReversal:
+    """Return the reversal that readings show, with its uncertainty, whether or not it is worth a table."""
+    if found.reversal_curves is not None:
+        return KnownReversal(found.reversal_curves, "reversal: identified, over the position of each axis")
+    if found.reversal is None:
+        if found.method in ("joint", "two-step", "deviations"):
+            return KnownReversal(
+                None, "reversal: not known: the file tells of no position that was approached from both directions"
+            )
+        return KnownReversal(
+            None, "reversal: not known: none exceeds its uncertainty, or only one direction was measured"
+        )
+    curves = {}
+    for name, axis in found.reversal.axes.items():
+        for component, (value, u) in enumerate(zip(axis.vector_mm, axis.u_mm, strict=True)):
+            curves[AXES.index(name), component] = Curve(np.zeros(1), np.array([value]), np.array([u]))
+    return KnownReversal(ReversalCurves(curves), "reversal: identified, one mean for each axis")
+
+
+def reversal_beside(path: Path) -> KnownReversal:
+    """Return the reversal that belongs to an errors file.
+
+    It is in ``NAME.reversal.csv``, for fitted errors in the identified one; what is not worth a table is in
+    ``identify.json`` in the same folder.
+    """
+    stem = path.name.removesuffix(".errors.csv")
+    names = [f"{stem}.reversal.csv", *(["identified.reversal.csv"] if stem == "fitted" else [])]
+    named = next((path.parent / name for name in names if (path.parent / name).is_file()), None)
+    summed = _summed_up(path.parent / "identify.json") if stem in ("identified", "fitted") else {}
+    if named is None and not summed:
+        return KnownReversal(
+            None, f"reversal: not known: errors are means of both directions, {names[-1]} is not there"
+        )
+    curves = {**summed, **({} if named is None else read_reversal(named).curves)}
+    where = " and ".join([*([named.name] if named else []), *(["identify.json"] if summed else [])])
+    return KnownReversal(ReversalCurves(curves), f"reversal: {where}; a direction that is not there counts as zero")
+
+
+def _summed_up(path: Path) -> dict[tuple[int, int], Curve]:
+    """Mean reversals of ``identify.json`` with their uncertainties; none if it holds none or is another file."""
+    if not path.is_file():
+        return {}
+    curves = {}
+    try:
+        axes = (json.loads(read_text(path)).get("reversal") or {}).get("axes", {})
+        for name, item in axes.items():
+            for component, (value, u) in enumerate(zip(item["vector_um"], item["u_um"], strict=True)):
+                parts = np.array([float(value)]) * MM_PER_UM, np.array([float(u)]) * MM_PER_UM
+                curves[AXES.index(name), component] = Curve(np.zeros(1), *parts)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return {}
+    return curves
+
+
+def reversal_figures(source: ErrorSource, reversal: ReversalCurves) -> dict[str, Figure]:
+    """Return ``B_X``, ``B_mean_X``, ``E_X`` ... of the axes whose reversal is known, and of the body diagonals.
+
+    Values of the reversal count as independent of each other and of the errors.
+    """
+    found: dict[str, Figure] = {}
+    for axis, letter in enumerate(AXES):
+        if (axis, axis) in reversal.curves:
+            found |= _of_axis(source, reversal, axis, letter)
+    return {**found, **_of_diagonals(source, reversal)} if reversal.curves else found
+
+
+def _of_axis(source: ErrorSource, reversal: ReversalCurves, axis: int, letter: str) -> dict[str, Figure]:
+    curve = reversal.curves[axis, axis]
+    low, high = source.machine.axes[axis].range_mm
+    inside = curve.position_mm[(curve.position_mm > low) & (curve.position_mm < high)]
+    levels = np.unique(np.concatenate([levels_of(source, axis), inside]))
+    points = np.tile(np.array(source.machine.reference_point_mm), (len(levels), 1))
+    points[:, axis] = levels
+    terms = [[((axis, axis), float(q), 1.0)] for q in levels]
+    unit = np.eye(3)[axis]
+    field = source.field(points)
+    share = 1.0 / len(curve.value)
+    mean = [((axis, axis), float(q), share) for q in curve.position_mm]
+    where = f"of {letter} on the line through the reference point; ISO 230-2"
+    return {
+        f"B_{letter}": _largest(reversal, terms, f"largest reversal error {where}"),
+        f"B_mean_{letter}": _figure(reversal, mean, 0.0, 0.0, f"mean reversal error of {letter}; ISO 230-2"),
+        f"E_{letter}": _both_ways(field, unit, reversal, terms, f"bidirectional systematic error {where}"),
+    }
+
+
+def _of_diagonals(source: ErrorSource, reversal: ReversalCurves) -> dict[str, Figure]:
+    sizes, errors = {}, {}
+    for name, signs in BODY_DIAGONALS.items():
+        points = diagonal_points(source.machine, signs)
+        unit = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
+        terms = [[((a, c), float(point[a]), float(signs[a] * unit[c])) for a, c in reversal.curves] for point in points]
+        field = source.field(points)
+        sizes[name] = _largest(reversal, terms, f"reversal error B of the diagonal {name}; ISO 230-6")
+        text = f"bidirectional systematic error E of the diagonal {name}; ISO 230-6"
+        errors[name] = _both_ways(field, unit, reversal, terms, text)
+    found = {f"B {name}": item for name, item in sizes.items()} | {f"E {name}": item for name, item in errors.items()}
+    for key, group, text in (("Bd", sizes, "reversal error B"), ("Ed", errors, "bidirectional systematic error E")):
+        worst = max(group, key=lambda name: group[name].value)
+        found[key] = replace(group[worst], meaning=f"largest {text} of the body diagonals, {worst}; ISO 230-6")
+    return found
+
+
+def _value(reversal: ReversalCurves, terms: Sequence[Term]) -> float:
+    return sum(factor * float(reversal.curves[key].at(np.array([q]))[0]) for key, q, factor in terms)
+
+
+def _u(reversal: ReversalCurves, terms: Sequence[Term]) -> float:
+    """Standard uncertainty of a sum of values of the curves; nan where one is not known."""
+    square = 0.0
+    for key in dict.fromkeys(key for key, _, _ in terms):
+        curve = reversal.curves[key]
+        gradient = sum(factor * hat_matrix(curve.position_mm, np.array([q]))[0] for k, q, factor in terms if k == key)
+        weights = np.asarray(gradient)
+        used = weights != 0.0
+        square += float(np.sum((weights[used] * curve.u[used]) ** 2))
+    return math.sqrt(square)
+
+
+def _figure(reversal: ReversalCurves, terms: Sequence[Term], value_mm: float, u_mm: float, meaning: str) -> Figure:
+    """A figure of a value with its own uncertainty plus a sum of reversal values."""
+    value, u = value_mm + _value(reversal, terms), math.hypot(u_mm, _u(reversal, terms))
+    return Figure(value / MM_PER_UM, u / MM_PER_UM, "um", meaning)
+
+
+def _largest(reversal: ReversalCurves, terms: Sequence[Sequence[Term]], meaning: str) -> Figure:
+    worst = max(terms, key=lambda item: abs(_value(reversal, item)))
+    sign = -1.0 if _value(reversal, worst) < 0.0 else 1.0
+    return _figure(reversal, [(key, q, sign * factor) for key, q, factor in worst], 0.0, 0.0, meaning)
+
+
+def _both_ways(
+    field: ErrorField, unit: FloatArray, reversal: ReversalCurves, terms: Sequence[Sequence[Term]], meaning: str
+) -> Figure:
+    """Range of mean +/- half the reversal over points, along a direction."""
+    along = field.error_mm @ unit
+    half = 0.5 * np.array([_value(reversal, item) for item in terms])
+    both = np.concatenate([along + half, along - half])
+    weight, parts, value = np.zeros_like(field.error_mm), [], 0.0
+    for at, sign in ((int(np.argmax(both)), 1.0), (int(np.argmin(both)), -1.0)):
+        row, way = at % len(along), 1.0 if at < len(along) else -1.0
+        weight[row] += sign * unit
+        value += sign * float(along[row])
+        parts += [(key, q, 0.5 * sign * way * factor) for key, q, factor in terms[row]]
+    return _figure(reversal, parts, value, field.spread(weight), meaning)
+
+
+# All figures of a machine from its errors, or of its axes from positioning runs.
+
 
 #: Points of the volume, and of the smaller grid on which pairs of points are looked at.
 MOST_POINTS, MOST_IN_PAIRS = 20_000, 1_750
@@ -34,12 +451,12 @@ MOST_POINTS, MOST_IN_PAIRS = 20_000, 1_750
 Groups = Mapping[str, Mapping[str, Figure]]
 
 
-@dataclass(frozen=True)
-class Accuracy:
+@dataclass(frozen=True, repr=False)
+class Accuracy(Drawable):
     """Figures by group (``volume``, ``orientation``, ``axes``, ``diagonals``, ``errors``, ``X`` ...) and key.
 
-    ``statements`` says in words what they stand for: alignment, reference line, tool offset, edition. ``targets`` has the
-    values at each target of groups that stem from runs (:class:`compgen.accuracy.iso230_2.PositioningTest`).
+    ``statements`` says in words what they refer to: alignment, reference line, tool offset, edition. ``targets`` has the
+    values at each target of groups that stem from runs (:class:`compgen.accuracy.positioning.PositioningTest`).
     """
 
     groups: Groups
@@ -57,6 +474,26 @@ class Accuracy:
             }
         return found
 
+    def overview(self) -> Overview:
+        """All figures with their expanded uncertainty."""
+        rows = tuple(
+            (f"{group} {key}", f"{item.value:.3f}", "" if np.isnan(item.u) else f"{item.expanded:.3f}", item.unit)
+            for group, figures in self.groups.items()
+            for key, item in figures.items()
+        )
+        title = f"{len(rows)} figures of {shortened(tuple(self.groups))}"
+        return Overview(title, ("figure", "value", "U (k = 2)", "unit"), rows, self.statements)
+
+    def panels(self) -> Sequence[Panel]:
+        """The figures of each group, um and urad apart."""
+        panels = []
+        for group, figures in self.groups.items():
+            for unit in ("um", "urad"):
+                shown = {key: item.value for key, item in figures.items() if item.unit == unit}
+                if shown:
+                    panels.append(Panel(group, unit, bars=(Bars("", tuple(shown), tuple(shown.values())),)))
+        return panels
+
 
 def nodes_of(machine: Machine, *sources: ErrorSource) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the nodes of the curves of all sources by axis; the ends of the travel where there is no curve."""
@@ -71,7 +508,7 @@ def nodes_of(machine: Machine, *sources: ErrorSource) -> tuple[FloatArray, Float
 
 def volume_fields(
     machine: Machine, sources: tuple[ErrorSource, ...], alignment: Alignment
-) -> list[tuple[Field, Field]]:
+) -> list[tuple[ErrorField, ErrorField]]:
     """Return for each source its aligned field over the volume, and over the smaller grid of the pairs.
 
     All have the same points: the nodes of all curves within the travel and the middles between them.
@@ -110,7 +547,7 @@ def accuracy_of_errors(
 
 
 def groups_of_errors(source: ErrorSource, line: str) -> dict[str, dict[str, Figure]]:
-    """Return the groups of figures beside the volume's."""
+    """Return the groups of figures other than the volume's."""
     return {
         "orientation": orientation_figures(source),
         "axes": axis_figures(source),
@@ -119,8 +556,8 @@ def groups_of_errors(source: ErrorSource, line: str) -> dict[str, dict[str, Figu
     }
 
 
-def statements_of(machine: Machine, field: Field, line: str) -> tuple[str, ...]:
-    """Say what the figures of a volume stand for."""
+def statements_of(machine: Machine, field: ErrorField, line: str) -> tuple[str, ...]:
+    """Say what the figures of a volume refer to."""
     tool = ", ".join(f"{value:g}" for value in machine.tool_offset_mm)
     ranges = ", ".join(f"{low:g} ... {high:g}" for low, high in (axis.range_mm for axis in machine.axes))
     return (
@@ -133,7 +570,7 @@ def statements_of(machine: Machine, field: Field, line: str) -> tuple[str, ...]:
 
 
 def accuracy_of_runs(
-    statistics: Mapping[str, RunStatistics], edition: int = LATEST, budgets: Mapping[str, Budget] | None = None
+    statistics: Mapping[str, RunStatistics], edition: int = LATEST, budgets: Mapping[str, SetupBudget] | None = None
 ) -> Accuracy:
     """Return ISO 230-2 and, where the runs allow it, VDI/DGQ 3441 of every axis; groups are the axes' letters.
 

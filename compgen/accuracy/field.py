@@ -1,8 +1,4 @@
-"""Fields of position errors: how they are aligned, and the figures of a volume with their uncertainty.
-
-Every figure is taken as a linear functional of the field near where it stands: sum(weight * error) over few points. So
-its uncertainty is that of the functional, from the joint covariance of what the field is made of, alignment included.
-"""
+"""Fields of position errors and where they come from: alignment, figures of a volume, their uncertainty."""
 
 from __future__ import annotations
 
@@ -12,13 +8,26 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.accuracy.figure import Figure
-from compgen.core.csvio import FloatArray
-from compgen.core.machine import Machine
-from compgen.core.names import MM_PER_UM
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.names import ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
-from compgen.verify.residuals import without_rigid_motion
+from compgen.identify.covariance import Covariance, covariance_or_independent
+from compgen.kinematics.curves import hat_matrix
+from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.first_order import c_matrix, tool_of, volumetric_error
+from compgen.kinematics.gauge import rigid_fields, without_rigid_motion
+
+# Fields of position errors: how they are aligned, and the figures of a volume with their uncertainty.
+#
+# Every figure is taken as a linear functional of the field near its present value: sum(weight * error) over few points. So
+# its uncertainty is that of the functional, from the joint covariance of what the field is made of, alignment included.
+
 
 #: Standard uncertainty (mm) of sum(weight * error) for weights (n, 3); nan if it is not known.
 Spread = Callable[[FloatArray], float]
@@ -29,7 +38,7 @@ _SAME_MM = 1e-6
 
 
 @dataclass(frozen=True)
-class Field:
+class ErrorField:
     """Position errors (n, 3) of the tool tip at commanded positions (n, 3), mm, and how well they are known.
 
     ``tip_mm`` is where the tip should be (position and tool offset), (n, 3); a rigid motion turns about it.
@@ -45,6 +54,22 @@ class Field:
     def __len__(self) -> int:
         """Return the number of points."""
         return len(self.position_mm)
+
+    def at_rows(self, rows: NDArray[np.int64]) -> ErrorField:
+        """Return the field at some of its points; their uncertainty is still that of the whole field."""
+
+        def spread(weight: FloatArray) -> float:
+            full = np.zeros_like(self.error_mm)
+            full[rows] = weight
+            return self.spread(full)
+
+        return ErrorField(self.position_mm[rows], self.tip_mm[rows], self.error_mm[rows], spread, self.alignment)
+
+    def thinned(self, most: int) -> ErrorField:
+        """Return at most ``most`` points, evenly from first to last."""
+        if len(self) <= most:
+            return self
+        return self.at_rows(np.unique(np.round(np.linspace(0, len(self) - 1, most)).astype(np.int64)))
 
 
 def unknown_spread(_: FloatArray) -> float:
@@ -62,18 +87,9 @@ def independent_spread(u_mm: FloatArray) -> Spread:
     return spread
 
 
-def _rigid(tip_mm: FloatArray) -> FloatArray:
-    """Fields of three translations and three rotations (about machine zero), shape (n, 3, 6)."""
-    fields = np.zeros((len(tip_mm), 3, 6))
-    fields[:, range(3), range(3)] = 1.0
-    for k in range(3):
-        fields[:, :, 3 + k] = np.cross(np.eye(3)[k], tip_mm)
-    return fields
-
-
-def _without(field: Field, parameters: FloatArray, error_mm: FloatArray, text: str) -> Field:
+def _without(field: ErrorField, parameters: FloatArray, error_mm: FloatArray, text: str) -> ErrorField:
     """Field with ``error_mm``, of which a rigid motion was taken out that ``parameters`` (6, n, 3) read off the field."""
-    motion = _rigid(field.tip_mm)
+    motion = rigid_fields(field.tip_mm).reshape(-1, 3, 6)
 
     def spread(weight: FloatArray) -> float:
         through = np.einsum("nij,ni->j", motion, weight)
@@ -82,7 +98,7 @@ def _without(field: Field, parameters: FloatArray, error_mm: FloatArray, text: s
     return replace(field, error_mm=error_mm, spread=spread, alignment=text)
 
 
-def aligned(machine: Machine, field: Field, alignment: Alignment) -> Field:
+def aligned(machine: Machine, field: ErrorField, alignment: Alignment) -> ErrorField:
     """Return the field in the stated alignment.
 
     Parameters
@@ -97,7 +113,7 @@ def aligned(machine: Machine, field: Field, alignment: Alignment) -> Field:
         return field
     if alignment == "axes":
         return _to_axes(machine, field)
-    motion = _rigid(field.tip_mm).reshape(-1, 6)
+    motion = rigid_fields(field.tip_mm)
     scale = np.linalg.norm(motion, axis=0)
     inverse = np.linalg.pinv(motion / scale) / scale[:, None]
     error = without_rigid_motion(field.tip_mm, field.error_mm)
@@ -112,7 +128,7 @@ def axis_lines(machine: Machine) -> FloatArray:
     return points
 
 
-def _to_axes(machine: Machine, field: Field) -> Field:
+def _to_axes(machine: Machine, field: ErrorField) -> ErrorField:
     rows = [_row_of(field, point) for point in axis_lines(machine)]
     parameters = np.zeros((6, len(field), 3))
     first, second = (0, 1) if machine.squareness_reference == "X" else (1, 0)
@@ -125,7 +141,7 @@ def _to_axes(machine: Machine, field: Field) -> Field:
             if other:  # the primary axis fixes the rotation about z
                 parameters[5, row, across] += side * sign / length
             parameters[3 + across, row, 2] -= side * sign / length  # dz along x: -B; dz along y: +A
-    motion = _rigid(field.tip_mm)
+    motion = rigid_fields(field.tip_mm).reshape(-1, 3, 6)
     rotation = parameters[3:].copy()
     parameters[:3, rows[0]] = np.eye(3)
     parameters[:3] -= np.einsum("ij,jnk->ink", motion[rows[0]][:, 3:], rotation)
@@ -139,7 +155,7 @@ def _to_axes(machine: Machine, field: Field) -> Field:
     return _without(field, parameters, error, text)
 
 
-def _row_of(field: Field, point_mm: FloatArray) -> int:
+def _row_of(field: ErrorField, point_mm: FloatArray) -> int:
     distance = np.max(np.abs(field.position_mm - point_mm), axis=1)
     row = int(np.argmin(distance))
     if distance[row] > _SAME_MM:
@@ -150,7 +166,7 @@ def _row_of(field: Field, point_mm: FloatArray) -> int:
     return row
 
 
-def volume_figures(field: Field, pairs: Field | None = None) -> dict[str, Figure]:
+def volume_figures(field: ErrorField, pairs: ErrorField | None = None) -> dict[str, Figure]:
     """Return the figures of a volume: ISO 230-1 ranges V_X, V_Y, V_Z, and ours, labelled as such.
 
     Parameters
@@ -177,11 +193,11 @@ def volume_figures(field: Field, pairs: Field | None = None) -> dict[str, Figure
     return found | _between(pairs or field)
 
 
-def _figure(field: Field, value_mm: float, weight: FloatArray, meaning: str) -> Figure:
+def _figure(field: ErrorField, value_mm: float, weight: FloatArray, meaning: str) -> Figure:
     return Figure(float(value_mm) / MM_PER_UM, field.spread(weight) / MM_PER_UM, "um", meaning)
 
 
-def _range(field: Field, component: int, meaning: str) -> Figure:
+def _range(field: ErrorField, component: int, meaning: str) -> Figure:
     along = field.error_mm[:, component]
     weight = np.zeros_like(field.error_mm)
     weight[int(np.argmax(along)), component] += 1.0
@@ -189,7 +205,7 @@ def _range(field: Field, component: int, meaning: str) -> Figure:
     return _figure(field, float(np.ptp(along)), weight, meaning)
 
 
-def _at(field: Field, row: int, toward: FloatArray | None = None) -> FloatArray:
+def _at(field: ErrorField, row: int, toward: FloatArray | None = None) -> FloatArray:
     """Weights that read off the length of the error at one point, or its part along ``toward`` (3,)."""
     weight = np.zeros_like(field.error_mm)
     vector = field.error_mm[row] if toward is None else toward
@@ -198,7 +214,7 @@ def _at(field: Field, row: int, toward: FloatArray | None = None) -> FloatArray:
     return weight
 
 
-def _between(field: Field) -> dict[str, Figure]:
+def _between(field: ErrorField) -> dict[str, Figure]:
     """Largest difference of two error vectors, and the largest error of a length between two points."""
     difference, length = _largest_pairs(field)
     where = f"any two of {len(field)} points"
@@ -214,8 +230,8 @@ def _between(field: Field) -> dict[str, Figure]:
         )
     }
     i, j = length
-    line = field.tip_mm[i] - field.tip_mm[j]
-    value = float(np.linalg.norm(line + apart_of(field, i, j)) - np.linalg.norm(line))
+    line, apart = field.tip_mm[i] - field.tip_mm[j], field.error_mm[i] - field.error_mm[j]
+    value = float(np.linalg.norm(line + apart) - np.linalg.norm(line))
     weight = (_at(field, i, line) - _at(field, j, line)) * (1.0 if value >= 0 else -1.0)
     ends = f"({_place(field, i)}) and ({_place(field, j)}) mm"
     found["length"] = _figure(
@@ -224,16 +240,11 @@ def _between(field: Field) -> dict[str, Figure]:
     return found
 
 
-def apart_of(field: Field, first: int, second: int) -> FloatArray:
-    """Difference (3,) of the errors of two points, mm."""
-    return np.asarray(field.error_mm[first] - field.error_mm[second])
-
-
-def _place(field: Field, row: int) -> str:
+def _place(field: ErrorField, row: int) -> str:
     return ", ".join(f"{value:.6g}" for value in field.position_mm[row])
 
 
-def _largest_pairs(field: Field, block: int = 256) -> tuple[tuple[int, int], tuple[int, int]]:
+def _largest_pairs(field: ErrorField, block: int = 256) -> tuple[tuple[int, int], tuple[int, int]]:
     """Rows of the pair with the largest difference of vectors, and of that with the largest length error."""
     best = [(-1.0, (0, 0)), (-1.0, (0, 0))]
     tip, error = field.tip_mm, field.error_mm
@@ -253,3 +264,98 @@ def _largest_pairs(field: Field, block: int = 256) -> tuple[tuple[int, int], tup
                 i, j = divmod(at, len(tip) - first)
                 best[k] = (float(values.flat[at]), (first + i, first + j))
     return best[0][1], best[1][1]
+
+
+# Errors of a machine with what is known of their uncertainty, as a source of fields at any points.
+
+
+#: What tables of a control add to the command at points, (n, 3), mm.
+Correction = Callable[[Points], FloatArray]
+
+
+@dataclass(frozen=True)
+class ErrorSource:
+    """Errors of a machine; ``factor`` (k, r) has F F^T as the covariance of the k values in the order of the table.
+
+    ``factor`` is None where the uncertainty is not known. ``correction`` is what active tables add: the field is then that
+    of the machine with them. ``exact`` moves the exact model, for fields that are compared with measured ones; a correction
+    always does.
+    """
+
+    machine: Machine
+    errors: ErrorTable
+    factor: FloatArray | None = None
+    correction: Correction | None = None
+    exact: bool = False
+
+    @property
+    def known(self) -> bool:
+        """Whether the uncertainty is known."""
+        return self.factor is not None
+
+    def field(self, position_mm: FloatArray) -> ErrorField:
+        """Return the errors of the tip at positions (n, 3) with the machine's tool; uncertainties to first order."""
+        points = Points(position_mm)
+        tool = tool_of(self.machine, None)
+        if self.correction is None:
+            model = exact_error if self.exact else volumetric_error
+            error = model(self.machine, self.errors, position_mm)
+        else:  # looked up at the commanded position, as controls do
+            added = self.correction(points)
+            error = exact_error(self.machine, self.errors, position_mm + added) + added
+        return ErrorField(position_mm, position_mm + tool, error, self._spread(position_mm))
+
+    def _spread(self, position_mm: FloatArray) -> Spread:
+        if self.factor is None:
+            return unknown_spread
+
+        def spread(weight: FloatArray) -> float:
+            used = np.any(weight != 0.0, axis=1)
+            return self.u_of(self._gradient(position_mm[used], weight[used]))
+
+        return spread
+
+    def _gradient(self, position_mm: FloatArray, weight: FloatArray) -> FloatArray:
+        """Derivative (k,) of sum(weight * E) over points by the values of the table; E = C P is linear in them."""
+        through = np.einsum("nij,ni->nj", c_matrix(self.machine, position_mm), weight)
+        parts = []
+        for name in self.errors.names:
+            column = through[:, ERROR_INDEX[name]]
+            if name in SQUARENESS_NAMES:
+                parts.append(np.array([column.sum()]))
+            else:
+                nodes = self.errors.curves[name].position_mm
+                parts.append(column @ hat_matrix(nodes, position_mm[:, error_named(name).axis]))
+        return np.concatenate(parts)
+
+    def value_gradient(self, name: str, weight: FloatArray) -> FloatArray:
+        """Derivative (k,) of sum(weight * values of one error)."""
+        parts = []
+        for other in self.errors.names:
+            count = 1 if other in self.errors.squareness else len(self.errors.curves[other].value)
+            parts.append(np.asarray(weight) if other == name else np.zeros(count))
+        return np.concatenate(parts)
+
+    def u_of(self, gradient: FloatArray) -> float:
+        """Standard uncertainty of a functional of the values with derivative (k,); nan if it is not known."""
+        if self.factor is None:
+            return math.nan
+        return float(np.linalg.norm(gradient @ self.factor))
+
+
+def error_source(
+    machine: Machine, errors: ErrorTable, covariance: Covariance | None = None, correction: Correction | None = None
+) -> ErrorSource:
+    """Return a source; without a covariance the values of the table count as independent with their own uncertainties.
+
+    The uncertainty is known only if every value has one.
+    """
+    known = covariance_or_independent(errors, covariance)
+    return ErrorSource(machine, errors, None if known is None else known.errors_factor, correction)
+
+
+def grid_points(machine: Machine, levels_mm: tuple[FloatArray, ...]) -> FloatArray:
+    """Points (n, 3) of a full grid, with the points that the alignment to the axes needs added where they are missing."""
+    grid = np.stack(np.meshgrid(*levels_mm, indexing="ij"), axis=-1).reshape(-1, 3)
+    extra = [p for p in axis_lines(machine) if np.max(np.abs(grid - p), axis=1).min() > 1e-6]
+    return np.concatenate([grid, np.array(extra)]) if extra else grid

@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-#: Expanded uncertainties are this many standard ones (about 95 %).
-COVERAGE = 2.0
+import numpy as np
+
+from compgen.data.names import COVERAGE
+from compgen.identify.covariance import normalized_error
 
 Verdict = Literal["better", "worse", "not separated", "smaller", "larger", "same"]
 
@@ -82,12 +84,8 @@ class ComparedFigure:
     @property
     def en(self) -> float:
         """E_n number (ISO/IEC 17043): |gain| over the root sum of squares of both expanded uncertainties."""
-        joint = math.hypot(self.before.expanded, self.after.expanded)
-        if math.isnan(joint):
-            return math.nan
-        if joint == 0.0:
-            return 0.0 if self.gain == 0.0 else math.inf
-        return abs(self.gain) / joint
+        joint = np.hypot(self.before.expanded, self.after.expanded)
+        return float(normalized_error(np.asarray(self.gain), joint))
 
     @property
     def separated(self) -> bool:

@@ -1,4 +1,4 @@
-"""What stands on the two sides of a comparison: error files, measurements of any kind, predictions."""
+"""The two sides of a comparison: what each file contains, and which comparison fits the two."""
 
 from __future__ import annotations
 
@@ -9,27 +9,47 @@ from pathlib import Path
 
 import numpy as np
 
+from compgen.accuracy.compare import (
+    CompareOptions,
+    Comparison,
+    MeasuredField,
+    agreement,
+    check_same_positions,
+    compare_diagonals,
+    compare_errors,
+    compare_fields,
+    compare_runs,
+    measured_field,
+    paired_figures,
+)
 from compgen.accuracy.diagonals import DiagonalRun, diagonal_runs
-from compgen.accuracy.field import Field
-from compgen.accuracy.pairing import MeasuredField, measured_field
-from compgen.accuracy.reversal import KnownReversal, identified_reversal, reversal_beside
-from compgen.accuracy.runs import RunStatistics, axis_statistics
-from compgen.accuracy.source import ErrorSource, error_source
-from compgen.controllers.isg.error_files import read_error_file
-from compgen.controllers.isg.etalon_exchange import is_exchange_text
-from compgen.core.axis_runs import AxisRuns
-from compgen.core.csvio import names_in_header, read_csv
-from compgen.core.deviations import Deviations
-from compgen.core.diagonals import read_diagonals
-from compgen.core.error_table import ERROR_COLUMNS, ErrorTable
-from compgen.core.files import read_bytes, sha256_of
-from compgen.core.lengths import POSITION_COLUMNS, Lengths
-from compgen.core.machine import Machine
-from compgen.core.names import MM_PER_UM
-from compgen.errors import CompgenWarning, InputError
+from compgen.accuracy.evaluate import (
+    KnownReversal,
+    identified_reversal,
+    reversal_beside,
+    reversal_figures,
+    volume_fields,
+)
+from compgen.accuracy.field import Alignment, ErrorField, ErrorSource, aligned, error_source
+from compgen.accuracy.figure import Figure
+from compgen.accuracy.positioning import RunStatistics, axis_statistics
+from compgen.controls.etalon_exchange import is_exchange_text, read_error_file
+from compgen.data.axis_runs import AxisRuns, read_diagonals
+from compgen.data.csv_files import FloatArray, names_in_header, read_csv
+from compgen.data.deviations import Deviations
+from compgen.data.error_table import ERROR_COLUMNS, ErrorTable
+from compgen.data.files import read_bytes, sha256_of
+from compgen.data.lengths import POSITION_COLUMNS, Lengths, Points
+from compgen.data.machine import Machine
+from compgen.data.names import MM_PER_UM
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify import Identification, IdentifyOptions, identify_measurement, joint_covariance, read_measurement
+from compgen.identify.any_measurement import Measurement
 from compgen.identify.covariance import Covariance, read_covariance
-from compgen.identify.measurement import Measurement
+from compgen.tables import ReadTables
+
+# What the two sides of a comparison can be: error files, measurements of any kind, predictions.
+
 
 #: Bytes that tell what a file is.
 _LOOKED_AT = 1_000_000
@@ -57,7 +77,7 @@ class Side:
     lengths: Lengths | None = None
     runs: dict[str, RunStatistics] | None = None
     diagonals: dict[str, DiagonalRun] | None = None
-    predicted: Field | None = None
+    predicted: ErrorField | None = None
     reversal: KnownReversal = NOT_KNOWN
     u_um: float | None = None
 
@@ -67,7 +87,7 @@ class Side:
             return self
         measurement = self.lengths or self.deviations
         if measurement is None:
-            raise InputError(f"holds {self.kind}, from which the errors of the machine do not follow", file=self.path)
+            raise InputError(f"contains {self.kind}, which do not determine the errors of the machine", file=self.path)
         chosen = IdentifyOptions(u_deviation_um=self.u_um if self.lengths is None else None)
         found = identify_measurement(self.machine, measurement, chosen)
         return replace(self, source=_source_of(self.machine, found), reversal=identified_reversal(found))
@@ -90,10 +110,10 @@ def read_side(
     Parameters
     ----------
     machine : the machine.
-    path : the file; its columns tell what it is. A folder stands for the errors that were identified there.
+    path : the file; its columns tell what it is. For a folder: the errors that were identified there.
     instrument : constants of a six-DOF instrument, for ``*.sixdof.csv``.
     u_um : standard uncertainty of measured deviations, um; default the file's own.
-    reader : of measurements; that of :mod:`compgen.imports` takes foreign files as well.
+    reader : of measurements; that of :mod:`compgen.foreign` takes foreign files as well.
     """
     source = _errors_in(Path(path))
     text = read_bytes(source, _LOOKED_AT).decode("utf-8-sig", errors="replace")  # to tell the kind; readers are strict
@@ -127,12 +147,12 @@ def _errors_in(path: Path) -> Path:
         return path
     found = path / "identified.errors.csv"
     if not found.is_file():
-        raise InputError("is a folder without identified.errors.csv; give the file that is meant", file=path)
+        raise InputError("is a folder without identified.errors.csv; give a file", file=path)
     return found
 
 
 def covariance_beside(path: Path, errors: ErrorTable) -> Covariance | None:
-    """Return the covariance file that an errors file names, if it lies beside it and belongs to it; warn if it does not."""
+    """Return the covariance file that an errors file names, if it is there and belongs to it; warn if it does not."""
     name = errors.metadata.get("covariance")
     beside = path.parent / name if name else None
     if beside is None or not beside.is_file():
@@ -149,7 +169,7 @@ def _source_of(machine: Machine, found: Identification) -> ErrorSource:
     return error_source(machine, found.errors, joint_covariance(found) if found.has_covariance else None)
 
 
-def _read_predicted(machine: Machine, path: Path) -> Field:
+def _read_predicted(machine: Machine, path: Path) -> ErrorField:
     """Predicted errors at points as a field without uncertainty of its own."""
     table = read_csv(path, (*POSITION_COLUMNS, *PREDICTED_COLUMNS), ("tool_x_mm", "tool_y_mm", "tool_z_mm"))
     position = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
@@ -158,5 +178,180 @@ def _read_predicted(machine: Machine, path: Path) -> Field:
     if "tool_x_mm" in table.columns:
         tool = np.column_stack([table.numbers(f"tool_{k}_mm") for k in "xyz"])
         if np.max(np.abs(tool - np.array(machine.tool_offset_mm))) > 1e-6:
-            raise InputError("has another tool offset than the machine; predict with the machine's own", file=path)
-    return Field(position, position + tool, error, lambda _: 0.0)
+            raise InputError("has a tool offset that differs from the machine's; predict with the machine's", file=path)
+    return ErrorField(position, position + tool, error, lambda _: 0.0)
+
+
+# Two sides of a comparison brought together: by their kind, or as prediction and measurement.
+
+
+def compare_sides(before: Side, after: Side, options: CompareOptions) -> Comparison:
+    """Compare two sides of like kind: axis runs, diagonals, measured positions, or errors (given, or identified first).
+
+    Raises
+    ------
+    InputError
+        for kinds that cannot be compared, and for different points unless ``options.align`` says how to align them.
+    """
+    if before.runs is not None and after.runs is not None:
+        return compare_runs(before.runs, after.runs, options)
+    if before.diagonals is not None and after.diagonals is not None:
+        return compare_diagonals(before.machine, before.diagonals, after.diagonals, options)
+    if before.predicted is not None or after.predicted is not None:
+        side = before if before.predicted is not None else after
+        raise InputError(
+            "contains predicted errors at points; compare them with a measurement: --predicted", file=side.path
+        )
+    for alone, name in (("runs", "axis runs"), ("diagonals", "measured diagonals")):
+        if getattr(before, alone) is not None or getattr(after, alone) is not None:
+            raise InputError(
+                f"BEFORE contains {before.kind}, AFTER {after.kind}; {name} can be compared with {name} only"
+            )
+    if options.align != "model":
+        if before.deviations is not None and after.deviations is not None:
+            return _positions(before, after, options)
+        if before.deviations is not None or after.deviations is not None:
+            return _errors_at_positions(before, after, options)
+    said = []
+    if before.lengths is not None and after.lengths is not None:
+        said.append(check_same_positions(before.lengths, after.lengths, options.align))
+    first, second = before.errors(), after.errors()
+    assert first.source is not None and second.source is not None
+    own = replace(options, align=None if options.align == "model" else options.align)
+    found = compare_errors(first.source, second.source, own)
+    for side in (first, second):
+        if side.kind not in ("errors",):
+            said.append(f"{side.path.name}: errors identified from {side.kind}")
+    groups = {name: dict(group) for name, group in found.groups.items()}
+    both = [_reversal_of(side) for side in (first, second)]
+    if both[0] and both[1]:
+        groups |= paired_figures({"reversal": both[0]}, {"reversal": both[1]})
+    else:
+        said += [f"{side.path.name}: {side.reversal.text}" for side in (first, second) if side.reversal.curves is None]
+    return replace(found, groups=groups, statements=(*said, *found.statements))
+
+
+def _reversal_of(side: Side) -> dict[str, Figure]:
+    if side.source is None or side.reversal.curves is None:
+        return {}
+    return reversal_figures(side.source, side.reversal.curves)
+
+
+def _positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
+    """Points against points; and the errors identified from each side, where they follow from the points."""
+    found = compare_fields(before.machine, before.measured(), after.measured(), options)
+    try:
+        first, second = before.errors().source, after.errors().source
+        assert first is not None and second is not None
+        errors = compare_errors(first, second, replace(options, align=None, alignment=None))
+    except (UndeterminedError, InputError) as error:
+        text = f"single errors are not compared: they do not follow from these points ({str(error).partition(';')[0]})"
+        return replace(found, statements=(*found.statements, text))
+    rest = {name: group for name, group in errors.groups.items() if name != "volume"}
+    text = "axes, diagonals and single errors: identified from the points of each side; " + errors.statements[-2]
+    return replace(found, groups={**found.groups, **rest}, statements=(*found.statements, text))
+
+
+def _errors_at_positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
+    """Errors on one side, taken at the positions that were measured on the other."""
+    measured = _own_tool(after if before.deviations is None else before)
+    other = before if before.deviations is None else after
+    field = _predicted_at(other, measured.field)
+    taken = MeasuredField(field, measured.keys, measured.measured)
+    sides = (taken, measured) if other is before else (measured, taken)
+    found = compare_fields(before.machine, *sides, options)
+    text = f"{other.path.name}: errors, the exact model moved with them to the measured positions"
+    return replace(found, statements=(text, *found.statements))
+
+
+def compare_prediction(predicted: Side, measured: Side, options: CompareOptions) -> Comparison:
+    """Compare a prediction (errors, or errors at points) with what was measured; verdict by the agreement."""
+    first, second = _both_fields(predicted, measured, options)
+    found = agreement(first, second)
+    statements: tuple[str, ...] = (
+        f"prediction {predicted.path.name} against {measured.kind}",
+        f"{len(first)} points, {first.alignment}",
+    )
+    if predicted.predicted is not None:
+        text = "a list of predicted points has no uncertainty: that of the measurement alone counts"
+        statements = (*statements, f"{text}; where squareness is large, predict with --exact")
+    return Comparison("prediction", {"volume": dict(found.figures)}, (), statements, found)
+
+
+def with_prediction(
+    found: Comparison, before: Side, after: Side, tables: ReadTables, options: CompareOptions
+) -> Comparison:
+    """Add to a comparison what the emulated control with its tables predicted for AFTER, from the errors BEFORE."""
+    known = before.errors()
+    assert known.source is not None
+    machine = before.machine
+
+    def correction(points: Points) -> FloatArray:
+        return tables.mean_correction(machine, points.position_mm)
+
+    predicted = replace(known, source=replace(known.source, correction=correction), deviations=None, lengths=None)
+    own = replace(options, align=None if options.align == "model" else options.align)
+    first, second = _both_fields(predicted, after, own)
+    text = (
+        f"prediction: {tables.controller.name} emulated with its tables on the errors BEFORE, mean of both directions"
+    )
+    return replace(found, prediction=agreement(first, second), statements=(*found.statements, text))
+
+
+def _both_fields(predicted: Side, measured: Side, options: CompareOptions) -> tuple[ErrorField, ErrorField]:
+    """Predicted and measured field at the same points, aligned alike."""
+    machine = predicted.machine
+    for side in (measured, predicted):
+        if side.runs is not None or side.diagonals is not None:
+            raise InputError(f"{side.kind} cannot be compared with a prediction of errors", file=side.path)
+    if measured.predicted is not None:
+        raise InputError("AFTER is a prediction too; expected a measurement", file=measured.path)
+    alignment: Alignment = options.alignment or ("as-given" if measured.deviations is not None else "axes")
+    if predicted.predicted is not None:
+        alignment = options.alignment or "as-given"
+    if measured.deviations is not None:
+        second = _own_tool(measured).field
+        first = _predicted_at(predicted, second)
+    elif predicted.predicted is not None:
+        first, second = predicted.predicted, _exact(measured).field(predicted.predicted.position_mm)
+    else:
+        (first, _), (second, _) = volume_fields(machine, (_exact(predicted), _exact(measured)), alignment)
+        return first, second
+    return aligned(machine, first, alignment), aligned(machine, second, alignment)
+
+
+def _exact(side: Side) -> ErrorSource:
+    """Errors of a side as a source that moves the exact model."""
+    source = side.errors().source
+    assert source is not None
+    return replace(source, exact=True)
+
+
+def _own_tool(side: Side) -> MeasuredField:
+    found = side.measured()
+    if not all(found.measured):
+        raise InputError("a comparison with a prediction needs dx, dy and dz; not all were measured", file=side.path)
+    offset = found.field.tip_mm - found.field.position_mm - np.array(side.machine.tool_offset_mm)
+    if float(np.max(np.abs(offset))) > 1e-6:
+        raise InputError(
+            "was measured with a tool offset that differs from the machine's, which the prediction uses",
+            file=side.path,
+        )
+    return found
+
+
+def _predicted_at(predicted: Side, measured: ErrorField) -> ErrorField:
+    """Predicted field at the measured points; a list of points must hold every one of them."""
+    if predicted.predicted is None:
+        return _exact(predicted).field(measured.position_mm)
+    given = predicted.predicted
+    index = {key: k for k, key in enumerate(map(tuple, np.round(given.position_mm, 3).tolist()))}
+    wanted = list(map(tuple, np.round(measured.position_mm, 3).tolist()))
+    missing = [key for key in wanted if key not in index]
+    if missing:
+        raise InputError(
+            f"has no prediction for {len(missing)} of {len(wanted)} measured points, the first is {missing[0]} mm; "
+            "predict at the measured points",
+            file=predicted.path,
+        )
+    return given.at_rows(np.array([index[key] for key in wanted], dtype=np.int64))

@@ -1,41 +1,117 @@
-"""The command line: ``volcomp --help``."""
+"""The command line: ``volcomp --help``.
+
+This module knows the names of the commands and one line about each. The module that holds a command is imported when
+the command runs, and with it what the command needs; ``volcomp --help`` and the completion of a shell load neither.
+"""
 
 from __future__ import annotations
 
 import sys
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import entry_points
 
 import click
 
-from compgen.cli import (
-    compare_commands,
-    diagnose_commands,
-    export_commands,
-    identify_commands,
-    import_commands,
-    listing_commands,
-    options_commands,
-    plan_commands,
-    recal_commands,
-    recal_decision_commands,
-    recal_drift_commands,
-    recal_reprocess_commands,
-    recal_store_commands,
-    report_commands,
-    run_commands,
-    safety_commands,
-    serve_commands,
-    simulate_commands,
+from compgen.cli.common import load_for, plugin_option, run_command
+
+#: Every command by the module that holds it as ``<name>_command``, with its line in ``volcomp --help``.
+_COMMANDS = {
+    "run_commands": {
+        "run": "Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.",
+        "report": "Make the report of a folder that run, identify, verify or compare wrote.",
+    },
+    "identify_commands": {
+        "identify": "Identify error curves, squareness and stations from a measurement.",
+        "fit": "Fit smooth curves to identified errors, within bounds.",
+    },
+    "diagnose_commands": {
+        "diagnose": "Find where model and measurement disagree, and name the missing effect.",
+    },
+    "table_commands": {
+        "options": "Show what each option of a control would buy, by level and by control.",
+        "export": "Export errors to the files of a control, with manifest.json and preflight.md.",
+        "read": "Read controller files, emulate the control, and write the correction at each point.",
+        "verify": "Verify controller files against the errors of the machine.",
+        "diff": "Compare two sets of tables by what they do: A minus B at the tool, in um.",
+        "merge": "Merge old tables and new errors to one set of tables.",
+        "crash-test": "Feed wrong tables to the verification, and see that each is rejected.",
+    },
+    "plan_commands": {
+        "plan": "Plan a measurement: what it will determine, and how well.",
+        "simulate": "Simulate a machine and its measurement.",
+        "predict": "Predict the error of the tool tip at given points: E = C P, or the exact model.",
+    },
+    "accuracy_commands": {
+        "accuracy": "Evaluate one measurement or error file by the standards (ISO 230, VDI/DGQ 3441).",
+        "compare": "Compare before and after: improvement factors with uncertainty.",
+    },
+    "listing_commands": {
+        "controllers": "List the controls that compgen writes, and what they can express.",
+        "machines": "List the machines with their travel (mm).",
+        "effects": "List the effects other than the geometric errors.",
+        "instruments": "List the instruments that compgen simulates.",
+        "import": "Show what a file of another program holds, and write it as a contract file.",
+    },
+    "fleet_commands": {
+        "recal": "Scheduled recalibration: new measurements become proposed tables.",
+        "serve": "Show the fleet in a browser: history, drift, before and after of proposed tables.",
+    },
+}
+
+
+class Unloaded(click.Command):
+    """Name and help line of a command whose module has not been imported yet."""
+
+    def __init__(self, name: str, module: str, line: str) -> None:
+        super().__init__(name, short_help=line)
+        self.module = module
+
+    @cached_property
+    def loaded(self) -> click.Command:
+        """The command itself; its module is imported now."""
+        module = import_module(f"compgen.cli.{self.module}")
+        command = getattr(module, f"{str(self.name).replace('-', '_')}_command")
+        assert isinstance(command, click.Command)
+        return plugin_option(command)  # type: ignore[no-any-return]
+
+
+class CommandTable(click.Group):
+    """A group of commands that are imported when they are called; its help and completion need their names only."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command that ``args`` begin with, and import it."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command.loaded if isinstance(command, Unloaded) else command, rest
+
+
+def _show_version(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+    """Print the version, also where the package runs from a folder that was never installed, and stop."""
+    if value and not context.resilient_parsing:
+        from compgen.resources import program_version
+
+        click.echo(f"compgen, version {program_version()}")
+        context.exit()
+
+
+@click.group(
+    cls=CommandTable,
+    commands=[Unloaded(name, module, line) for module, lines in _COMMANDS.items() for name, line in lines.items()],
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
 )
-from compgen.cli.common import run_command
-from compgen.cli.plugin_options import plugin_option
-from compgen.export import program_version
-from compgen.plugins import load_plugins
-
-
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
-@click.version_option(program_version(), prog_name="compgen")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_show_version,
+    help="Show the version and exit.",
+)
 @plugin_option
-def cli() -> None:
+@click.pass_context
+def cli(context: click.Context) -> None:
     """From a machine-tool measurement to checked compensation tables.
 
     Lengths are in mm, errors in files in um and urad. Exit codes: 0 done and accepted, 1 done but not acceptable,
@@ -45,32 +121,8 @@ def cli() -> None:
     Example:
       volcomp run zha-gantry lengths.csv --controller isg-csv --out tables/
     """
-    load_plugins()
-
-
-MODULES = (
-    run_commands,
-    import_commands,
-    simulate_commands,
-    identify_commands,
-    diagnose_commands,
-    plan_commands,
-    export_commands,
-    compare_commands,
-    report_commands,
-    options_commands,
-    safety_commands,
-    recal_commands,
-    recal_decision_commands,
-    recal_drift_commands,
-    recal_reprocess_commands,
-    recal_store_commands,
-    serve_commands,
-    listing_commands,
-)
-for module in MODULES:
-    for command in module.COMMANDS:
-        cli.add_command(plugin_option(command))
+    if any(group.startswith("compgen.") for group in entry_points().groups):  # else there is no plug-in to look for
+        load_for(context, installed=True)
 
 
 def main() -> None:

@@ -1,67 +1,124 @@
-"""``volcomp diagnose``."""
+"""``volcomp diagnose``: where model and measurement disagree, for one measurement or for each of many."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 
-from compgen.cli.common import NUMBER, json_option, machine_argument, out_option, print_json, progress, stdout
-from compgen.cli.diagnose_batch import Asked, diagnose_each, diagnosed
-from compgen.cli.identify_commands import sixdof_option
-from compgen.cli.parallel_options import fleet_options
-from compgen.controllers.isg.error_files import read_error_file
-from compgen.core.files import OutputFolder
-from compgen.core.machine import Machine
-from compgen.diagnose import DiagnoseOptions
-from compgen.diagnose.axis_session import ORDERS, Order
-from compgen.diagnose.files import next_steps, summary
-from compgen.errors import InputError
+from compgen.cli.common import fleet_options, json_option, out_option, print_json
+from compgen.cli.shared_options import instrument_option, machine_argument, mapper, measurements_argument, options_of
+from compgen.cli.terminal import progress, say
+from compgen.controls.etalon_exchange import read_error_file
+from compgen.data.files import OutputFolder, json_text
+from compgen.data.machine import Machine
+from compgen.diagnose import AxisDiagnosis, DiagnoseOptions, Diagnosis, diagnose
+from compgen.diagnose.diagnose import SixDofDiagnosis, diagnose_sixdof, sixdof_text
+from compgen.diagnose.observed import read_diagnosed
+from compgen.diagnose.page import diagnosis_files, next_steps, summary
+from compgen.errors import CompgenError, InputError
+from compgen.instruments.sixdof_instrument import read_instrument
+from compgen.instruments.sixdof_readings import read_sixdof
+from compgen.kinematics.kernel_switch import one_thread
+
+# ``volcomp diagnose --each``: every measurement by itself, in this process, in several, or on a cluster.
+
+
+Show = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class DiagnoseRequest:
+    """How to diagnose measurements; it can be sent to another process."""
+
+    machine: Machine
+    options: DiagnoseOptions
+    instrument: Path | None
+
+    def __call__(self, path: Path) -> DiagnosedMeasurement:
+        """Diagnose one measurement; what cannot be used becomes part of what was found."""
+        try:
+            with one_thread():
+                found, contents = diagnosed(self, (path,), lambda _: None)
+        except CompgenError as error:
+            return DiagnosedMeasurement({}, {"error": str(error)}, acceptable=False)
+        return DiagnosedMeasurement(contents, found.to_dict(), acceptable=found.acceptable)
+
+
+@dataclass(frozen=True)
+class DiagnosedMeasurement:
+    """Files of a diagnosis by name, its figures, and whether it is acceptable."""
+
+    contents: dict[str, str | bytes]
+    figures: dict[str, Any]
+    acceptable: bool
+
+
+def diagnosed(
+    request: DiagnoseRequest, measurements: Sequence[Path], show: Show
+) -> tuple[Diagnosis | AxisDiagnosis | SixDofDiagnosis, dict[str, str | bytes]]:
+    """Diagnose files as one measurement; return the diagnosis and its files by name."""
+    if request.instrument is None:
+        found = diagnose(request.machine, read_diagnosed(measurements), request.options, show=show)
+        show("drawing")
+        return found, dict(diagnosis_files(found))
+    if request.options.against is not None or request.options.effects or request.options.add:
+        raise InputError("--against, --effects and --add cannot be used with six-DOF readings")
+    readings = diagnose_sixdof(request.machine, read_sixdof(measurements), read_instrument(request.instrument))
+    return readings, {"diagnosis.json": json_text(readings.to_dict()), "diagnosis.md": sixdof_text(readings)}
+
+
+def diagnose_each(
+    request: DiagnoseRequest, measurements: Sequence[Path], out: Path, spread: tuple[int, str | None], *, as_json: bool
+) -> int:
+    """Diagnose every measurement into a folder of its own; the exit code is 1 if any is not acceptable."""
+    names = [path.name.split(".")[0] for path in measurements]
+    twice = sorted({name for name in names if names.count(name) > 1 or not name})
+    if twice:
+        raise InputError(f"the folder {twice[0]!r} would hold two diagnoses; rename the measurements", field="--each")
+    results: list[dict[str, Any]] = []
+    with mapper(*spread) as share:
+        for name, path, found in zip(names, measurements, share(request, measurements), strict=True):
+            files = OutputFolder(out / name)
+            for file, content in found.contents.items():
+                files.add(file, content)
+            files.commit()
+            results.append({"measurement": str(path), "acceptable": found.acceptable, **found.figures})
+            if not as_json:
+                verdict = found.figures.get("error") or found.figures.get("verdict") or ""
+                say(f"{path}: {verdict}")
+    if as_json:
+        print_json({"accepted": all(item["acceptable"] for item in results), "measurements": results})
+    return 0 if all(item["acceptable"] for item in results) else 1
+
+
+# ``volcomp diagnose``.
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 @click.command("diagnose")
 @machine_argument
-@click.argument("measurements", nargs=-1, required=True, type=click.Path(path_type=Path))
+@measurements_argument
 @out_option
+@options_of(DiagnoseOptions, "options", read={"effects": _names, "against": read_error_file})
+@instrument_option
 @click.option(
-    "--max-effects", type=click.IntRange(0, 6), default=4, show_default=True, help="Most named effects at once."
+    "--each", is_flag=True, help="Diagnose each measurement on its own, into a folder of --out with its name."
 )
-@click.option("--effects", metavar="NAME,...", help="Look for these effects only; default: the whole catalogue.")
-@click.option("--add", "added", multiple=True, metavar="NAME", help="Add this effect whether it was found or not.")
-@sixdof_option
-@click.option("--u-um", type=NUMBER, help="Standard uncertainty of a reading, um; used where no line was repeated.")
-@click.option(
-    "--against",
-    type=click.Path(path_type=Path),
-    metavar="ERRORS",
-    help="Errors (*.errors.csv) that the measurement is compared with: which have changed?",
-)
-@click.option(
-    "--order",
-    type=click.Choice(ORDERS),
-    default="auto",
-    show_default=True,
-    help="Order of axis runs in time: time_s or the column order, else run by run, up then down (auto); or as named. "
-    "The order of rows counts with 'rows' only.",
-)
-@click.option(
-    "--leave-out-disturbed", is_flag=True, help="Leave out short bursts of disturbed readings once they are found."
-)
-@click.option("--each", is_flag=True, help="Every measurement by itself, into a folder of --out by its name.")
 @fleet_options
 @json_option
 def diagnose_command(
     machine: Machine,
     measurements: tuple[Path, ...],
     out: Path,
-    max_effects: int,
-    effects: str | None,
-    added: tuple[str, ...],
+    options: DiagnoseOptions,
     instrument: Path | None,
-    u_um: float | None,
-    against: Path | None,
-    order: Order,
-    leave_out_disturbed: bool,
     each: bool,
     workers: int,
     cluster: str | None,
@@ -70,11 +127,11 @@ def diagnose_command(
     """Find where model and measurement disagree, name the missing effect, add it, and see the gap shrink.
 
     MEASUREMENTS are *.lengths.csv (mm), *.deviations.csv or *.axis.csv files (um), or *.sixdof.csv files (mm) with
-    --instrument, whose readings are asked about their instrument. Writes diagnosis.json,
+    --instrument, which are checked for errors of the instrument itself. Writes diagnosis.json,
     diagnosis.md, pages with pictures (index.html), and extended.toml: the machine with the effects that were found, to be
     given to the next command in place of MACHINE. Axis runs (ISO 230-2): also removed.csv, what was taken off each reading.
 
-    --each asks every file by itself; --workers and --cluster share those out.
+    --each diagnoses every file on its own; --workers and --cluster distribute them.
 
     Exit code 1: it cannot be decided, or the gap does not shrink on lines that were left out.
 
@@ -83,17 +140,14 @@ def diagnose_command(
       volcomp diagnose zha-gantry lengths.csv --out diagnosis/
     """
     OutputFolder(out)
-    names = tuple(name.strip() for name in effects.split(",") if name.strip()) if effects else ()
-    predicted = None if against is None else read_error_file(against)
-    options = DiagnoseOptions(max_effects, names, added, u_um, predicted, order, leave_out_disturbed)
-    asked = Asked(machine, options, instrument)
+    request = DiagnoseRequest(machine, options, instrument)
     if each:
-        return diagnose_each(asked, measurements, out, (workers, cluster), as_json=as_json)
+        return diagnose_each(request, measurements, out, (workers, cluster), as_json=as_json)
     if workers > 1 or cluster is not None:
-        raise InputError("--workers and --cluster share out the measurements of --each, which is not given")
+        raise InputError("--workers and --cluster need --each: they distribute its measurements")
     with progress(quiet=as_json) as show:
         show("reading the measurement")
-        found, contents = diagnosed(asked, measurements, show)
+        found, contents = diagnosed(request, measurements, show)
     files = OutputFolder(out)
     for name, content in contents.items():
         files.add(name, content)
@@ -102,14 +156,8 @@ def diagnose_command(
         print_json(found.to_dict())
     else:
         data = found.to_dict()
-        stdout.print(
-            contents["diagnosis.md"] if instrument is not None else summary(machine.name, data, markdown=False),
-            soft_wrap=True,
-        )
+        say(str(contents["diagnosis.md"]) if instrument is not None else summary(machine.name, data, markdown=False))
         steps = next_steps(contents, str(machine.source or machine.name), " ".join(map(str, measurements)), str(out))
         if steps:
-            stdout.print(steps, soft_wrap=True)
+            say(steps)
     return 0 if found.acceptable else 1
-
-
-COMMANDS = (diagnose_command,)

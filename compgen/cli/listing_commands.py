@@ -1,31 +1,43 @@
-"""``volcomp controllers``, ``machines``, ``effects`` and ``instruments``: what is there."""
+"""``volcomp controllers``, ``machines``, ``effects``, ``instruments``: what is available. ``volcomp import``: foreign files."""
 
 from __future__ import annotations
 
 import inspect
 import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import click
+import numpy as np
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from compgen.cli.common import json_option, open_machine, print_json, stdout
-from compgen.controllers import CONTROLLERS
-from compgen.core.machine import machine_files
-from compgen.core.names import AXES
-from compgen.core.plugins import Kind
-from compgen.core.text import nearest
+from compgen.cli.common import PATH, json_option, print_json
+from compgen.cli.shared_options import open_machine, option_name, options_of
+from compgen.cli.terminal import answer, say, stdout
+from compgen.controls import CONTROLLERS
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.deviations import Deviations
+from compgen.data.error_table import ErrorTable
+from compgen.data.files import OutputFolder, read_text
+from compgen.data.lengths import Lengths
+from compgen.data.machine import Machine, machine_files
+from compgen.data.messages import nearest
+from compgen.data.names import AXES, error_named
+from compgen.data.registry import Kind
 from compgen.effects import ANY_STATION, FAMILIES, catalogue, listed
-from compgen.effects.of_machine import STATION_NAME
+from compgen.effects.catalogue import STATION_NAME
 from compgen.errors import CompgenWarning, InputError
-from compgen.export import Format, load_format
-from compgen.export.card import control_card
-from compgen.model import modelled_errors
+from compgen.foreign import ImportOptions, describe_native, import_file, native_format
+from compgen.kinematics import modelled_errors
 from compgen.plugins import CONTROLS, EFFECT_FAMILIES, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS
-from compgen.report.card_text import card_text
-from compgen.report.effects_text import card_summary, effect_card_text
+from compgen.report.cards import card_summary, card_text, control_card, effect_card_text
+from compgen.tables import Format, load_format
+
+# ``volcomp controllers``, ``machines``, ``effects`` and ``instruments``: what is there.
 
 
 @click.command("controllers")
@@ -36,14 +48,15 @@ def controllers_command(name: str | None, as_json: bool) -> int:
 
     With NAME: the card of one control: what it can express, the settings of the machine file (units in their names:
     mm, um) with defaults, limits, sources, and what no public document settles. Nothing is computed; the units of each
-    control's numbers (mm, rad, counts) stand in its preflight.md.
+    control's numbers (mm, rad, counts) are in its preflight.md.
 
     \b
     Example:
       volcomp controllers siemens-cec
     """
     if name is not None:
-        _show_card(name, as_json)
+        shown, origin = control_card(name), CONTROLS.origins.get(name)
+        answer(as_json, {**shown.summary(), "plugin": origin}, card_text(shown, origin))
         return 0
     cards = [load_format(known) for known in sorted(CONTROLLERS)]
     if as_json:
@@ -55,14 +68,6 @@ def controllers_command(name: str | None, as_json: bool) -> int:
         table.add_row(card.name, card.title, card.expresses, f"{card.evidence}{', plug-in' if origin else ''}")
     stdout.print(table)
     return 0
-
-
-def _show_card(name: str, as_json: bool) -> None:
-    card, origin = control_card(name), CONTROLS.origins.get(name)
-    if as_json:
-        print_json({**card.summary(), "plugin": origin})
-    else:
-        stdout.print(card_text(card, origin))
 
 
 def _listed(card: Format) -> dict[str, object]:
@@ -80,7 +85,7 @@ def _listed(card: Format) -> dict[str, object]:
 @click.argument("name", required=False, metavar="[NAME]")
 @json_option
 def effects_command(name: str | None, as_json: bool) -> int:
-    """List the effects beside the geometric errors: what diagnose looks for, simulate makes, and a machine file may name.
+    """List the effects other than the geometric errors: what diagnose looks for, simulate makes, and a machine file may name.
 
     With NAME: the card of one effect: equation, source, columns that it needs, parameters (units in their names: um, urad,
     ppm), what data may confuse it with, and the measurement that separates them. Effects of plug-ins are listed too.
@@ -123,11 +128,12 @@ def _show_effect(name: str, as_json: bool) -> None:
     stations = [match.group(1)] if (match := STATION_NAME.fullmatch(name)) else [ANY_STATION]
     known, origin = catalogue(stations), _effect_origins().get(name)
     if name not in known:
-        raise InputError(f"{name!r} is no effect; {nearest(name, [*listed(), *SIMULATED_EFFECTS.registry])}")
-    if as_json:
-        print_json({"name": name, **card_summary(known[name].card), "plugin": origin})
-    else:
-        stdout.print(effect_card_text(known[name].card, origin), markup=False, highlight=False, soft_wrap=True)
+        raise InputError(f"{name!r} is not an effect; {nearest(name, [*listed(), *SIMULATED_EFFECTS.registry])}")
+    answer(
+        as_json,
+        {"name": name, **card_summary(known[name].card), "plugin": origin},
+        effect_card_text(known[name].card, origin),
+    )
 
 
 @click.command("instruments")
@@ -139,19 +145,11 @@ def instruments_command(as_json: bool) -> int:
     Example:
       volcomp instruments
     """
-    return _list_readers(SIMULATED_INSTRUMENTS, as_json)
-
-
-def _list_readers(kind: Kind, as_json: bool) -> int:
-    """Print what a registry of readers holds: the first line of each docstring, and the plug-in that it came from."""
-    rows = _readers(kind)
-    if as_json:
-        print_json(rows)
-        return 0
+    rows = _readers(SIMULATED_INSTRUMENTS)
     table = Table("name", "what it is", "from", box=box.SIMPLE)
     for name, row in rows.items():
         table.add_row(name, Text(row["title"] or ""), Text(row["plugin"] or "built in", overflow="fold"))
-    stdout.print(table if rows else f"no {kind.word} is built in; --plugin PATH adds some")
+    answer(as_json, rows, table)
     return 0
 
 
@@ -164,7 +162,7 @@ def _readers(kind: Kind) -> dict[str, dict[str, str | None]]:
 
 
 @click.command("machines")
-@click.option("--machines", multiple=True, type=click.Path(path_type=Path), help="Further folder with machine files.")
+@click.option("--machines", multiple=True, type=PATH, help="Additional folder with machine files.")
 @json_option
 def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
     """List the machines with their travel (mm): the shipped ones, those in ./machines, and those in --machines folders.
@@ -189,11 +187,133 @@ def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
         table.add_row(name, machine.chain.name, travel, str(len(names)), str(path))
         ranges = {letter: list(axis.range_mm) for letter, axis in zip(AXES, machine.axes, strict=True)}
         listing[name] = {"chain": machine.chain.name, "range_mm": ranges, "errors": list(names), "file": str(path)}
-    if as_json:
-        print_json(listing)
-    else:
-        stdout.print(table)
+    answer(as_json, listing, table)
     return 0
 
 
-COMMANDS = (controllers_command, machines_command, effects_command, instruments_command)
+# ``volcomp import``: what a foreign file holds, before anything is computed, and its contract file.
+
+
+@click.command("import")
+@click.argument("file", type=PATH)
+@options_of(ImportOptions, "given")
+@click.option("--machine", metavar="MACHINE", help="Machine whose travel the positions are checked against.")
+@click.option(
+    "--machines", multiple=True, type=PATH, help="Additional folder with machine files (may be given several times)."
+)
+@click.option("--out", metavar="DIR", type=PATH, help="Folder for the contract file; without it nothing is written.")
+@json_option
+def import_command(
+    file: Path,
+    given: ImportOptions,
+    machine: str | None,
+    machines: tuple[Path, ...],
+    out: Path | None,
+    as_json: bool,
+) -> int:
+    """Show what a measurement or error file of another program holds, and write it as a contract file.
+
+    Renishaw .rtl, .rta, .rts (text) and .rtx (captures), Etalon exchange files, ISO 230-2 .dat files of ecmc, tables as
+    text (any separator, decimal comma or point) and Excel workbooks (.xlsx). Shown are axis, targets, runs,
+    directions, unit, sign, instrument, and what the file leaves open. Deviations are measured minus commanded; units in
+    the written file are mm, um and urad. A file of compgen's own format is shown as well, and copied with --out. Nothing is
+    written while a question is open: answer it by an option. Exit code 2 then, if --out was given.
+
+    \b
+    Example:
+      volcomp import x-axis.rtl --machine zha-gantry --out imported/
+    """
+    target = OutputFolder(out) if out is not None else None
+    kind = native_format(file)
+    known = None if machine is None else open_machine(machine, machines)
+    data: object
+    if kind is not None:
+        answered = [item for item in fields(given) if getattr(given, item.name)]
+        if answered:
+            message = f"is already in compgen's own format ({kind}); nothing is converted, so this option has no effect"
+            raise InputError(message, file=file, field=option_name(answered[0]))
+        understood, data = describe_native(file, kind)
+        note = "is already in compgen's own format: the other commands read it directly"
+        summary: dict[str, Any] = {"file": str(file), "format": "compgen", "kind": kind, "understood": understood, "doubts": [],
+                   "notes": [note]}  # fmt: skip
+    else:
+        item = import_file(file, given)
+        summary, data = item.summary(), item.data
+    against = [] if known is None else outside_travel(known, data)
+    summary = {**summary, "machine": _machine_summary(known, against), "files": []}
+    if target is not None and not summary["doubts"] and not against:
+        for name, text in {file.name: read_text(file)}.items() if kind is not None else item.files().items():
+            target.add(name, text)
+        summary["files"] = [str(path) for path in target.commit().values()]
+    if as_json:
+        print_json(summary)
+    else:
+        _show(summary)
+    return 2 if against or (target is not None and summary["doubts"]) else 0
+
+
+def _machine_summary(machine: Machine | None, against: Sequence[str]) -> dict[str, Any] | None:
+    return None if machine is None else {"name": machine.name, "outside": list(against)}
+
+
+def outside_travel(machine: Machine, data: object) -> list[str]:
+    """Say which positions of an imported file lie outside the travel of a machine, one line for each axis."""
+    found = []
+    for axis, values in _positions(data).items():
+        low, high = machine.axes[axis].range_mm
+        if len(values) and (values.min() < low - 1e-3 or values.max() > high + 1e-3):
+            found.append(
+                f"positions of {AXES[axis]} go from {values.min():g} to {values.max():g} mm, the travel of {machine.name} from "
+                f"{low:g} to {high:g} mm: another unit, zero or axis?"
+            )
+    return found
+
+
+def _positions(data: object) -> dict[int, np.ndarray]:
+    if isinstance(data, AxisRuns):
+        return {axis: data.position_mm[data.axis == axis] for axis in data.axes}
+    if isinstance(data, Lengths | Deviations):
+        return {axis: data.position_mm[:, axis] for axis in range(3)}
+    if isinstance(data, ErrorTable):
+        ends = [(error_named(name).axis, curve.position_mm) for name, curve in data.curves.items()]
+        return {axis: np.concatenate([values for k, values in ends if k == axis]) for axis in {k for k, _ in ends}}
+    return {}
+
+
+def _show(summary: Mapping[str, Any]) -> None:
+    say(f"{summary['file']}: {summary['format']}, {summary['kind']}")
+    for line in _lines(summary["understood"]):
+        say(f"  {line}")
+    for text in summary["notes"]:
+        say(f"note: {_printable(text)}")
+    for text in (summary["machine"] or {}).get("outside", []):
+        say(f"outside: {text}", style="red")
+    for text in summary["doubts"]:
+        say(f"open: {_printable(text)}", style="yellow")
+    for path in summary["files"]:
+        say(f"  {path}")
+    if summary["doubts"]:
+        say("nothing is written while questions are open; answer them by options")
+
+
+def _lines(facts: Mapping[str, Any], depth: int = 0) -> list[str]:
+    found = []
+    for key, value in facts.items():
+        if isinstance(value, Mapping):
+            found.append(f"{'  ' * depth}{_printable(key)}:")
+            found += _lines(value, depth + 1)
+        elif value is not None:
+            text = f"{value:.6g}" if isinstance(value, float) else _flat(value)
+            found.append(f"{'  ' * depth}{_printable(key)}: {text}")
+    return found
+
+
+def _flat(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return _printable(", ".join(f"{item:g}" if isinstance(item, float) else str(item) for item in value))
+    return _printable(value)
+
+
+def _printable(value: Any) -> str:
+    """Return text of a user's file on one line, in its own script, without control characters."""
+    return "".join(char if char.isprintable() else "?" for char in " ".join(str(value).split()))

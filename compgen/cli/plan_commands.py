@@ -1,8 +1,9 @@
-"""``volcomp plan``."""
+"""``volcomp plan``, ``simulate`` and ``predict``: before anything is measured."""
 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -10,21 +11,25 @@ from typing import Any, cast
 import click
 import numpy as np
 
-from compgen.cli.common import NUMBER, json_option, machine_argument, out_option, print_json, progress, stdout
-from compgen.core.error_table import format_errors
-from compgen.core.files import OutputFolder
-from compgen.core.machine import Machine
-from compgen.core.points import Points, format_points, read_points
-from compgen.errors import InputError
-from compgen.identify import IdentifyOptions
-from compgen.identify.noise import ReadingNoise
+from compgen.cli.common import NUMBER, PATH, json_option, out_option, print_json
+from compgen.cli.shared_options import machine_argument, options_of
+from compgen.cli.terminal import answer, progress, say, say_paths, stdout
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable, format_errors
+from compgen.data.files import OutputFolder, write_file
+from compgen.data.lengths import Points, format_points, read_points
+from compgen.data.machine import Machine
+from compgen.effects import active_effects, displacement_of, readings_of_points
+from compgen.errors import CompgenWarning, InputError
+from compgen.foreign import open_errors
+from compgen.identify import Covariance, IdentifyOptions, predict_uncertainty, read_covariance
+from compgen.kinematics import predict
 from compgen.plan import (
     Box,
-    Candidate,
     Plan,
-    PlannedStations,
     PlanVisibility,
     Suggestion,
+    TrajectoryCandidate,
     box_from_text,
     format_stations,
     judge_trajectories,
@@ -38,36 +43,50 @@ from compgen.plan import (
     suggest,
 )
 from compgen.plan.suggest import DEFAULT_EVALUATIONS, Criterion
-from compgen.report.plan_text import plan_table, suggestion_table, trajectory_table, visibility_table
+from compgen.report.terminal import plan_table, suggestion_table, trajectory_table, visibility_table
+from compgen.simulate import (
+    AxisLaser,
+    AxisSimulation,
+    DiagonalLaser,
+    SimulatedSixDof,
+    Simulation,
+    SixDofSimulation,
+    read_scenario,
+    simulate,
+    simulate_axis_runs,
+    simulate_sixdof,
+    write_simulation,
+)
+from compgen.tables import residuals
+
+# ``volcomp plan``.
+
 
 Progress = Callable[[str], None]
 
 
 @click.command("plan")
 @machine_argument
-@click.option("--stations", required=True, type=click.Path(path_type=Path), help="CSV: station, x_mm, y_mm, z_mm.")
-@click.option(
-    "--points", type=click.Path(path_type=Path), help="*.points.csv (mm); a point that stands twice is read twice."
-)
+@click.option("--stations", required=True, type=PATH, help="CSV: station, x_mm, y_mm, z_mm.")
+@click.option("--points", type=PATH, help="*.points.csv (mm); a point listed twice is measured twice.")
 @click.option("--grid", is_flag=True, help="All nodes of the machine as points, in place of --points.")
-@click.option("--u-length-um", type=NUMBER, help="Constant part of the standard uncertainty of a length, um.")
-@click.option("--u-length-um-per-m", type=NUMBER, help="Part of it that grows with the length, um/m.")
+@options_of(IdentifyOptions, "readings", only=("u_length_um", "u_length_um_per_m"))
 @click.option("--suggest", "search", is_flag=True, help="Search better places for the stations.")
 @click.option(
-    "--box", multiple=True, metavar="LABEL:XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX", help="Where a station may stand, mm."
+    "--box", multiple=True, metavar="LABEL:XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX", help="Where a station may be placed, mm."
 )
-@click.option("--boxes", type=click.Path(path_type=Path), help="CSV: station, x_min_mm, x_max_mm, ... z_max_mm.")
+@click.option("--boxes", type=PATH, help="CSV: station, x_min_mm, x_max_mm, ... z_max_mm.")
 @click.option(
     "--criterion",
     type=click.Choice(["worst", "rms"]),
     default="worst",
-    help="What the search lowers: the worst or the rms standard uncertainty of E over the volume (default: worst).",
+    help="What the search minimises: the worst or the rms standard uncertainty of E over the volume (default: worst).",
 )
 @click.option(
     "--evaluations",
     type=click.IntRange(min=2),
     default=DEFAULT_EVALUATIONS,
-    help=f"Arrangements that the search looks at (default: {DEFAULT_EVALUATIONS}).",
+    help=f"Arrangements that the search evaluates (default: {DEFAULT_EVALUATIONS}).",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=1, help="Seed of the search (default: 1).")
 @click.option("--target-um", type=NUMBER, help="Propose the smallest trajectory whose worst u of E is below this, um.")
@@ -78,8 +97,7 @@ def plan_command(
     stations: Path,
     points: Path | None,
     grid: bool,
-    u_length_um: float | None,
-    u_length_um_per_m: float | None,
+    readings: IdentifyOptions,
     search: bool,
     box: tuple[str, ...],
     boxes: Path | None,
@@ -93,16 +111,16 @@ def plan_command(
     """Plan a measurement: what it will determine, and how well, before anything is measured.
 
     Writes plan.json and plan.errors.csv (um, urad; values zero, u_value predicted) to DIR, with --suggest also
-    suggested.stations.csv, with --target-um proposed.points.csv (mm). Says which effects beside the geometric errors the plan
-    can never see (volcomp effects), and what to measure in addition. Without --u-length-um 0.1 um + 0.15 um/m is
-    assumed. Exit code 1 if an unknown is not determined, or no trajectory reaches the target.
+    suggested.stations.csv, with --target-um proposed.points.csv (mm). Names the effects other than the geometric errors
+    that the plan can never see (volcomp effects), and what to measure in addition. Without --u-length-um
+    0.1 um + 0.15 um/m is assumed. Exit code 1 if an unknown is not determined, or no trajectory reaches the target.
 
     \b
     Example:
       volcomp plan zha-gantry --stations identified/stations.csv --grid --out plan/
     """
     OutputFolder(out)
-    noise = planned_noise(IdentifyOptions(u_length_um, u_length_um_per_m))
+    noise = planned_noise(readings)
     given, where = read_stations(stations), _points(machine, points, grid=grid)
     allowed = _boxes(box, boxes, search=search)
     regions = regions_of(machine, given, allowed)
@@ -116,24 +134,19 @@ def plan_command(
             kind = cast(Criterion, criterion)
             suggestion = suggest(setup, regions, criterion=kind, evaluations=evaluations, seed=seed, progress=show)
         best = suggestion.plan.planned.stations if suggestion else given
-        judged = None if target_um is None else _judged(machine, best, noise, target_um, show)
+        judged = (
+            None if target_um is None else judge_trajectories(machine, best, noise, target_um=target_um, progress=show)
+        )
     summary = _write(out, result, visible, suggestion, judged, target_um)
-    if as_json:
-        print_json(summary)
-    else:
-        _show(result, suggestion, judged, target_um)
-        stdout.print(visibility_table(visible))
+    shown = [plan_table(result), *([suggestion_table(suggestion)] if suggestion else [])]
+    if judged is not None and target_um is not None:
+        shown.append(trajectory_table(*judged, target_um))
+    answer(as_json, summary, *shown, visibility_table(visible))
     reached = judged is None or judged[1] is not None
     return 0 if result.determined and reached else 1
 
 
-Judged = tuple[list[Candidate], Candidate | None]
-
-
-def _judged(
-    machine: Machine, stations: PlannedStations, noise: ReadingNoise, target_um: float, show: Progress
-) -> Judged:
-    return judge_trajectories(machine, stations, noise, target_um=target_um, progress=show)
+Judged = tuple[list[TrajectoryCandidate], TrajectoryCandidate | None]
 
 
 def _points(machine: Machine, points: Path | None, *, grid: bool) -> Points:
@@ -147,7 +160,7 @@ def _points(machine: Machine, points: Path | None, *, grid: bool) -> Points:
 
 def _boxes(box: tuple[str, ...], boxes: Path | None, *, search: bool) -> dict[str, Box]:
     if (box or boxes) and not search:
-        raise InputError("--box and --boxes say where --suggest may place a station; give --suggest as well")
+        raise InputError("--box and --boxes need --suggest: they say where it may place a station")
     found = read_boxes(boxes) if boxes else {}
     for text in box:
         label, where = box_from_text(text)
@@ -186,12 +199,118 @@ def _write(
     return summary
 
 
-def _show(result: Plan, suggestion: Suggestion | None, judged: Judged | None, target_um: float | None) -> None:
-    stdout.print(plan_table(result))
-    if suggestion is not None:
-        stdout.print(suggestion_table(suggestion))
-    if judged is not None and target_um is not None:
-        stdout.print(trajectory_table(*judged, target_um))
+# ``volcomp simulate`` and ``volcomp predict``.
 
 
-COMMANDS = (plan_command,)
+@click.command("simulate")
+@machine_argument
+@click.option("--scenario", required=True, type=PATH, help="Scenario TOML; see docs/files.md.")
+@out_option
+@click.option("--seed", type=click.IntRange(min=0), help="Seed; default: that of the scenario.")
+@json_option
+def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | None, as_json: bool) -> int:
+    """Simulate a machine and its measurement: writes *.lengths.csv (mm) and truth.errors.csv (um, urad) to DIR.
+
+    A scenario whose instrument has type = "sixdof" writes *.sixdof.csv in place of lengths, one with "axis-laser"
+    *.axis.csv, with "diagonal-laser" *.diagonals.csv (um).
+
+    \b
+    Example:
+      volcomp simulate zha-gantry --scenario examples/zha-gantry.scenario.toml --out simulated/
+    """
+    with progress(quiet=as_json) as show:
+        show("simulating")
+        planned = read_scenario(scenario)
+        simulation: Simulation | SixDofSimulation | AxisSimulation
+        if isinstance(planned.instrument, AxisLaser | DiagonalLaser):
+            simulation = simulate_axis_runs(machine, planned, seed)
+        elif isinstance(planned.instrument, SimulatedSixDof):
+            simulation = simulate_sixdof(machine, planned, seed)
+        else:
+            simulation = simulate(machine, planned, seed)
+    paths = write_simulation(simulation, out)
+    if as_json:
+        if isinstance(simulation, SixDofSimulation | AxisSimulation):
+            summary = {"readings": len(simulation.readings), "stations": []}
+        else:
+            summary = {"readings": len(simulation.lengths), "stations": list(simulation.lengths.stations)}
+        print_json({**summary, "files": {name: str(path) for name, path in paths.items()}})
+    else:
+        say_paths(paths.values())
+    return 0
+
+
+@click.command("predict")
+@machine_argument
+@click.argument("errors", type=PATH)
+@click.option("--points", required=True, type=PATH, help="*.points.csv (mm).")
+@click.option("--out", required=True, metavar="FILE", type=PATH, help="CSV file for the result.")
+@click.option("--exact", is_flag=True, help="Finite rotations along the chain in place of E = C P.")
+@click.option(
+    "--uncertainty",
+    is_flag=False,
+    flag_value="",
+    metavar="[FILE]",
+    help="Add standard uncertainties; FILE is the covariance (default: the file that ERRORS names).",
+)
+@json_option
+def predict_command(
+    machine: Machine, errors: Path, points: Path, out: Path, exact: bool, uncertainty: str | None, as_json: bool
+) -> int:
+    """Predict the error of the tool tip at given points: E = C P, or the exact model.
+
+    ERRORS is an *.errors.csv file (um, urad). With --exact the effects of the machine file that move the tip are added
+    where the points hold their columns (approach_x ..., temp_..., time_s, feed_mm_min, load_kg). FILE gets the points plus
+    ex_um, ey_um, ez_um, and with --uncertainty
+    u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that volcomp identify wrote.
+
+    \b
+    Example:
+      volcomp predict zha-gantry fitted/fitted.errors.csv --points p.points.csv --out predicted.csv
+    """
+    where = read_points(points)
+    table = open_errors(errors)
+    covariance = None if uncertainty is None else _covariance(errors, table, uncertainty)
+    error_mm = predict(machine, table, where, exact=exact)
+    if exact:
+        error_mm = error_mm + _effects_mm(machine, where)
+    columns = {f"e{axis}_um": error_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
+    extra: dict[str, float] = {}
+    if covariance is not None:
+        u_um = predict_uncertainty(machine, covariance, where) * 1e3
+        columns |= {f"u_{axis}_um": u_um[:, k] for k, axis in enumerate("xyz")}
+        extra = {f"u_{axis}_max_um": float(u_um[:, k].max()) for k, axis in enumerate("xyz")}
+    model = "exact" if exact else "E = C P"
+    write_file(out, format_points(where, columns, {"machine": machine.name, "model": model}))
+    figures = residuals(error_mm)
+    if as_json:
+        print_json({"points": len(where), "model": model, **figures.as_dict(), **extra, "file": str(out)})
+    else:
+        text = f"{len(where)} points, {model}: max {figures.max_um:.2f} um, rms {figures.rms_um:.2f} um -> {out}"
+        say(text)
+        if extra:
+            stdout.print(f"largest standard uncertainty: x, y, z {', '.join(f'{u:.3f}' for u in extra.values())} um")
+    return 0
+
+
+def _effects_mm(machine: Machine, points: Points) -> FloatArray:
+    """How the effects of the machine file move the tip at the points, (n, 3), mm; warns of columns that are missing."""
+    moved_mm, missing = displacement_of(active_effects(machine), readings_of_points(machine, points))
+    if missing:
+        message = f"the points lack the columns of {', '.join(missing)}: left out (volcomp effects NAME lists them)"
+        warnings.warn(message, CompgenWarning, stacklevel=2)
+    return moved_mm
+
+
+def _covariance(errors: Path, table: ErrorTable, file: str) -> Covariance:
+    """Return the covariance of an errors file: the one given, else the one that the errors file names."""
+    if file:
+        return read_covariance(file, errors)
+    name = table.metadata.get("covariance")
+    if name is None:
+        raise InputError(
+            "names no covariance file (# covariance = ...), so --uncertainty knows none; only the files of compgen "
+            "identify and run have one: give it by --uncertainty FILE",
+            file=errors,
+        )
+    return read_covariance(errors.parent / name, errors)

@@ -1,58 +1,139 @@
-"""``volcomp run``: the whole chain."""
+"""``volcomp run`` and ``report``: the whole chain, and its report."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
-from compgen.cli.common import (
+from compgen.cli.common import PATH, json_option, out_option, print_json
+from compgen.cli.shared_options import (
+    active_options,
     controller_option,
-    json_option,
-    machine_argument,
-    out_option,
-    print_json,
-    progress,
-    stdout,
-)
-from compgen.cli.emphasis_options import emphasis_options
-from compgen.cli.fit_options import fitting_options
-from compgen.cli.identify_commands import (
+    emphasis_options,
+    explain_option,
+    fitting_options,
     identify_options,
-    instrument_options,
-    method_options,
-    sixdof_option,
-    systematic_options,
+    instrument_option,
+    limits_option,
+    machine_argument,
+    measurements_argument,
+    sample_options,
+    templates_option,
+    unverified_option,
 )
-from compgen.cli.options_commands import explain_option, explain_run
-from compgen.cli.report_commands import report_beside
-from compgen.cli.safety_options import active_options, limits_option
-from compgen.cli.sample_options import sample_options
-from compgen.core.machine import Machine
+from compgen.cli.table_commands import explain_run
+from compgen.cli.terminal import progress, say, say_paths, stdout
+from compgen.data.files import OutputFolder
+from compgen.data.machine import Machine
+from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions
-from compgen.identify import SystematicInputs
+from compgen.identify import IdentifyOptions
 from compgen.pipeline import run
-from compgen.report.text import identification_table, run_json, verification_table
-from compgen.verify.active import ActiveTables
-from compgen.verify.safety import SafetyLimits
+from compgen.report.terminal import identification_table, run_json, verification_table
+from compgen.tables.active import ActiveTables
+from compgen.tables.safety import SafetyLimits
+
+if TYPE_CHECKING:
+    from compgen.report.html.write import Further
+
+
+# ``volcomp report``.
+
+
+@click.command("report")
+@click.argument("folder", metavar="DIR", type=PATH)
+@click.option("--out", metavar="DIR", type=PATH, help="Folder for the report; default: DIR itself.")
+@click.option(
+    "--dcc",
+    "certificate",
+    metavar="FILE",
+    type=PATH,
+    help="Laboratory, customer, persons, dates (TOML): write dcc.xml too; default: DIR/certificate.toml if there.",
+)
+@click.option(
+    "--dcc-schema",
+    "schema",
+    metavar="FILE",
+    type=PATH,
+    help="dcc.xsd of PTB on this disk: write dcc.xml only if it is valid by it.",
+)
+@json_option
+def report_command(folder: Path, out: Path | None, certificate: Path | None, schema: Path | None, as_json: bool) -> int:
+    """Make the report of a folder that run, identify, verify or compare wrote, from its files alone.
+
+    Writes report.html (one file, no network; print it to PDF from a browser), report.json (its numbers), dossier.md and
+    dossier.json (documentation), calibration.json (results in the order of a calibration certificate), and with --dcc
+    dcc.xml (Digital Calibration Certificate). Lengths in mm, errors in um and urad.
+
+    \b
+    Example:
+      volcomp report tables/ --dcc certificate.toml --dcc-schema dcc.xsd
+    """
+    from compgen.report.html import write_report
+    from compgen.report.html.write import short_text
+
+    OutputFolder(out or folder)
+    also, remark = _certificate(folder, certificate, schema)
+    with progress(quiet=as_json) as show:
+        show("drawing the report")
+        report, paths = write_report(folder, out, also)
+    if as_json:
+        print_json({**report.data, "paths": [str(path) for path in paths.values()]})
+        return 0
+    stdout.print(short_text(report.data))
+    say_paths(paths.values())
+    if remark:
+        say(remark)
+    return 0
+
+
+def _certificate(folder: Path, certificate: Path | None, schema: Path | None) -> tuple[Further | None, str]:
+    """What makes dcc.xml, and a line about it; None where no certificate is requested."""
+    beside = folder / "certificate.toml"
+    source = certificate or (beside if beside.is_file() else None)
+    if source is None:
+        if schema is not None:
+            raise InputError("--dcc-schema needs a certificate; give its data with --dcc certificate.toml")
+        return None, ""
+    from compgen.report.dcc import NEWEST, certificate_files, read_certificate, read_schema
+
+    options = read_certificate(source)
+    rules = None if schema is None else read_schema(schema)
+    remark = f"dcc.xml: DCC {NEWEST}, not checked against the schema; --dcc-schema dcc.xsd does that"
+    if rules is not None:
+        remark = f"dcc.xml: DCC {rules.version}, valid by {rules.path}"
+    return (lambda data: certificate_files(data, options, rules)), remark
+
+
+def report_beside(folder: Path) -> Path | None:
+    """Write the report of a finished command into its folder; a report that fails does not undo the result."""
+    from compgen.report.html import write_report
+
+    try:
+        return write_report(folder)[1]["report.html"]
+    except InputError as error:
+        warnings.warn(f"the report could not be made: {error}", CompgenWarning, stacklevel=2)
+        return None
+
+
+# ``volcomp run``: the whole chain.
 
 
 @click.command("run")
 @machine_argument
 @emphasis_options
-@click.argument("measurements", nargs=-1, required=True, type=click.Path(path_type=Path))
+@measurements_argument
 @controller_option(multiple=True)
 @sample_options
-@sixdof_option
+@instrument_option
 @out_option
-@instrument_options
-@systematic_options
-@method_options
+@identify_options
 @fitting_options
-@click.option("--templates", type=click.Path(path_type=Path), help="Folder of your own templates, searched first.")
-@click.option("--allow-unverified", is_flag=True, help="Export formats that no public document fully describes.")
+@templates_option
+@unverified_option
 @active_options()
 @limits_option
 @click.option(
@@ -70,11 +151,7 @@ def run_command(
     controller: tuple[str, ...],
     instrument: Path | None,
     out: Path,
-    u_length_um: float | None,
-    u_length_um_per_m: float | None,
-    keep_all: bool,
-    systematic: SystematicInputs,
-    choices: Mapping[str, Any],
+    options: IdentifyOptions,
     fitting: FitOptions,
     templates: Path | None,
     allow_unverified: bool,
@@ -101,7 +178,7 @@ def run_command(
             measurements,
             tuple(dict.fromkeys(controller)),
             out,
-            identify_options=identify_options(u_length_um, u_length_um_per_m, keep_all, systematic, choices),
+            identify_options=options,
             fit_options=fitting,
             templates=templates,
             allow_unverified=allow_unverified,
@@ -125,11 +202,7 @@ def run_command(
         stdout.print(identification_table(result.identification))
         stdout.print(verification_table([item.verification for item in result.results]))
         for item in result.results:
-            for path in item.paths:
-                stdout.print(f"  {path}", markup=False, soft_wrap=True)
+            say_paths(item.paths)
         if report is not None:
-            stdout.print(f"  {report}", markup=False, soft_wrap=True)
+            say(f"  {report}")
     return 0 if result.accepted else 1
-
-
-COMMANDS = (run_command,)

@@ -2,6 +2,6 @@
 
 from compgen.diagnose.axis_diagnosis import AxisDiagnosis
 from compgen.diagnose.diagnose import DiagnoseOptions, diagnose
-from compgen.diagnose.result import Diagnosis
+from compgen.diagnose.diagnosis import Diagnosis
 
 __all__ = ["AxisDiagnosis", "DiagnoseOptions", "Diagnosis", "diagnose"]

@@ -1,4 +1,4 @@
-"""The diagnosis of one measurement up to the chosen set: base fit, noise, groups, search, evidence."""
+"""The diagnosis of one measurement up to the chosen set, with lack of fit and homogeneity."""
 
 from __future__ import annotations
 
@@ -7,21 +7,208 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from compgen.core.csvio import FloatArray
-from compgen.diagnose.base import BaseFit
-from compgen.diagnose.base_choice import Wider, widened, wider_of
-from compgen.diagnose.evidence import RUN_RATIO, Evidence, evidence_of
-from compgen.diagnose.generic import base_groups, generic_groups
-from compgen.diagnose.groups import Group, named_groups
-from compgen.diagnose.noise import Noise
-from compgen.diagnose.noise_fit import noise_of, run_ratio
-from compgen.diagnose.scene import Scene, scene_of
-from compgen.diagnose.search import Chosen, Rules, beside, gains, rules_of, search
-from compgen.diagnose.whiten import whitener
+from compgen.data.csv_files import FloatArray
+from compgen.diagnose.base_fit import BaseFit, legendre
+from compgen.diagnose.groups import (
+    Group,
+    Wider,
+    base_groups,
+    covariates_of,
+    generic_groups,
+    named_groups,
+    widened,
+    wider_of,
+)
+from compgen.diagnose.layout import MeasurementLayout
+from compgen.diagnose.noise_model import Noise, has_repeats, noise_of, run_ratio, whitener
+from compgen.diagnose.search import (
+    Chosen,
+    Design,
+    Rules,
+    design_of,
+    gain_of,
+    gains,
+    orthonormal,
+    remainder_of,
+    rules_of,
+    search,
+)
+
+# What speaks for and against a set of groups: lack of fit, what is left over, changes from run to run, homogeneity.
+
+
+#: Limits: standard normal deviate of the lack of fit, likelihood ratio of runs, p-value of the homogeneity.
+LACK_OF_FIT_Z = 3.0
+RUN_RATIO = 12.0
+HOMOGENEITY_P = 2e-3
+#: Evidence of the best remaining generic group, in units of the criterion beyond its handicap.
+DIRECTED, DIRECTED_SLOW = 20.0, 26.0
+
+
+@dataclass(frozen=True)
+class Remaining:
+    """A generic group that is left over, with its evidence (2 log, without handicap)."""
+
+    group: int
+    evidence: float
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence for a set.
+
+    Parameters
+    ----------
+    lack_of_fit_z : deviate of the global lack of fit against pure error; nan without repeats.
+    directed : generic groups that are left over, best first.
+    run_ratio : likelihood ratio of what changes from run to run.
+    homogeneity_p : p-value of every named member, by its group.
+    uneven : chi-square that the unevenness of every named member explains, by its group.
+    chi2 : drop-one chi-square of every member, by its group.
+    excess : residual sum of squares beyond its expectation.
+    """
+
+    lack_of_fit_z: float
+    directed: tuple[Remaining, ...]
+    run_ratio: float
+    homogeneity_p: dict[int, float]
+    uneven: dict[int, float]
+    chi2: dict[int, float]
+    excess: float
+
+    @property
+    def misfits(self) -> bool:
+        """Whether the set leaves something that the noise does not explain."""
+        return bool(self.lack_of_fit_z > LACK_OF_FIT_Z) or bool(self.directed)
+
+    @property
+    def changes_between_runs(self) -> bool:
+        """Whether repeats of a line differ by more than the noise within them."""
+        return self.run_ratio > RUN_RATIO
+
+
+def evidence_of(design: Design, chosen: Chosen, noise: Noise, ratio: float, layout: MeasurementLayout) -> Evidence:
+    """Collect the evidence for a chosen set."""
+    size = len(design.coordinates(chosen.members))
+    left = design.total - chosen.chi2
+    named = [g for g in chosen.members if design.groups[g].tier == "named"]
+    chi2 = {g: gain_of(design, [m for m in chosen.members if m != g], g) for g in chosen.members}
+    even = {g: homogeneity(design, chosen, g, layout) for g in named}
+    return Evidence(
+        _lack_of_fit(left, design.freedom - size, noise),
+        _directed(design, chosen),
+        ratio,
+        {g: p for g, (p, _) in even.items()},
+        {g: gained for g, (_, gained) in even.items()},
+        chi2,
+        left - (design.freedom - size),
+    )
+
+
+def _lack_of_fit(left: float, freedom: int, noise: Noise) -> float:
+    """Deviate of the F-test of what the set leaves, against the pure error of the repeats."""
+    from scipy.stats import f as f_distribution
+    from scipy.stats import norm
+
+    if noise.freedom <= 0 or freedom <= noise.freedom:
+        return float("nan")
+    ratio = (left - noise.quadratic) / (freedom - noise.freedom) / (noise.quadratic / noise.freedom)
+    if ratio <= 0:
+        return -10.0
+    p = float(f_distribution.sf(ratio, freedom - noise.freedom, noise.freedom))
+    return float(norm.isf(p)) if p > 0 else 40.0
+
+
+def _directed(design: Design, chosen: Chosen) -> tuple[Remaining, ...]:
+    """Generic groups with more evidence left than chance gives."""
+    wanted = [
+        g
+        for g, group in enumerate(design.groups)
+        if group.tier == "generic" and g not in chosen.members and design.size(g)
+    ]
+    gained = gains(design, remainder_of(design, chosen.members), wanted)
+    found = []
+    for g, chi2 in zip(wanted, gained, strict=True):
+        k = design.size(g)
+        evidence = float(chi2 - k - k * np.log(max(chi2 / k, 1.0)))
+        if evidence > (DIRECTED_SLOW if design.groups[g].slow else DIRECTED):
+            found.append(Remaining(g, evidence))
+    return tuple(sorted(found, key=lambda item: -item.evidence))
+
+
+def contribution(design: Design, chosen: Chosen, member: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Parameters (k,) of a member fitted together with the others, their covariance (k, k), and its raw contribution (n,)."""
+    index = design.coordinates(chosen.members)
+    solution, inverse = _solved(design.rows(chosen.members)[:, index], design.score[index])
+    offsets = np.cumsum([0, *(design.size(g) for g in chosen.members)])
+    k = chosen.members.index(member)
+    at, end = int(offsets[k]), int(offsets[k + 1])
+    mapping = design.maps[member]
+    parameters = mapping @ solution[at:end]
+    covariance = mapping @ inverse[at:end, at:end] @ mapping.T
+    return parameters, covariance, np.asarray(design.groups[member].columns @ parameters)
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    square, vectors = np.linalg.eigh(matrix)
+    kept = square > 1e-9
+    inverse = (vectors[:, kept] / square[kept]) @ vectors[:, kept].T
+    return inverse @ right, inverse
+
+
+def leftover(design: Design, chosen: Chosen) -> FloatArray:
+    """Whitened residual without base model and chosen set, scaled to the degrees of freedom that are left, (N,)."""
+    basis = orthonormal(design.directions[:, design.coordinates(chosen.members)]) if chosen.members else None
+    left = design.residual if basis is None else design.residual - basis @ (basis.T @ design.residual)
+    used = design.count - design.freedom + (0 if basis is None else basis.shape[1])
+    return np.asarray(left * np.sqrt(design.count / max(design.count - used, 1)))
+
+
+def homogeneity(design: Design, chosen: Chosen, member: int, layout: MeasurementLayout) -> tuple[float, float]:
+    """p-value of the test that an effect has the same size everywhere, and the chi-square of its unevenness.
+
+    Its contribution is multiplied by stations, quarters of the time, load, directions and position; a true effect
+    leaves nothing for these products to explain, a wrong name that takes up part of something else does.
+    """
+    from scipy.stats import f as f_distribution
+
+    effect = design.groups[member].effect
+    assert effect is not None
+    shape = contribution(design, chosen, member)[2]
+    readings = design.fit.readings
+    c = covariates_of(readings, layout)
+    parts = [c.s, legendre(c.time, 3)[:, 1:]]
+    if len(readings.stations) > 1:
+        parts.append((readings.station[:, None] == np.arange(1, len(readings.stations))).astype(np.float64))
+    if c.load is not None:
+        parts.append(c.load[:, None])
+    if c.approach is not None:
+        parts.append(c.approach)
+    columns = shape[:, None] * np.hstack(parts)
+    white = design.projected(columns)
+    members = design.directions[:, design.coordinates(chosen.members)]
+    basis = orthonormal(members)
+    white -= basis @ (basis.T @ white)
+    residual = design.residual - basis @ (basis.T @ design.residual)
+    norm = np.linalg.norm(white, axis=0)
+    raw = np.linalg.norm(design.whiten(columns), axis=0)
+    kept = norm > 0.02 * np.maximum(raw, 1e-300)
+    if not kept.any():
+        return 1.0, 0.0
+    extra = orthonormal(white[:, kept], least=1e-4)
+    gained = float(np.sum((extra.T @ residual) ** 2))
+    k = extra.shape[1]
+    freedom = max(design.freedom - basis.shape[1] - k, 1)
+    left = float(residual @ residual) - gained
+    return float(f_distribution.sf(gained / k / max(left / freedom, 1e-300), k, freedom)), gained
+
+
+# The diagnosis of one measurement up to the chosen set: base fit, noise, groups, search, evidence.
+
 
 Show = Callable[[str], None]
 
-#: Share of what wider curves explain above which one smooth term in one direction stands for them.
+#: Share of what wider curves explain above which one smooth term in one direction replaces them.
 ONE_TERM = 0.85
 #: Named effects that wider curves are compared with.
 MOST_NAMED = 4
@@ -33,7 +220,7 @@ class Analysis:
 
     fit: BaseFit
     noise: Noise
-    scene: Scene
+    design: Design
     rules: Rules
     chosen: Chosen
     evidence: Evidence
@@ -56,7 +243,7 @@ def analyse(
     most_named : largest number of named effects.
     only : names of effects to look for; default all.
     sigma_mm : standard uncertainty of each reading, (n,), if one is given.
-    show : receives the stage in words.
+    show : is told each step in words.
     """
     show("building the catalogue")
     wider = wider_of(fit)
@@ -68,58 +255,53 @@ def analyse(
     groups = [*base_groups(fit.readings), *named, *generic_groups(fit.readings, fit.observed.layout)]
     fixed = [group for group in named if group.scans == 1]
     show("fitting the noise")
-    noise = noise_of(fit, fixed if _repeats(fit) else [], sigma_mm=sigma_mm)
+    repeats = has_repeats(fit.observed.layout)
+    noise = noise_of(fit, fixed if repeats else [], sigma_mm=sigma_mm)
     show(f"comparing {len(groups)} groups")
-    scene, rules, chosen = _searched(fit, groups, noise, most_named)
-    more = [scene.groups[g] for g in chosen.members if scene.groups[g].slow or noise.source != "repeats"]
+    design, rules, chosen = _searched(fit, groups, noise, most_named)
+    more = [design.groups[g] for g in chosen.members if design.groups[g].slow or noise.source != "repeats"]
     if more:
-        show("fitting the noise beside what was found")
-        noise = noise_of(fit, [*fixed, *more] if _repeats(fit) else more, sigma_mm=sigma_mm, before=noise)
-        scene, rules, chosen = _searched(fit, groups, noise, most_named)
+        show("fitting the noise together with what was found")
+        noise = noise_of(fit, [*fixed, *more] if repeats else more, sigma_mm=sigma_mm, before=noise)
+        design, rules, chosen = _searched(fit, groups, noise, most_named)
     show("weighing the evidence")
     ratio = run_ratio(fit, [*fixed, *more], noise, RUN_RATIO)
-    evidence = evidence_of(scene, chosen, noise, ratio, fit.observed.layout)
-    return Analysis(fit, noise, scene, rules, chosen, evidence, tuple(missing))
+    evidence = evidence_of(design, chosen, noise, ratio, fit.observed.layout)
+    return Analysis(fit, noise, design, rules, chosen, evidence, tuple(missing))
 
 
 def needed(fit: BaseFit, wider: Sequence[Wider], only: Sequence[str], sigma_mm: FloatArray | None) -> list[Wider]:
-    """Return the wider bases that are worth their columns beside the names, and that no single smooth term replaces.
+    """Return the wider bases that are worth their columns in addition to the names, and that no single smooth term replaces.
 
     A machine whose curves are steeper has them in several errors of an axis; what acts in one direction alone is
     something else.
     """
     named, _ = named_groups(fit.readings, only)
     fixed = [group for group in named if group.scans == 1]
-    noise = noise_of(fit, fixed if _repeats(fit) else [], sigma_mm=sigma_mm)
+    noise = noise_of(fit, fixed if has_repeats(fit.observed.layout) else [], sigma_mm=sigma_mm)
     along = [group for group in generic_groups(fit.readings, fit.observed.layout) if len(group.covariates) == 1]
     along = [group for group in along if group.covariates[0] in ("x", "y", "z")]
     groups = [*base_groups(fit.readings), *(item.group for item in wider), *named, *along]
-    scene = scene_of(fit, groups, whitener(fit.observed.layout, noise))
-    chosen = search(scene, replace(rules_of(scene, MOST_NAMED), generic=False)).members
+    design = design_of(fit, groups, whitener(fit.observed.layout, noise))
+    chosen = search(design, replace(rules_of(design, MOST_NAMED), generic=False)).members
     found = []
     for item in wider:
         place = next((g for g in chosen if groups[g].name == item.group.name), None)
         if place is None:
             continue
-        left = beside(scene, [g for g in chosen if g != place])
-        single = [g for g, group in enumerate(groups) if group.covariates == ("xyz"[item.axis],) and scene.size(g)]
-        if max(gains(scene, left, single), default=0.0) < ONE_TERM * float(gains(scene, left, [place])[0]):
+        left = remainder_of(design, [g for g in chosen if g != place])
+        single = [g for g, group in enumerate(groups) if group.covariates == ("xyz"[item.axis],) and design.size(g)]
+        if max(gains(design, left, single), default=0.0) < ONE_TERM * float(gains(design, left, [place])[0]):
             found.append(item)
     return found
 
 
-def _repeats(fit: BaseFit) -> bool:
-    from compgen.diagnose.noise_fit import has_repeats
-
-    return has_repeats(fit.observed.layout)
-
-
-def _searched(fit: BaseFit, groups: Sequence[Group], noise: Noise, most_named: int) -> tuple[Scene, Rules, Chosen]:
-    scene = scene_of(fit, groups, whitener(fit.observed.layout, noise))
-    rules = rules_of(scene, most_named)
-    return scene, rules, search(scene, rules)
+def _searched(fit: BaseFit, groups: Sequence[Group], noise: Noise, most_named: int) -> tuple[Design, Rules, Chosen]:
+    design = design_of(fit, groups, whitener(fit.observed.layout, noise))
+    rules = rules_of(design, most_named)
+    return design, rules, search(design, rules)
 
 
 def white_rms(analysis: Analysis) -> float:
     """RMS of the whitened residual of the base model; 1 if it explains everything."""
-    return float(np.sqrt(analysis.scene.total / analysis.scene.freedom))
+    return float(np.sqrt(analysis.design.total / analysis.design.freedom))

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.core.csvio import FloatArray
-from compgen.diagnose.axis_model import GENERIC_HANDICAP, RUN_HANDICAP, Candidate
+from compgen.data.csv_files import FloatArray
+from compgen.diagnose.axis_model import Candidate
 from compgen.diagnose.axis_session import AxisSession
 from compgen.diagnose.layout import IntArray
 from compgen.effects import Effect, catalogue
@@ -17,7 +17,13 @@ from compgen.effects import Effect, catalogue
 #: constant rate: as slow as these sessions are, most drifts are the beginning or the end of a warm-up.
 WARMUP_SCANS, LINEAR_SCANS = 2.0, 4.0
 #: Waves in the session that are tried, and what they count as (neighbours are nearly alike).
-WAVES, WAVE_SCANS = np.arange(0.5, 4.1, 0.25), 6.0
+WAVES, WAVE_SCANS = np.concatenate([np.arange(0.5, 4.1, 0.25), np.arange(4.5, 10.1, 0.5)]), 10.0
+#: Waves in a run from which a swing is doubtful beside a reversal, and the share of a swing that must be left to see.
+RUN_LIKE, LEAST_WAVE = 0.6, 0.3
+#: Time constants of a jump that fades, as shares of the session, and most readings at which it may begin.
+FADING, MOST_ONSETS = (0.07, 0.2), 150
+#: Most columns of "every target of every run has a value of its own", and the degree of the curve of a run.
+MOST_OF_RUNS, CURVE = 60, 4
 #: Windows of disturbed readings are looked for in sessions up to this size; beyond it, one reading in several begins one.
 MOST_WINDOWS = 800
 #: Numbers of readings in a burst that are tried; those up to LONGEST_FREE may each have a value of their own.
@@ -73,7 +79,7 @@ def _slow(session: AxisSession) -> list[Candidate]:
 
 
 def _steps(session: AxisSession) -> list[Candidate]:
-    if not _in_runs(session):
+    if not session.in_runs:
         return []
     step = catalogue()["step_between_runs"]
     at = (np.flatnonzero(np.diff(session.leg)) + 1).tolist()
@@ -88,11 +94,6 @@ def _leg_end(session: AxisSession, first: int) -> int:
     return int(np.flatnonzero(session.leg == session.leg[first])[-1])
 
 
-def _in_runs(session: AxisSession) -> bool:
-    """Whether the session goes run by run; one that goes target by target has no runs that may be bad or stepped."""
-    return len(session) >= 2.5 * (int(session.leg.max()) + 1)
-
-
 def _runs(session: AxisSession) -> float:
     """Positions that count for a step or a bad run; equal, so that the first run off and a step after it weigh the same."""
     return float(session.leg.max()) + 1.0
@@ -101,7 +102,7 @@ def _runs(session: AxisSession) -> float:
 def _disturbed(session: AxisSession) -> list[Candidate]:
     """One run (or one way of it) that is off, and shorter bursts."""
     bad, burst = catalogue()["bad_run"], catalogue()["disturbed_readings"]
-    runs = set() if not _in_runs(session) else {_ends(session.leg == k) for k in range(int(session.leg.max()) + 1)}
+    runs = set() if not session.in_runs else {_ends(session.leg == k) for k in range(int(session.leg.max()) + 1)}
     runs |= {_ends(session.cycle == k) for k in range(int(session.cycle.max()) + 1)} if runs else set()
     runs = runs if len(runs) > 1 else set()
     found = []
@@ -156,11 +157,11 @@ def _logged(session: AxisSession) -> list[Candidate]:
     return found
 
 
-def _varies(session: AxisSession, columns: FloatArray) -> bool:
+def _varies(session: AxisSession, columns: FloatArray, least: float = 1e-3) -> bool:
     """Whether something is left of columns beside the means of the cells."""
     count = np.bincount(session.cell)[:, None]
     means = np.stack([np.bincount(session.cell, column) for column in columns.T], axis=1) / count
-    return bool(np.linalg.norm(columns - means[session.cell]) > 1e-3 * np.linalg.norm(columns))
+    return bool(np.linalg.norm(columns - means[session.cell]) > least * np.linalg.norm(columns))
 
 
 def _generic(session: AxisSession) -> list[Candidate]:
@@ -174,19 +175,22 @@ def _generic(session: AxisSession) -> list[Candidate]:
         covariates: tuple[str, ...],
         columns: FloatArray,
         scans: float = 1.0,
-        handicap: float = GENERIC_HANDICAP,
+        least: float = 1e-3,
     ) -> None:
         columns = columns.reshape(len(session), -1)
         columns = columns / np.maximum(np.sqrt(np.mean(columns**2, axis=0)), 1e-12)
-        if columns.shape[1] and columns.shape[1] < len(session) // 2 and _varies(session, columns):
-            found.append(Candidate(text, "generic", columns, scans, text, covariates, handicap=handicap))
+        if columns.shape[1] and columns.shape[1] <= len(session) // 2 and _varies(session, columns, least):
+            found.append(Candidate(text, "generic", columns, scans, text, covariates))
 
     add("the readings wander smoothly with time", ("time",), np.column_stack([t, t**2, t**3]))
     add("the readings wander smoothly with time", ("time",), np.column_stack([t, t**2]))
     for waves in WAVES.tolist():
         angle = np.pi * (t + 1) * waves
         text = f"the readings swing with time, about {waves:.3g} waves in the session"
-        add(text, ("time",), np.column_stack([np.sin(angle), np.cos(angle)]), WAVE_SCANS)
+        # a wave as long as a run looks like a reversal, and one of exactly that length is part of the curve of the axis
+        as_run = waves > RUN_LIKE * (int(session.cycle.max()) + 1)
+        columns = np.column_stack([np.sin(angle), np.cos(angle)])
+        add(text, ("time", "approach") if as_run else ("time",), columns, WAVE_SCANS, LEAST_WAVE)
     saturating = [-np.expm1(-(t + 1) / 2 / tau) for tau in (0.2, 0.6)]
     for shape in (t, *saturating):
         add("the scale of the axis changes with time", ("time", "x"), shape * s, 3)
@@ -195,19 +199,36 @@ def _generic(session: AxisSession) -> list[Candidate]:
         own = own - own.mean(axis=1, keepdims=True)
         add("each target drifts in its own way", ("time", "x"), shape[:, None] * own, 3)
     cycles, legs = _indicators(session.cycle), _indicators(session.leg)
-    if cycles.shape[1] > 2 and _in_runs(session):
-        add("every run has a level of its own", ("run",), cycles[:, 1:], handicap=RUN_HANDICAP)
+    if cycles.shape[1] > 2 and session.in_runs:
+        add("every run has a level of its own", ("run",), cycles[:, 1:])
         add("every run has a slope of its own", ("run", "x"), cycles * s[:, None])
-    if legs.shape[1] > cycles.shape[1] and _in_runs(session):
-        add("every way of every run has a level of its own", ("run", "approach"), legs[:, 1:], handicap=RUN_HANDICAP)
+        curve = np.polynomial.legendre.legvander(s, min(CURVE, len(session.targets_mm) - 1))[:, 1:]
+        add("every run has a curve of its own", ("run", "x"), _products(cycles, np.asarray(curve, dtype=np.float64)))
+        if cycles.shape[1] * len(session.targets_mm) <= MOST_OF_RUNS:
+            text = "both ways of a run agree, and differ from the other runs"
+            add(text, ("run", "x"), _products(cycles, _indicators(session.target)))
+    if legs.shape[1] > cycles.shape[1] and session.in_runs:
+        add("every way of every run has a level of its own", ("run", "approach"), legs[:, 1:])
     inside = [k for k in range(1, len(session)) if session.leg[k] == session.leg[k - 1]]
     for k in inside:
         add(f"jump within {_way(session, k)}, before {session.place(k)}", ("time",), _from(session, k), len(inside))
+    number = np.arange(len(session), dtype=np.float64)
+    onsets = range(1, len(session) - 1, max(1, len(session) // MOST_ONSETS))
+    for k in onsets:
+        for fades in FADING:
+            shape = np.where(number >= k, np.exp(-np.maximum(number - k, 0.0) / (fades * len(session))), 0.0)
+            text = f"a jump before {session.place(k)} that fades"
+            add(text, ("time",), shape, len(FADING) * len(onsets))
     for k in (np.flatnonzero(np.diff(session.leg)) + 1).tolist():
         legs_count = int(session.leg.max())
         add(f"the scale changes at {session.place(k)}", ("time", "x"), _from(session, k) * s, legs_count)
         add(f"the reversal changes at {session.place(k)}", ("time", "approach"), _from(session, k) * way, legs_count)
     return found
+
+
+def _products(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Every column of the one times every column of the other."""
+    return np.asarray((first[:, :, None] * second[:, None, :]).reshape(len(first), -1))
 
 
 def _from(session: AxisSession, k: int) -> FloatArray:

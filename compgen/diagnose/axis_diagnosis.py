@@ -15,20 +15,21 @@ import numpy as np
 from scipy import stats
 
 from compgen.accuracy import positioning_test, run_statistics
-from compgen.core.axis_runs import AxisRuns
-from compgen.core.csvio import FloatArray, format_csv
-from compgen.core.error_table import ErrorTable
-from compgen.core.files import read_text
-from compgen.core.machine import Machine
-from compgen.core.names import AXES, ERROR_NAMES, MM_PER_UM
-from compgen.core.threads import one_thread
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.csv_files import FloatArray, format_csv
+from compgen.data.error_table import ErrorTable
+from compgen.data.files import read_text
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM
 from compgen.diagnose.axis_candidates import candidates_of, invisible_of
-from compgen.diagnose.axis_model import DRIFTS, LEAST_GAIN, LEAST_MM, Candidate, NoiseGrid, Search
+from compgen.diagnose.axis_model import DRIFTS, LEAST_GAIN, LEAST_MM, OF_RUNS, Candidate, NoiseGrid, Search
 from compgen.diagnose.axis_session import ORDER_TEXTS, AxisSession, Order, sessions_of
 from compgen.diagnose.layout import IntArray
+from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.effects import Effect, active_effects, catalogue, section_text
-from compgen.effects.what_to_do import what_to_do
+from compgen.effects.catalogue import what_to_do
 from compgen.errors import InputError
+from compgen.kinematics.kernel_switch import one_thread
 
 Grade = Literal["confirmed", "beside_unknown", "tentative"]
 Show = Callable[[str], None]
@@ -51,17 +52,35 @@ SMOOTH_SHARE = 0.7
 ALIAS = 9.2
 #: A name that explains less than this share of what has no name is tentative.
 LEAST_SHARE = 0.5
+#: The same for a drift beside something smooth in time, which could as well be part of it.
+LEAST_SHARE_OF_DRIFT = 2.0
 #: Chi-square that a reversal needs beside something without a name, and beside runs that do not repeat.
 LEAST_BESIDE, LEAST_BESIDE_RUNS = 40.0, 200.0
 #: An effect must not depend on position, direction or time by more than this share of itself.
 UNEVEN_SHARE, UNEVEN_P = 0.05, 1e-3
+#: Time constant of a step that fades, as a share of the session; readings that a disturbance must have to show that it does.
+FADES, LEAST_WINDOW = 0.15, 4
 #: A warm-up with a time constant beyond this share of the session has hardly begun to level off.
 HARDLY_LEVELS = 1.5
-#: Excess kurtosis of what is left, freed from its memory, and memory, beyond which that is no noise (in 200 sessions with
-#: noise of a memory up to 0.85 the largest were 2.0 and 0.90).
-JUMPS, WANDERS = 3.0, 0.94
+#: A tentative drift is taken off where the means of the runs move in the second half by no more than this share of the
+#: first, and where no more than this share of their movement is left.
+LEVELS_OFF, LEAST_FOLLOWED = 0.8, 0.5
+#: Why a name is tentative whose drift has a part that differs along the axis or by direction.
+NOT_THE_SAME = "the drift is not the same at all positions and in both directions"
+#: Excess kurtosis of what is left, freed from its memory, beyond which that is no noise (in 200 sessions with noise of a
+#: memory up to 0.85 the largest was 2.0), and the skewness over its standard error.
+JUMPS, LEANS = 3.0, 4.5
+#: Memory that noise of a measurement may have; twice the log likelihood that a longer one must bring, or such a memory.
+USUAL_MEMORY, WANDERS, MOST_MEMORY = 0.9, 5.0, 0.94
+#: Twice the log likelihood that a scatter which changes with time must bring, the same with position or direction, and the
+#: natural logarithms of the scatter at one end over that at the other that are tried (in 20 sessions the largest was 8.1).
+SCATTER_GROWS, SCATTER_CHANGES, SCATTERS = 10.0, 13.0, (-2.0, -1.4, -0.8, 0.8, 1.4, 2.0)
 #: Memory from which a note says that the scatter has one.
 MEMORY = 0.5
+#: Correlation of time and position from which a session that goes target by target cannot tell them apart.
+ALIKE = 0.7
+#: Weight from which one effect of whole runs may as well be the other.
+AS_WELL = 0.2
 #: Effects whose readings are left out of the figures; all other changes are taken off.
 LEFT_OUT = ("bad_run", "disturbed_readings")
 #: Effects of the machine that a machine file keeps; a warm-up of one session is not among them.
@@ -72,7 +91,8 @@ MACHINE_EFFECTS = ("thermal_scale", "spindle_growth", "servo_lag")
 class AxisEffect:
     """A named effect: parameters as (value, u) by name in the unit of the name; ``shift_mm`` (n,) is what it adds.
 
-    ``left_out`` are readings (numbers in time) that are of no use because of it.
+    ``left_out`` are readings (numbers in time) that are of no use because of it. ``remains`` says what of a tentative drift
+    is taken off all the same, and what stays; empty for all others.
     """
 
     name: str
@@ -89,6 +109,7 @@ class AxisEffect:
     effect: Effect
     values: FloatArray
     homogeneity_p: float = 1.0
+    remains: str = ""
 
 
 @dataclass(frozen=True)
@@ -219,11 +240,11 @@ def _findings(
     if len(members) >= most > 0 and search.criteria(members)[1].max() >= LEAST_GAIN:
         unknown.append(AxisUnknown(f"more than {most} changes: the session does not repeat", ("time", "run"), np.nan))
     effects = [_change(changes, k, generic) for k in members if k not in generic]
-    for name in ("bad_run", "step_between_runs"):
-        if sum(item.name == name for item in effects) > 1:
-            effects = [_doubted(item, "the runs do not repeat") for item in effects]
-            text = "the runs do not repeat: more than one of them is off, or steps between more than two of them"
-            unknown.append(AxisUnknown(text, ("run",), np.nan, name))
+    doubled = _doubled(effects)
+    if doubled:
+        effects = [_doubted(item, "the runs do not repeat") for item in effects]
+        text = "the runs do not repeat: more than one of them is off, or steps between more than two of them"
+        unknown.append(AxisUnknown(text, ("run", *_one_way(session, effects)), np.nan, doubled))
     if repeated and not unknown:
         unknown += _restless(changes)
     static, irregular = reversal.found(names, add, source)
@@ -235,7 +256,9 @@ def _findings(
     if not unknown and effects and all(e.grade == "tentative" for e in effects) and repeated:
         first = effects[0]
         unknown = [AxisUnknown(f"resembles {first.name} but {first.reasons[0]}", (), np.nan, first.name)]
+    effects = [_common_part(session, item, effects, changes) for item in effects]
     removed, left_out, taken, figures, notes = _taken_off(session, effects)
+    effects = [item if item.name in taken else replace(item, remains="") for item in effects]
     before, after = _residuals(session, grid, effects)
     return AxisFindings(
         session, tuple(effects), tuple(unknown), invisible_of(session),
@@ -246,8 +269,77 @@ def _findings(
     )  # fmt: skip
 
 
+def _doubled(effects: Sequence[AxisEffect]) -> str:
+    """Name of which there is more than one, a run that is off or a step; empty if none.
+
+    The last run off and a step before it are the same readings: they count as the one of which there is none yet.
+    """
+    of_runs = [item for item in effects if item.name in OF_RUNS]
+    if len({item.name for item in of_runs}) == len(of_runs):
+        return ""
+    may_be = [{name for name, weight in item.alias if weight > AS_WELL} for item in of_runs]
+    either = any(set(OF_RUNS) <= names for names in may_be)
+    return "" if either and len(of_runs) == 2 else of_runs[0].name
+
+
+def _one_way(session: AxisSession, effects: Sequence[AxisEffect]) -> tuple[str, ...]:
+    """("time", "approach") if the runs that are off are all of one direction: then it is the reversal that changes."""
+    off = [session.direction[item.left_out] for item in effects if item.name == "bad_run"]
+    alike = off and np.ptp(np.concatenate(off)) == 0
+    return ("time", "approach") if alike else ()
+
+
 def _doubted(item: AxisEffect, reason: str) -> AxisEffect:
     return replace(item, grade="tentative", reasons=(*item.reasons, reason))
+
+
+def _common_part(
+    session: AxisSession, item: AxisEffect, effects: Sequence[AxisEffect], changes: _Changes
+) -> AxisEffect:
+    """A tentative drift with the sentence that it is taken off, if the means of the runs show it."""
+    if item.name not in DRIFTS or item.grade != "tentative" or not session.in_runs:
+        return item
+    off = [other.left_out for other in effects if other.grade != "tentative"]
+    used = np.isin(np.arange(len(session)), np.concatenate([np.zeros(0, dtype=np.int64), *off]), invert=True)
+    drift = session.run_means_mm(item.shift_mm, used)
+    memory = (1.0 + changes.phi) / (1.0 - changes.phi)
+    u = changes.sigma_mm * float(np.sqrt(min(memory / len(session.targets_mm), 1.0)))
+    if not _levels_off(session.run_means_mm(session.deviation_mm, used), drift, u):
+        return item
+    stays = "part of the drift is not the same at all positions or in both directions and stays"
+    if NOT_THE_SAME not in item.reasons and item.homogeneity_p >= UNEVEN_P:
+        stays = "what has no name beside it stays"
+    moves = "rise" if item.shift_mm[0] < 0 else "fall"
+    ways = "both directions" if len(drift) > 1 else "the one direction that was measured"
+    text = (
+        f"the means of the runs {moves} and level off in {ways}: what is common to all positions is taken off; {stays}"
+    )
+    return replace(item, remains=text)
+
+
+def _levels_off(means: FloatArray, drift: FloatArray, u_mm: float) -> bool:
+    """Whether the means of the runs (ways, runs) go one way and less and less, up and down alike, as the drift does.
+
+    A way by itself (one direction) may differ from this by what the uncertainty ``u_mm`` of a mean allows, two of them for
+    each difference of means.
+    """
+    runs = means.shape[1]
+    if runs < 3 or not np.isfinite(means).all():
+        return False
+    sense, half = np.sign(drift[:, -1].sum() - drift[:, 0].sum()), (runs - 1) // 2
+    up, left = sense * means, (sense * (means - drift)).mean(axis=0)
+    first, second = up[:, half] - up[:, 0], up[:, -1] - up[:, -1 - half]
+    step, turn = (
+        2.0 * 2.0**0.5 * u_mm,
+        2.0 * 6.0**0.5 * u_mm,
+    )  # of a difference, and of a difference of two with one in common
+    return bool(
+        np.diff(up).min() > -step
+        and (up[:, -1] - up[:, 0]).min() > step
+        and second.sum() <= LEVELS_OFF * first.sum()
+        and (second - first).max() <= turn
+        and np.ptp(left) <= LEAST_FOLLOWED * np.ptp(up.mean(axis=0))
+    )
 
 
 def _beside_unknown(item: AxisEffect, unknown: Sequence[AxisUnknown]) -> AxisEffect:
@@ -282,7 +374,7 @@ class _Changes:
             self.weights[0], self.freedom, self.sigma_mm, self.phi = 1.0, 0, float("nan"), 0.0
             self.square = np.full(len(self.grid.points), np.nan)
             return
-        self.square = search.square(search.state(members)[0])
+        self.square = search.square(members)
         self.weights = self.grid.weights(self.square)
         self.freedom = max(self.grid.freedom - self.columns.shape[1], 1)
         self.sigma_mm = float(np.sqrt(self.weights @ self.square / self.freedom))
@@ -293,12 +385,12 @@ class _Changes:
         """Values and covariance of ``extra`` (n, k) beside ``columns`` (n, m), both weighted over the grid."""
         design = np.hstack([columns, extra])
         value, square, total = np.zeros(extra.shape[1]), np.zeros((extra.shape[1],) * 2), []
-        for weight, own, rss in zip(self.weights, self.grid.inverse, self.square, strict=True):
+        for point, (weight, rss) in enumerate(zip(self.weights, self.square, strict=True)):
             if weight < 1e-4:
                 continue
-            middle = design.T @ own @ design
-            inverse = np.linalg.pinv(middle, rcond=1e-10, hermitian=True)
-            fitted = (inverse @ (design.T @ own @ self.search.y))[-extra.shape[1] :]
+            pulled = self.grid.solve(point, design)
+            inverse = np.linalg.pinv(design.T @ pulled, rcond=1e-10, hermitian=True)
+            fitted = (inverse @ (pulled.T @ self.search.y))[-extra.shape[1] :]
             value += weight * fitted
             square += weight * inverse[-extra.shape[1] :, -extra.shape[1] :] * rss / max(self.freedom, 1)
             total.append((weight, fitted))
@@ -307,10 +399,10 @@ class _Changes:
 
 
 def _restless(changes: _Changes) -> list[AxisUnknown]:
-    """What is left jumps or wanders more than noise does."""
+    """What is left jumps, leans to one side, wanders, or does not scatter equally, more than noise does."""
     session, point = changes.session, int(np.argmax(changes.weights))
     design = np.hstack([changes.grid.cells, changes.columns])
-    inverse = changes.grid.inverse[point]
+    inverse = changes.grid.inverse(point)
     value = np.linalg.pinv(design.T @ inverse @ design, rcond=1e-10, hermitian=True) @ (
         design.T @ inverse @ changes.search.y
     )
@@ -323,9 +415,56 @@ def _restless(changes: _Changes) -> list[AxisUnknown]:
     if float(np.mean(white**4)) / scale**4 - 3.0 > JUMPS:
         text = "the readings jump now and then by more than they scatter, and do not repeat"
         return [AxisUnknown(text, ("time",), rms)]
-    if changes.phi > WANDERS:
+    if abs(float(np.mean(white**3))) / scale**3 > LEANS * np.sqrt(6.0 / len(session)):
+        text = "the readings creep to one side and slip back, and do not repeat"
+        return [AxisUnknown(text, ("time",), rms)]
+    memory = np.array([phi for phi, _ in changes.grid.points])
+    fits = 2.0 * (changes.grid.log_likelihoods(changes.square) - changes.grid.prior)
+    if changes.phi > MOST_MEMORY or fits[memory > USUAL_MEMORY].max() - fits[memory <= USUAL_MEMORY].max() > WANDERS:
         return [AxisUnknown("the readings wander from one to the next and do not repeat", ("time",), rms)]
+    return _uneven_scatter(changes, rms)
+
+
+def _uneven_scatter(changes: _Changes, rms: float) -> list[AxisUnknown]:
+    """A scatter that grows or falls along the session, along the axis, or differs by direction."""
+    session, search = changes.session, changes.search
+    chosen = np.flatnonzero(changes.weights > 0.1 * changes.weights.max())
+    points = [changes.grid.points[k] for k in chosen]
+    base = 2.0 * float(changes.grid.log_likelihoods(changes.square)[chosen].max())
+    t = (session.time - session.time[0]) / (session.time[-1] - session.time[0])
+    of: list[tuple[str, tuple[str, ...], FloatArray]] = [
+        ("time", ("time",), t),
+        ("the position", ("x",), 0.5 * (1.0 + session.s)),
+        ("the direction", ("approach",), np.asarray(0.5 * (1.0 + session.direction), dtype=np.float64)),
+    ]
+    for what, covariates, shape in of:
+        if np.ptp(shape) == 0.0:
+            continue
+        gains = {}
+        for change in SCATTERS:
+            scatter = np.exp(change * (shape - shape.mean()))
+            grid = NoiseGrid(session, scatter, points)
+            columns = changes.columns / scatter[:, None]
+            square = np.array([_left(grid, k, search.y / scatter, columns) for k in range(len(points))])
+            square = np.maximum(square, grid.freedom * LEAST_MM**2)
+            own = 2.0 * float(grid.log_likelihoods(square).max()) - 2.0 * float(np.sum(np.log(scatter)))
+            gains[change] = own - base
+        best = max(gains, key=lambda change: gains[change])
+        if gains[best] > (SCATTER_GROWS if what == "time" else SCATTER_CHANGES):
+            factor = float(np.exp(abs(best)))
+            if what == "time" and abs(float(np.corrcoef(t, session.s)[0, 1])) > ALIKE:
+                what, covariates = "time or the position, which go together here", ("time", "x")
+            text = f"the scatter of the readings changes with {what}, by a factor of about {factor:.1f}"
+            return [AxisUnknown(text, covariates, rms)]
     return []
+
+
+def _left(grid: NoiseGrid, point: int, y: FloatArray, columns: FloatArray) -> float:
+    """Return y'Py beside columns (n, k)."""
+    pulled = grid.free(point, np.column_stack([y, columns]))
+    gram = columns.T @ pulled[:, 1:]
+    right = columns.T @ pulled[:, 0]
+    return float(y @ pulled[:, 0] - right @ np.linalg.pinv(gram, rcond=1e-10, hermitian=True) @ right)
 
 
 def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffect:
@@ -340,12 +479,18 @@ def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffec
     shift = item.columns @ values
     reasons, p = [], 1.0
     lost = item.name in LEFT_OUT
-    if not lost and item.columns.shape[1] == 1:
+    of_generic = set[str]().union(*(search.candidates[k].covariates for k in generic))
+    if item.name in DRIFTS and "time" in of_generic and of_generic & {"x", "approach"}:
+        reasons.append(NOT_THE_SAME)
+    if item.name in (*OF_RUNS, *DRIFTS) and "run" in of_generic:
+        reasons.append("every run differs from the others")
+    if item.columns.shape[1] == 1:
         p, share = _uneven(changes, member, shift)
         if p < UNEVEN_P and share > UNEVEN_SHARE:
             reasons.append(f"does not behave like it at all positions, directions and times (p = {p:.1e})")
     unnamed = sum(float(search.criteria([k for k in changes.members if k != g])[0][g]) for g in generic)
-    if unnamed and gains[member] < LEAST_SHARE * unnamed:
+    share = LEAST_SHARE_OF_DRIFT if item.name in DRIFTS and "time" in of_generic else LEAST_SHARE
+    if unnamed and gains[member] < share * unnamed:
         reasons.append("small beside what has no name")
     own = np.array([float(values.mean())]) if item.free else values
     u = np.sqrt(np.diag(covariance))
@@ -381,10 +526,11 @@ def _alias(search: Search, criteria: FloatArray, member: int) -> tuple[tuple[str
 def _uneven(changes: _Changes, member: int, shift: FloatArray) -> tuple[float, float]:
     """p-value that an effect depends on position, direction or time, and the share of it that does."""
     session = changes.session
+    item = changes.search.candidates[member]
     half = np.where(session.time > np.median(session.time), 1.0, -1.0)
     unit = shift / max(float(np.abs(shift).max()), 1e-12)
     columns = np.hstack([changes.grid.cells, changes.columns])
-    extra = np.column_stack([unit * session.s, unit * session.direction, unit * half])
+    extra = np.column_stack([unit * session.s, unit * session.direction, unit * half, *_fading(session, item)])
     beside = extra - columns @ np.linalg.lstsq(columns, extra, rcond=None)[0]
     extra = extra[:, np.linalg.norm(beside, axis=0) > 0.05 * np.linalg.norm(extra, axis=0)]
     count = extra.shape[1]
@@ -395,6 +541,20 @@ def _uneven(changes: _Changes, member: int, shift: FloatArray) -> tuple[float, f
     own = (extra - columns @ np.linalg.lstsq(columns, extra, rcond=None)[0]) @ value
     share = float(np.sum((own - own.mean()) ** 2) / max(np.sum((shift - shift.mean()) ** 2), 1e-18))
     return float(stats.f.sf(wald, count, changes.freedom - count)), share
+
+
+def _fading(session: AxisSession, item: Candidate) -> list[FloatArray]:
+    """What a step or a disturbance would do that fades: columns (n,) beside the one of its name."""
+    number = np.arange(len(session), dtype=np.float64)
+    if item.name == "step_between_runs":
+        since = number - item.effect.settings["at"] if item.effect is not None else number
+        return [np.where(since >= 0.0, np.exp(-np.maximum(since, 0.0) / (FADES * len(session))), 0.0)]
+    if item.name not in LEFT_OUT or item.last - item.first < LEAST_WINDOW - 1:
+        return []
+    inside, after = (number >= item.first) & (number <= item.last), number > item.last
+    length = item.last - item.first + 1.0
+    slope = np.where(inside, (number - 0.5 * (item.first + item.last)) / length, 0.0)
+    return [slope, np.where(after, np.exp(-np.maximum(number - item.last, 0.0) / length), 0.0)]
 
 
 def _text(
@@ -633,7 +793,8 @@ def _taken_off(
     """
     everything = np.arange(len(session))
     before = figures_of(session, session.deviation_mm, everything)
-    wanted = sorted((e for e in effects if not e.static and e.grade != "tentative"), key=lambda e: -e.gain)
+    sure = [e for e in effects if e.grade != "tentative" or e.remains]
+    wanted = sorted((e for e in sure if not e.static), key=lambda e: (bool(e.remains), -e.gain))
     kept_effects = list(wanted)
     notes: list[str] = []
     while True:
@@ -731,8 +892,8 @@ def _compared(changes: _Changes, errors: ErrorTable) -> dict[str, Any]:
     return {"rms_um": float(np.sqrt(np.mean(difference**2))) / MM_PER_UM, "changes": [entry] if p < 1e-3 else []}
 
 
-@dataclass(frozen=True)
-class AxisDiagnosis:
+@dataclass(frozen=True, repr=False)
+class AxisDiagnosis(DisplayedDiagnosis):
     """Diagnosis of axis runs, one part for each axis."""
 
     machine: Machine
@@ -855,6 +1016,7 @@ class AxisDiagnosis:
                 )
             if any(item.name in ("warmup_drift", "linear_drift") for item in part.effects):
                 found.append(f"{letter}: {WARM_UP_NOTE}")
+            found += [f"{letter}: {item.name} is tentative; {item.remains}" for item in part.effects if item.remains]
             grown = [key for key, pair in part.figures.items() if pair["after"] > pair["before"] * 1.001]
             if grown and part.taken_off:
                 found.append(f"{letter}: {', '.join(grown)} had been hidden a little by what was taken off")
@@ -903,7 +1065,13 @@ class AxisDiagnosis:
         table = {
             name: values if name == "axis" else np.array(values, dtype=np.float64) for name, values in rows.items()
         }
-        return format_csv(table, {}, digits | {name: 4 for name in table if name.endswith("_um")})
+        common = {
+            f"{item.name}_{part.session.letter}": item.remains
+            for part in self.axes
+            for item in part.effects
+            if item.remains
+        }
+        return format_csv(table, common, digits | {name: 4 for name in table if name.endswith("_um")})
 
 
 def _sections(part: AxisFindings) -> list[str]:

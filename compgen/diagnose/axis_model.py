@@ -17,10 +17,12 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.special import logsumexp
 
-from compgen.core.csvio import FloatArray
+from compgen.data.csv_files import FloatArray
 from compgen.diagnose.axis_session import AxisSession
+from compgen.diagnose.layout import IntArray
 from compgen.effects import Effect
 
 Tier = Literal["named", "generic"]
@@ -28,20 +30,35 @@ Tier = Literal["named", "generic"]
 #: Correlation of neighbouring readings, and share of white noise beside the part with a memory.
 PHI = (0.0, 0.25, 0.5, 0.7, 0.83, 0.92, 0.98)
 WHITE = (0.0, 0.4, 0.8)
+#: Logarithm of what speaks for each memory beforehand: what is alike over more than ten readings is rather a change than noise.
+LOG_PRIOR = dict(zip(PHI, (0.0, 0.0, 0.0, 0.0, 0.0, -1.0, -3.0), strict=True))
 #: Readings of resolution: residuals are never taken to be smaller than this, mm.
 LEAST_MM = 2e-6
 #: Variances over sigma^2 that the coefficients of several columns may have.
 LAMBDA = np.array([2.0, 20.0, 200.0, 2000.0])
+#: The same for columns of a smooth term that are fitted freely, each at the price that a name pays for its own: large effects
+#: must not cost more in four columns than in three names.
+FREE = 1e9
+LAMBDAS = np.append(LAMBDA, FREE)
 #: Names of slow drifts.
 DRIFTS = ("warmup_drift", "linear_drift")
 #: Smallest share of a column that must be left beside the means and the other members.
 LEAST_SEEN = 1e-3
 #: Improvement of the criterion that a member must bring.
 LEAST_GAIN = 5.5
+#: Criteria closer than this are the same: the last run off, and a step before it, are the same readings.
+SAME = 1e-6
 #: What a smooth term without a name must bring beyond a name.
 GENERIC_HANDICAP = 8.0
-#: The same for levels of whole runs, which two names together (a warm-up and a bad run) explain nearly as well.
-RUN_HANDICAP = 14.0
+#: Kinds of smooth terms from which a search begins.
+STARTS = 5
+#: Runs that are off, or steps, from which a search begins where the first one found anything that goes by runs.
+RUN_STARTS = 8
+#: Names of what goes by whole runs.
+OF_RUNS = ("bad_run", "step_between_runs")
+#: What every name beyond the first must bring before a smooth term without a name gives way to it: two events that happen
+#: to cancel or to follow each other are less likely than one.
+MORE_NAMES = 4.0
 #: What readings with a value of their own each must bring beyond a common offset.
 FREE_HANDICAP = 6.0
 
@@ -63,7 +80,6 @@ class Candidate:
     first: int = -1
     last: int = -1
     free: bool = False
-    handicap: float = GENERIC_HANDICAP
 
     def penalty(self, freedom: int) -> float:
         """Twice the log likelihood that the columns have to bring before they count."""
@@ -71,34 +87,61 @@ class Candidate:
         if self.columns.shape[1] == 1 and self.tier == "named":
             return float(np.log(freedom)) + scan
         own = float(np.log(freedom)) if self.columns.shape[1] == 1 else 2.0
-        return own + scan + (self.handicap if self.tier == "generic" else FREE_HANDICAP)
+        return own + scan + (GENERIC_HANDICAP if self.tier == "generic" else FREE_HANDICAP)
 
 
 class NoiseGrid:
-    """Inverse covariances of the noise for every (phi, w), freed from the cell means; sigma is 1."""
+    """Inverse covariances of the noise for every (phi, w); sigma is 1.
 
-    def __init__(self, session: AxisSession) -> None:
+    A noise with a memory is a Markov chain: the inverse T of K_ij = phi^|t_i - t_j| has three diagonals. With
+    V = a K + b I, inv(V) = inv(a I + b T) T is applied to a vector in n steps, and no covariance is ever inverted.
+    """
+
+    def __init__(
+        self,
+        session: AxisSession,
+        scatter: FloatArray | None = None,
+        points: Sequence[tuple[float, float]] | None = None,
+    ) -> None:
+        """Prepare the grid; ``scatter`` (n,) divides all readings, for noise that is not equal everywhere."""
         step = session.time / (np.median(np.diff(session.time)) if session.timed else 1.0)
-        apart = np.abs(step[:, None] - step[None, :])
         n = len(session)
-        cells = np.zeros((n, int(session.cell.max()) + 1))
-        cells[np.arange(n), session.cell] = 1.0
-        self.freedom = n - cells.shape[1]
-        self.points = [(phi, w) for phi in PHI for w in (WHITE if phi else (0.0,))]
-        inverse, free, constant, prior = [], [], [], []
-        for phi, w in self.points:
-            v = (1.0 - w) * phi**apart + w * np.eye(n) if phi else np.eye(n)
-            v[np.diag_indices(n)] += 1e-9
-            own = np.linalg.inv(v)
-            middle = cells.T @ own @ cells
-            right = own @ cells
-            inverse.append(own)
-            free.append(own - right @ np.linalg.solve(middle, right.T))
-            constant.append(np.linalg.slogdet(v)[1] + np.linalg.slogdet(middle)[1])
-            prior.append(-np.log(len(PHI)) - (np.log(len(WHITE)) if phi else 0.0))
-        self.inverse, self.free = np.array(inverse), np.array(free)
-        self.constant, self.prior = np.array(constant), np.array(prior)
-        self.cells = cells
+        self.cells = np.zeros((n, int(session.cell.max()) + 1))
+        self.cells[np.arange(n), session.cell] = 1.0 if scatter is None else 1.0 / scatter
+        self.freedom = n - self.cells.shape[1]
+        self.points = list(points or [(phi, w) for phi in PHI for w in (WHITE if phi else (0.0,))])
+        self._bands = [_bands(np.diff(step), phi, w) for phi, w in self.points]
+        #: inv(V) N and inv(N' inv(V) N) for the indicators N of the cells, which free a vector from the cell means.
+        self._right, self._middle = [], []
+        constant = []
+        for point, (_, _, determinant) in enumerate(self._bands):
+            right = self.solve(point, self.cells)
+            middle = self.cells.T @ right
+            self._right.append(right)
+            self._middle.append(np.linalg.inv(middle))
+            constant.append(determinant + np.linalg.slogdet(middle)[1])
+        self.constant = np.array(constant)
+        self.prior = np.array([LOG_PRIOR[phi] - (np.log(len(WHITE)) if phi else 0.0) for phi, _ in self.points])
+
+    def solve(self, point: int, columns: FloatArray) -> FloatArray:
+        """inv(V) times columns (n, k)."""
+        inverse, factor, _ = self._bands[point]
+        return np.asarray(cho_solve_banded((factor, True), _times(inverse, columns), check_finite=False))
+
+    def inverse(self, point: int) -> FloatArray:
+        """inv(V), (n, n)."""
+        found = self.solve(point, np.eye(len(self.cells)))
+        return 0.5 * (found + found.T)
+
+    def free(self, point: int, columns: FloatArray) -> FloatArray:
+        """P times columns (n, k); P is inv(V) freed from the cell means."""
+        right = self._right[point]
+        return self.solve(point, columns) - right @ (self._middle[point] @ (right.T @ columns))
+
+    def projector(self, point: int) -> FloatArray:
+        """P, (n, n)."""
+        right = self._right[point]
+        return self.inverse(point) - right @ (self._middle[point] @ right.T)
 
     def log_likelihood(self, square: FloatArray, extra: FloatArray) -> FloatArray:
         """Log likelihood (...) summed over the grid, for y'Py and further log determinants of shape (points, ...)."""
@@ -106,44 +149,99 @@ class NoiseGrid:
         own = -0.5 * self.freedom * np.log(square / self.freedom) - 0.5 * (extra + self.constant.reshape(shape))
         return np.asarray(logsumexp(own + self.prior.reshape(shape), axis=0))
 
+    def log_likelihoods(self, square: FloatArray) -> FloatArray:
+        """Log likelihood at every point of the grid, (points,), for y'Py (points,)."""
+        return np.asarray(-0.5 * self.freedom * np.log(square / self.freedom) - 0.5 * self.constant + self.prior)
+
     def weights(self, square: FloatArray) -> FloatArray:
         """Posterior weight of every point of the grid, (points,), for y'Py (points,)."""
-        own = -0.5 * self.freedom * np.log(square / self.freedom) - 0.5 * self.constant + self.prior
+        own = self.log_likelihoods(square)
         return np.asarray(np.exp(own - logsumexp(own)))
 
 
-def without(projector: FloatArray, columns: FloatArray, ridge: float = 0.0) -> tuple[FloatArray, FloatArray]:
-    """Free projectors (points, n, n) from columns (n, k); with ``ridge`` = 1 / lambda also log det(1 + lambda C'PC)."""
-    if not columns.shape[1]:
-        return projector, np.zeros(len(projector))
-    right = projector @ columns
-    middle = columns.T @ right
-    middle = 0.5 * (middle + middle.transpose(0, 2, 1))
-    determinant = np.zeros(len(projector))
-    if ridge:
-        middle = middle + ridge * np.eye(columns.shape[1])
-        determinant = np.linalg.slogdet(middle / ridge)[1]
-    inverse = np.linalg.pinv(middle, rcond=1e-10, hermitian=True)
-    return np.asarray(projector - right @ inverse @ right.transpose(0, 2, 1)), determinant
+def _bands(apart: FloatArray, phi: float, w: float) -> tuple[FloatArray, FloatArray, float]:
+    """Diagonal and lower diagonal of T (2, n), the Cholesky factor of a I + b T in bands, and log det V.
+
+    ``apart`` (n - 1,) are the distances of neighbouring readings in time. A little white noise keeps V regular.
+    """
+    n = len(apart) + 1
+    r = np.minimum(phi**apart, 1.0 - 1e-9) if phi else np.zeros(n - 1)
+    own = r**2 / (1.0 - r**2)
+    inverse = np.zeros((2, n))
+    inverse[0] = 1.0 + np.append(own, 0.0) + np.append(0.0, own)
+    inverse[1, :-1] = -r / (1.0 - r**2)
+    a, b = (1.0 - w, w + 1e-9) if phi else (1.0, 0.0)
+    sum_of_both = b * inverse
+    sum_of_both[0] += a
+    factor = cholesky_banded(sum_of_both, lower=True)
+    determinant = 2.0 * float(np.sum(np.log(factor[0]))) + float(np.sum(np.log1p(-(r**2))))
+    return inverse, factor, determinant
+
+
+def _times(bands: FloatArray, columns: FloatArray) -> FloatArray:
+    """A symmetric matrix of three diagonals times columns (n, k)."""
+    found = bands[0][:, None] * columns
+    found[1:] += bands[1, :-1, None] * columns[:-1]
+    found[:-1] += bands[1, :-1, None] * columns[1:]
+    return np.asarray(found)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """All candidates of k columns: numbers ``rows`` (m,), and for each point of the grid their Gram matrix C'PC.
+
+    ``columns`` are (m, k, n). The matrix is kept as eigenvalues (points, m, k) with the columns turned into the axes
+    ``turn`` (points, m, k, k), in which ``right`` (points, m, k) is C'Py. ``size`` (m,) is the mean square of the columns.
+    """
+
+    rows: IntArray
+    columns: FloatArray
+    value: FloatArray
+    turn: FloatArray
+    right: FloatArray
+    size: FloatArray
+
+
+@dataclass(frozen=True)
+class _State:
+    """A set of members, freed from each other: what it leaves of y'Py, log determinant, trace of P, and T'b, all by point.
+
+    ``turn`` (points, K, r) makes the Gram matrix of the members (with the prior of those of several columns) the unit; the
+    first ``free`` columns are of members without a prior.
+    """
+
+    members: tuple[int, ...]
+    free: list[int]
+    square: FloatArray
+    determinant: FloatArray
+    trace: FloatArray
+    turn: list[FloatArray]
+    right: list[FloatArray]
 
 
 class Search:
-    """Looks for the set of candidates that explains the readings."""
+    """Looks for the set of candidates that explains the readings.
+
+    All that is compared depends on products C'PC and C'Py alone. They are made once; the columns of a member are multiplied
+    with those of all candidates when it is first tried, and no (n, n) matrix is touched after that.
+    """
 
     def __init__(self, session: AxisSession, grid: NoiseGrid, candidates: Sequence[Candidate]) -> None:
         self.session, self.grid, self.candidates = session, grid, list(candidates)
         self.y = session.deviation_mm - session.deviation_mm.mean()
         self._drifts = np.array([c.name in DRIFTS for c in self.candidates], dtype=bool)
-        sizes = np.array([c.columns.shape[1] for c in self.candidates], dtype=np.int64)
-        #: Candidates of k columns: their numbers (m,) and columns (n, m, k).
-        self._blocks = [
-            (rows, np.stack([self.candidates[r].columns for r in rows], axis=1))
-            for rows in (np.flatnonzero(sizes == k) for k in np.unique(sizes))
-        ]
-        #: Variance over sigma^2 of members of several columns, from when they were first chosen.
+        self._named = np.array([c.tier == "named" for c in self.candidates], dtype=bool)
+        self._penalties = np.array([c.penalty(grid.freedom) for c in self.candidates])
+        pulled = [grid.free(point, self.y[:, None])[:, 0] for point in range(len(grid.points))]
+        self._square = np.array([self.y @ own for own in pulled])
+        self._blocks, self._trace = _blocks_of(grid, self.candidates, pulled)
+        #: P C (points, n, k) of a member, and C'P C of all candidates with it by block, (points, m, k, own k).
+        self._pulled: dict[int, FloatArray] = {}
+        self._cross: dict[int, list[FloatArray]] = {}
+        #: Variance over sigma^2 of members of several columns, from when they were last chosen.
         self._lambda: dict[int, float] = {}
-        self._best_lambda: dict[int, float] = {}
-        self._known: dict[frozenset[int], tuple[FloatArray, FloatArray]] = {}
+        self._best_lambda = np.full(len(self.candidates), LAMBDA[1])
+        self._known: dict[frozenset[tuple[int, float]], tuple[FloatArray, FloatArray]] = {}
 
     def columns_of(self, members: Sequence[int]) -> FloatArray:
         """Columns of some candidates side by side, (n, k)."""
@@ -151,56 +249,117 @@ class Search:
             return np.zeros((len(self.session), 0))
         return np.hstack([self.candidates[k].columns for k in members])
 
-    def square(self, projector: FloatArray) -> FloatArray:
-        """Return y'Py (points,), never below the resolution."""
-        own = np.einsum("i,pij,j->p", self.y, projector, self.y)
-        return np.asarray(np.maximum(own, self.grid.freedom * LEAST_MM**2))
+    def square(self, members: Sequence[int]) -> FloatArray:
+        """Return y'Py (points,) beside some members, never below the resolution."""
+        return np.maximum(self._state(members).square, self.grid.freedom * LEAST_MM**2)
 
-    def state(self, members: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Projectors beside some members, and the log determinants of those of several columns."""
-        single = [k for k in members if self.candidates[k].columns.shape[1] == 1]
-        projector, total = without(self.grid.free, self.columns_of(single))
-        for k in members:
-            if k not in single:
-                projector, own = without(projector, self.candidates[k].columns, 1.0 / self._lambda.get(k, LAMBDA[1]))
-                total = total + own
-        return projector, total
+    def _pull(self, member: int) -> FloatArray:
+        if member not in self._pulled:
+            columns = self.candidates[member].columns
+            self._pulled[member] = np.stack([self.grid.free(p, columns) for p in range(len(self.grid.points))])
+        return self._pulled[member]
+
+    def _crossed(self, member: int) -> list[FloatArray]:
+        """Products of all candidates with a member, in the axes of each candidate."""
+        if member not in self._cross:
+            own = self._pull(member)
+            self._cross[member] = [_crossed(block, own) for block in self._blocks]
+        return self._cross[member]
+
+    def _state(self, members: Sequence[int]) -> _State:
+        """Free the members from each other: those of one column together, then those of several with their prior."""
+        unbound = [k for k in members if self._lambda.get(k) == FREE and self.candidates[k].columns.shape[1] > 1]
+        single = [k for k in members if self.candidates[k].columns.shape[1] == 1 or k in unbound]
+        order = [*single, *(k for k in members if k not in single)]
+        paid = np.log(self.grid.freedom) * sum(self.candidates[k].columns.shape[1] for k in unbound)
+        columns = self.columns_of(order)
+        ridge = np.concatenate([
+            np.zeros(sum(self.candidates[k].columns.shape[1] for k in single)),
+            *(
+                np.full(self.candidates[k].columns.shape[1], 1.0 / self._lambda.get(k, LAMBDA[1]))
+                for k in order[len(single) :]
+            ),
+        ])  # fmt: skip
+        square, determinant, trace = self._square.copy(), np.zeros(len(self._square)), self._trace.copy()
+        turn, right, free = [], [], []
+        for p in range(len(square)):
+            pulled = np.hstack([np.zeros((len(self.y), 0)), *(self._pull(k)[p] for k in order)])
+            t, determinant[p] = _orthogonal(columns.T @ pulled, ridge, int(np.count_nonzero(ridge == 0.0)))
+            turn.append(t)
+            free.append(t.shape[1] - np.count_nonzero(ridge))
+            right.append(t.T @ (pulled.T @ self.y))
+            square[p] -= float(right[-1] @ right[-1])
+            trace[p] -= float(np.sum((pulled @ t) ** 2))
+        return _State(tuple(order), free, square, determinant + paid, trace, turn, right)
 
     def level(self, members: Sequence[int]) -> float:
         """Twice the log likelihood of a set."""
-        projector, extra = self.state(members)
-        return 2.0 * float(self.grid.log_likelihood(self.square(projector), extra))
+        state = self._state(members)
+        square = np.maximum(state.square, self.grid.freedom * LEAST_MM**2)
+        return 2.0 * float(self.grid.log_likelihood(square, state.determinant))
 
     def gains(self, members: Sequence[int]) -> FloatArray:
         """What every candidate brings beside a set: rise of twice the log likelihood, (candidates,)."""
-        projector, extra = self.state(members)
-        square = self.square(projector)
-        base = 2.0 * float(self.grid.log_likelihood(square, extra))
+        state = self._state(members)
         floor = self.grid.freedom * LEAST_MM**2
+        square = np.maximum(state.square, floor)
+        base = 2.0 * float(self.grid.log_likelihood(square, state.determinant))
         found = np.zeros(len(self.candidates))
-        for rows, columns in self._blocks:
-            parts = [_explained(own, self.y, columns) for own in projector]
+        for number, block in enumerate(self._blocks):
+            parts = [self._explained(state, number, p) for p in range(len(square))]
             taken = np.stack([part[0] for part in parts])  # (points, m, lambdas)
-            more = np.stack([part[1] for part in parts]) + extra[:, None, None]
+            more = np.stack([part[1] for part in parts]) + state.determinant[:, None, None]
             value = self.grid.log_likelihood(np.maximum(square[:, None, None] - taken, floor), more)
-            found[rows] = 2.0 * value.max(axis=1) - base
-            if columns.shape[2] > 1:
-                for k, best in zip(rows.tolist(), LAMBDA[value.argmax(axis=1)].tolist(), strict=True):
-                    if k not in members:
-                        self._best_lambda[k] = best
+            if value.shape[1] > len(LAMBDA):
+                value[self._named[block.rows], -1] = -np.inf
+            found[block.rows] = 2.0 * value.max(axis=1) - base
+            if block.columns.shape[1] > 1:
+                self._best_lambda[block.rows] = LAMBDAS[value.argmax(axis=1)]
         return found
+
+    def _explained(self, state: _State, number: int, point: int) -> tuple[FloatArray, FloatArray]:
+        """What the candidates of a block take off y'Py beside a set, and log det(1 + lambda C'PC), (m, lambdas).
+
+        One column is fitted freely (one lambda, no determinant) if enough of it can be seen.
+        """
+        block = self._blocks[number]
+        m, k = block.columns.shape[:2]
+        crossed = [self._crossed(member)[number][point] for member in state.members]
+        beside = np.concatenate([np.zeros((m, k, 0)), *crossed], axis=2) @ state.turn[point]
+        right = block.right[point] - beside @ state.right[point]
+        if k == 1:
+            size = block.value[point, :, 0] - np.sum(beside[:, 0] ** 2, axis=1)
+            seen = size > LEAST_SEEN * block.size * max(state.trace[point], 1e-12)
+            taken = np.where(seen, right[:, 0] ** 2 / np.where(seen, size, 1.0), 0.0)
+            # a free column takes its share of what the columns with a prior could explain: their determinant falls
+            alone = block.value[point, :, 0] - np.sum(beside[:, 0, : state.free[point]] ** 2, axis=1)
+            more = np.where(seen, np.log(np.where(seen, size / np.where(seen, alone, 1.0), 1.0)), 0.0)
+            return taken[:, None], more[:, None]
+        price = float(np.log(self.grid.freedom))
+        if beside.shape[2] < k:
+            return _ridged_beside(block.value[point], beside, right, price)
+        gram = np.eye(k) * block.value[point][:, None, :] - beside @ beside.transpose(0, 2, 1)
+        value, vector = np.linalg.eigh(gram)
+        turned = np.einsum("mkl,mk->ml", vector, right)
+        return _ridged(np.maximum(value, 0.0), turned, price)
 
     def criteria(self, members: Sequence[int]) -> tuple[FloatArray, FloatArray]:
         """Gain and gain less penalty of every candidate beside a set."""
-        key = frozenset(members)
+        gains, _ = self._compared(members)
+        return gains, gains - self._penalties
+
+    def _compared(self, members: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Gain of every candidate beside a set, and the variance over sigma^2 with which it is had."""
+        key = frozenset((k, self._lambda.get(k, 0.0)) for k in members)
         if key not in self._known:
-            self._known[key] = self._criteria(sorted(members))
+            gains = self.gains(sorted(members))
+            self._known[key] = gains, self._best_lambda.copy()
         return self._known[key]
 
-    def _criteria(self, members: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        gains = self.gains(members)
-        penalties = np.array([c.penalty(self.grid.freedom) for c in self.candidates])
-        return gains, gains - penalties
+    def _choose(self, members: Sequence[int], chosen: int) -> None:
+        """Give a candidate that joins a set the variance that suits it there."""
+        if self.candidates[chosen].columns.shape[1] > 1 and chosen not in members:
+            self._lambda[chosen] = float(self._compared(members)[1][chosen])
 
     def total(self, members: Sequence[int]) -> float:
         """Criterion of a set against the empty one; every member pays by what it brings beside those before it."""
@@ -212,12 +371,43 @@ class Search:
         return value
 
     def run(self, most: int) -> list[int]:
-        """Return the best set: names first and then all, or all from the start, whichever explains more."""
-        named = np.array([c.tier == "named" for c in self.candidates])
-        first = self._grown([], named, most)
-        found = self._grown(first, np.ones(len(named), dtype=bool), most)
-        other = self._grown([], np.ones(len(named), dtype=bool), most)
-        return max((found, other), key=self.total)
+        """Return the best set: names first and then all, all from the start, or from one smooth term, whichever explains more.
+
+        A step at a time does not find a smooth term that explains in one what several names explain together.
+        """
+        everything = np.ones(len(self.candidates), dtype=bool)
+        results = []
+
+        def keep(members: list[int]) -> None:
+            results.append((self._worth(members), members, dict(self._lambda)))
+
+        keep(self._grown(self._grown([], self._named, most), everything, most))
+        keep(self._grown([], everything, most))
+        gains = np.where(self._named, -np.inf, self.criteria([])[1])
+        starts: dict[str, int] = {}
+        for k in np.argsort(-gains, kind="stable").tolist():
+            if gains[k] > LEAST_GAIN and len(starts) < STARTS and most > 1:
+                starts.setdefault(self.candidates[k].name.partition(" at ")[0], k)
+        for k in starts.values():
+            self._choose([], k)
+            keep(self._grown([k], everything, most))
+        best = _first_of(results)[1]
+        if most > 1 and sum("run" in " ".join(self.candidates[k].covariates) for k in best):
+            for k in self._runs(RUN_STARTS):
+                keep(self._grown([k], self._named, most))
+        _, members, self._lambda = _first_of(results)
+        return members
+
+    def _runs(self, most: int) -> list[int]:
+        """Names of whole runs, those first that explain most: two runs that are off may hide each other from the first step."""
+        gains = self.criteria([])[0]
+        found = [k for k, c in enumerate(self.candidates) if c.name in OF_RUNS and c.columns.shape[1] == 1]
+        return sorted(found, key=lambda k: -gains[k])[:most]
+
+    def _worth(self, members: Sequence[int]) -> float:
+        """Criterion of a set, less what several names at once are unlikely."""
+        named = sum(self.candidates[k].tier == "named" for k in members)
+        return self.total(members) - MORE_NAMES * max(named - 1, 0)
 
     def _grown(self, members: list[int], allowed: NDArray[np.bool_], most: int) -> list[int]:
         """Forward steps, and after each of them every member is exchanged if another suits better beside the rest."""
@@ -225,7 +415,7 @@ class Search:
             best, criterion = self._best(members, allowed)
             if criterion < LEAST_GAIN:
                 break
-            self._lambda.setdefault(best, self._best_lambda.get(best, float(LAMBDA[1])))
+            self._choose(members, best)
             grown = self._exchanged([*members, best], allowed)
             if len(grown) <= len(members) and self.total(grown) <= self.total(members):
                 break
@@ -241,7 +431,7 @@ class Search:
 
     def _best(self, members: Sequence[int], allowed: NDArray[np.bool_]) -> tuple[int, float]:
         criteria = self._open(members, allowed)
-        best = int(np.argmax(criteria))
+        best = _first_best(criteria)
         return best, float(criteria[best])
 
     def _exchanged(self, members: list[int], allowed: NDArray[np.bool_]) -> list[int]:
@@ -250,33 +440,148 @@ class Search:
             for member in list(members):
                 rest = [k for k in members if k != member]
                 criteria = self._open(rest, allowed)
-                best = int(np.argmax(criteria))
+                best = _first_best(criteria)
                 if criteria[best] < LEAST_GAIN:
                     members, changed = rest, True
-                elif best != member and criteria[best] > criteria[member] + 1e-6:
-                    self._lambda.setdefault(best, self._best_lambda.get(best, float(LAMBDA[1])))
+                elif best != member and criteria[best] > criteria[member] + SAME:
+                    self._choose(rest, best)
                     members, changed = [*rest, best], True
             if not changed or len(members) < 2:
                 break
         return members
 
 
-def _explained(projector: FloatArray, y: FloatArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What candidates of k columns (n, m, k) take off y'Py, and log det(1 + lambda C'PC), (m, lambdas).
+def _first_of(
+    results: Sequence[tuple[float, list[int], dict[int, float]]],
+) -> tuple[float, list[int], dict[int, float]]:
+    """First of the results (criterion, members, variances) with the best criterion."""
+    most = max(result[0] for result in results)
+    return next(result for result in results if result[0] >= most - SAME)
 
-    One column is fitted freely (one lambda, no determinant) if enough of it can be seen.
+
+def _first_best(criteria: FloatArray) -> int:
+    """First of the candidates with the best criterion: rounding does not choose between two that are the same readings."""
+    return int(np.flatnonzero(criteria >= criteria.max() - SAME)[0])
+
+
+def _blocks_of(
+    grid: NoiseGrid, candidates: Sequence[Candidate], pulled: Sequence[FloatArray]
+) -> tuple[list[_Block], FloatArray]:
+    """Candidates by their number of columns, and the trace of P at every point; ``pulled`` are Py (n,) by point."""
+    sizes = np.array([c.columns.shape[1] for c in candidates], dtype=np.int64)
+    numbers = [np.flatnonzero(sizes == k) for k in np.unique(sizes).tolist()]
+    columns = [np.stack([candidates[r].columns.T for r in rows.tolist()]) for rows in numbers]
+    windows = [[_window(candidates[r].columns) for r in rows.tolist()] for rows in numbers]
+    grams: list[list[FloatArray]] = [[] for _ in numbers]
+    trace = []
+    for point in range(len(grid.points)):
+        projector = grid.projector(point)
+        trace.append(float(np.trace(projector)))
+        # sum of P from any row and column on: the Gram matrix of windows is a difference of four of these
+        summed = np.zeros((len(projector) + 1,) * 2)
+        summed[:-1, :-1] = projector[::-1, ::-1].cumsum(axis=0).cumsum(axis=1)[::-1, ::-1]
+        for gram, own, at in zip(grams, columns, windows, strict=True):
+            gram.append(_gram(projector, summed, own, at))
+    blocks = []
+    for rows, own, gram in zip(numbers, columns, grams, strict=True):
+        value, turn = np.linalg.eigh(np.stack(gram))
+        right = np.stack([own.reshape(-1, own.shape[2]) @ each for each in pulled]).reshape(value.shape)
+        right = np.einsum("pmkl,pmk->pml", turn, right)
+        blocks.append(_Block(rows, own, np.maximum(value, 0.0), turn, right, np.mean(own**2, axis=(1, 2))))
+    return blocks, np.array(trace)
+
+
+def _window(columns: FloatArray) -> tuple[int, int, float] | None:
+    """First reading, the one after the last, and value of a column that is constant there and zero elsewhere.
+
+    Several columns of one reading each, one after the other, have the value NaN. None for all other columns.
     """
-    n, count, k = columns.shape
-    flat = columns.reshape(n, count * k)
-    right = (projector @ y @ flat).reshape(count, k)
-    pulled = (projector @ flat).reshape(n, count, k)
-    if k == 1:
-        size = np.einsum("nmk,nmk->m", columns, pulled)
-        seen = size > LEAST_SEEN * np.einsum("nmk,nmk->m", columns, columns) * max(np.trace(projector) / n, 1e-12)
-        taken = np.where(seen, right[:, 0] ** 2 / np.where(seen, size, 1.0), 0.0)
-        return taken[:, None], np.zeros((count, 1))
-    value, vector = np.linalg.eigh(np.einsum("nmk,nml->mkl", columns, pulled))
-    turned = np.einsum("mkl,mk->ml", vector, right)
-    value = np.maximum(value, 0.0)[:, :, None]
-    taken = np.sum(turned[:, :, None] ** 2 * LAMBDA / (1.0 + LAMBDA * value), axis=1)
-    return np.asarray(taken), np.asarray(np.sum(np.log1p(LAMBDA * value), axis=1))
+    rows = np.flatnonzero(columns.any(axis=1))
+    if not len(rows) or rows[-1] - rows[0] + 1 != len(rows):
+        return None
+    first, end, own = int(rows[0]), int(rows[-1]) + 1, columns[rows]
+    if columns.shape[1] == 1:
+        return (first, end, float(own[0, 0])) if np.all(own == own[0]) else None
+    return (first, end, np.nan) if own.shape[0] == own.shape[1] and np.all(own == np.eye(len(own))) else None
+
+
+def _gram(
+    projector: FloatArray, summed: FloatArray, columns: FloatArray, windows: Sequence[tuple[int, int, float] | None]
+) -> FloatArray:
+    """C'PC of candidates with columns (m, k, n), (m, k, k)."""
+    m, k, n = columns.shape
+    found = np.empty((m, k, k))
+    rest = [i for i, window in enumerate(windows) if window is None]
+    if rest:
+        flat = columns[rest].reshape(-1, n)
+        found[rest] = columns[rest] @ (flat @ projector).reshape(-1, k, n).transpose(0, 2, 1)
+    for i, window in enumerate(windows):
+        if window is None:
+            continue
+        a, b, value = window
+        if k == 1:
+            found[i] = value**2 * (summed[a, a] - summed[a, b] - summed[b, a] + summed[b, b])
+        else:
+            found[i] = projector[a:b, a:b]
+    return found
+
+
+def _crossed(block: _Block, pulled: FloatArray) -> FloatArray:
+    """C'P times the columns of a member, in the axes of each candidate, (points, m, k, own k), from PC (points, n, own k)."""
+    m, k, n = block.columns.shape
+    points, _, own = pulled.shape
+    found = block.columns.reshape(m * k, n) @ pulled.transpose(1, 0, 2).reshape(n, points * own)
+    found = found.reshape(m, k, points, own).transpose(2, 0, 1, 3)
+    return np.asarray(found if k == 1 else block.turn.transpose(0, 1, 3, 2) @ found)
+
+
+def _orthogonal(gram: FloatArray, ridge: FloatArray, single: int) -> tuple[FloatArray, float]:
+    """T with T'(G + ridge) T = 1, and log det(1 + G / ridge) of those with a prior beside the first ``single`` without one.
+
+    What the columns without a prior have in common is counted once.
+    """
+    if not len(gram):
+        return np.zeros((0, 0)), 0.0
+    value, vector = np.linalg.eigh(0.5 * (gram + gram.T)[:single, :single])
+    kept = value > 1e-10 * value.max(initial=0.0)
+    first = vector[:, kept] / np.sqrt(value[kept])
+    if single == len(gram):
+        return first, 0.0
+    shared = first.T @ gram[:single, single:]
+    prior = ridge[single:]
+    factor = np.linalg.cholesky(gram[single:, single:] - shared.T @ shared + np.diag(prior))
+    second = np.linalg.inv(factor).T
+    turn = np.zeros((len(gram), first.shape[1] + len(second)))
+    turn[:single, : first.shape[1]] = first
+    turn[:single, first.shape[1] :] = -first @ shared @ second
+    turn[single:, first.shape[1] :] = second
+    return turn, 2.0 * float(np.sum(np.log(np.diag(factor)))) - float(np.sum(np.log(prior)))
+
+
+def _ridged(value: FloatArray, right: FloatArray, price: float) -> tuple[FloatArray, FloatArray]:
+    """What columns take off, and log det(1 + lambda C'PC), (m, lambdas), from eigenvalues and C'Py in their axes, (m, k).
+
+    The last are those that are fitted freely, at a price for each column.
+    """
+    grown = LAMBDAS * value[:, :, None]
+    taken = np.sum(right[:, :, None] ** 2 * LAMBDAS / (1.0 + grown), axis=1)
+    determinant = np.sum(np.log1p(grown), axis=1)
+    determinant[:, -1] = price * value.shape[1]
+    return np.asarray(taken), np.asarray(determinant)
+
+
+def _ridged_beside(
+    value: FloatArray, beside: FloatArray, right: FloatArray, price: float
+) -> tuple[FloatArray, FloatArray]:
+    """The same where C'PC is the eigenvalues (m, k) less B B' with B (m, k, r), r < k: the formula of Woodbury."""
+    taken, determinant = _ridged(value, right, price)
+    if not beside.shape[2]:
+        return taken, determinant
+    inverse = LAMBDAS / (1.0 + LAMBDAS * value[:, :, None])  # (m, k, lambdas)
+    scaled = inverse.transpose(0, 2, 1)[..., None] * beside[:, None]  # (m, lambdas, k, r)
+    middle = np.eye(beside.shape[2]) - beside.transpose(0, 2, 1)[:, None] @ scaled
+    pulled = np.einsum("mlkr,mk->mlr", scaled, right)
+    more = np.einsum("mlr,mlr->ml", pulled, np.linalg.solve(middle, pulled[..., None])[..., 0])
+    beside_of = np.linalg.slogdet(middle)[1]
+    beside_of[:, -1] = 0.0
+    return taken + more, determinant + beside_of

@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
-from compgen.core.axis_runs import AxisRuns
-from compgen.core.csvio import FloatArray
-from compgen.core.machine import Machine
-from compgen.core.names import AXES
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
+from compgen.data.names import AXES
 from compgen.diagnose.layout import IntArray
 from compgen.effects import Readings
 
@@ -98,6 +99,26 @@ class AxisSession:
     def repeated(self) -> bool:
         """Whether most readings have repeats in their cell."""
         return float(np.mean(np.bincount(self.cell)[self.cell] > 1)) >= 0.5
+
+    @property
+    def in_runs(self) -> bool:
+        """Whether it went run by run; a session that went target by target has no runs that may be bad or stepped."""
+        return len(self) >= 2.5 * (int(self.leg.max()) + 1)
+
+    def run_means_mm(self, values_mm: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+        """Means of the runs up and down, free from the curve of the axis, mm, (ways, runs); each way has the mean zero.
+
+        Only readings ``used`` (n,) count; a run that lacks a target is compared at the others. NaN: no reading of that run.
+        """
+        runs, targets = np.eye(int(self.cycle.max()) + 1)[self.cycle], np.eye(len(self.targets_mm))[self.target]
+        means = []
+        for way in np.unique(self.direction[used]):
+            own = used & (self.direction == way)
+            design = np.hstack([runs[own], targets[own]])
+            found = np.linalg.lstsq(design, values_mm[own], rcond=None)[0][: runs.shape[1]]
+            found[~runs[own].any(axis=0)] = np.nan
+            means.append(found - np.nanmean(found))
+        return np.array(means)
 
     @property
     def cycle_span(self) -> float:

@@ -1,39 +1,48 @@
-"""Diagnose: find where model and measurement disagree, name the effect, add it, and see the gap shrink."""
+"""Diagnose: find where model and measurement disagree, name the effect, add it, and see the misfit shrink."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from compgen.core.axis_runs import AxisRuns
-from compgen.core.csvio import FloatArray
-from compgen.core.deviations import Deviations
-from compgen.core.error_table import ErrorTable
-from compgen.core.lengths import Lengths
-from compgen.core.machine import Machine
-from compgen.core.names import MM_PER_UM
-from compgen.core.text import nearest
-from compgen.core.threads import one_thread
-from compgen.diagnose.advice import advice_of
-from compgen.diagnose.against import compared
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.csv_files import FloatArray
+from compgen.data.declared import option
+from compgen.data.deviations import Deviations
+from compgen.data.error_table import ErrorTable
+from compgen.data.lengths import Lengths
+from compgen.data.machine import Machine
+from compgen.data.messages import nearest
+from compgen.data.names import MM_PER_UM
 from compgen.diagnose.analysis import Analysis, analyse
 from compgen.diagnose.axis_diagnosis import AxisDiagnosis, findings_of
 from compgen.diagnose.axis_session import Order
-from compgen.diagnose.base import BaseFit
-from compgen.diagnose.base_choice import fit_smooth
-from compgen.diagnose.classes import classes_of, disturbed_class, disturbed_readings, gross_readings
-from compgen.diagnose.gap import gap_of
-from compgen.diagnose.gross import correction_of, looks_gross
-from compgen.diagnose.measurement import Measurement
-from compgen.diagnose.observed import Observed, ObservedDeviations, ObservedLengths
-from compgen.diagnose.refit import refit
-from compgen.diagnose.result import Classed, Diagnosis
-from compgen.diagnose.verdict import verdict_of
+from compgen.diagnose.base_fit import BaseFit
+from compgen.diagnose.diagnosis import Classed, Diagnosis, gap_of, refit
+from compgen.diagnose.gross import (
+    classes_of,
+    correction_of,
+    disturbed_class,
+    disturbed_readings,
+    gross_readings,
+    looks_gross,
+)
+from compgen.diagnose.groups import fit_smooth
+from compgen.diagnose.observed import Measurement, Observed, ObservedDeviations, ObservedLengths
+from compgen.diagnose.verdict import advice_of, compared, verdict_of
 from compgen.effects import catalogue
-from compgen.effects.of_machine import active_effects
+from compgen.effects.catalogue import active_effects
 from compgen.errors import InputError
+from compgen.instruments.sixdof_health import Suspicion, sixdof_health
+from compgen.instruments.sixdof_instrument import SixDofInstrument
+from compgen.instruments.sixdof_readings import SixDof
+from compgen.kinematics.kernel_switch import one_thread
+
+# The steps of a diagnosis, and the diagnosis of six-DOF readings.
+
 
 Show = Callable[[str], None]
 
@@ -56,13 +65,23 @@ class DiagnoseOptions:
     order : order of axis runs in time: as logged, else run by run, up then down; or what the user says.
     """
 
-    max_effects: int = 4
-    effects: tuple[str, ...] = ()
-    add: tuple[str, ...] = ()
-    u_um: float | None = None
-    against: ErrorTable | None = None
-    order: Order = "auto"
-    leave_out_disturbed: bool = False
+    max_effects: int = option(4, "Most named effects at once.", within=(0, 6))
+    effects: tuple[str, ...] = option(
+        (), "Look for these effects only; default: the whole catalogue.", metavar="NAME,..."
+    )
+    add: tuple[str, ...] = option((), "Add this effect whether it was found or not.", metavar="NAME")
+    u_um: float | None = option(None, "Standard uncertainty of a reading, um; used where no line was repeated.")
+    against: ErrorTable | None = option(
+        None,
+        "Errors (*.errors.csv) that the measurement is compared with: which have changed?",
+        metavar="ERRORS",
+    )
+    order: Order = option(
+        "auto",
+        "Order of axis runs in time: time_s or the column order, else run by run, up then down (auto); or as named. The "
+        "order of rows counts with 'rows' only.",
+    )
+    leave_out_disturbed: bool = option(False, "Leave out short bursts of disturbed readings once they are found.")
 
 
 def diagnose(
@@ -79,7 +98,7 @@ def diagnose(
     machine : chain, travel and which errors its model contains.
     measurement : tracer lengths, measured deviations, or axis runs.
     options : what it may do.
-    show : receives the stage in words.
+    show : is told each step in words.
 
     Raises
     ------
@@ -100,7 +119,7 @@ def diagnose(
         )  # fmt: skip
         return AxisDiagnosis(machine, measurement, tuple(found))
     if chosen.order != "auto":
-        raise InputError("--order belongs to axis runs; the rows of other measurements are ordered by time_s")
+        raise InputError("--order applies to axis runs only; other measurements are ordered by time_s")
     with one_thread():
         show("fitting the base model")
         observed = observed_of(machine, measurement)
@@ -118,7 +137,7 @@ def diagnose(
         freedom = len(observed) - fit.jacobian.shape[1]
         if freedom < 20:
             raise InputError(
-                f"{len(observed)} readings leave {freedom} degrees of freedom beside {fit.jacobian.shape[1]} unknowns; "
+                f"{len(observed)} readings with {fit.jacobian.shape[1]} unknowns leave {freedom} degrees of freedom; "
                 "a diagnosis needs at least 20: measure more lines"
             )
         analysis = _analysed(measurement, observed, fit, chosen, show)
@@ -147,8 +166,7 @@ def _base(observed: Observed) -> BaseFit:
     present = [change for change in known if change is not None]
     if not present:
         return fit
-    observed.value_mm = observed.value_mm - sum(present)
-    return fit_smooth(observed)
+    return fit_smooth(observed.minus(np.sum(present, axis=0)))
 
 
 def _analysed(
@@ -196,17 +214,19 @@ def _completed(
     classed: Sequence[Classed],
     removed: int,
 ) -> Diagnosis:
-    """Verdict, refit and gap; ``before`` is the fit to the file as it stands."""
+    """Verdict, refit and misfit; ``before`` is the fit to the unchanged file."""
     verdict = verdict_of(analysis)
     show("fitting the model with what was found")
     added = [*verdict.added, *_wanted(analysis, options.add, verdict.added)]
     found = refit(analysis, added)
     show("testing on lines, stations and times left out")
-    scene = analysis.scene
-    seen = {g: scene.groups[g].columns @ scene.maps[g] for g in added if scene.size(g)}
-    base = [columns for g, columns in seen.items() if scene.groups[g].tier == "base"]
-    columns = [columns for g, columns in seen.items() if scene.groups[g].tier != "base"]
-    predicting = [columns for g, columns in seen.items() if scene.groups[g].tier != "base" and scene.groups[g].predicts]
+    design = analysis.design
+    seen = {g: design.groups[g].columns @ design.maps[g] for g in added if design.size(g)}
+    base = [columns for g, columns in seen.items() if design.groups[g].tier == "base"]
+    columns = [columns for g, columns in seen.items() if design.groups[g].tier != "base"]
+    predicting = [
+        columns for g, columns in seen.items() if design.groups[g].tier != "base" and design.groups[g].predicts
+    ]
     gap = gap_of(analysis.fit, columns, predicting, analysis.noise, base)
     if before is not analysis.fit:
         gap = replace(gap, train=replace(gap.train, before_mm=before.rms_mm))
@@ -225,13 +245,85 @@ def _completed(
 
 def _wanted(analysis: Analysis, names: Sequence[str], present: Sequence[int]) -> list[int]:
     """Groups of the names that the user wants added, at their best scan position."""
-    scene = analysis.scene
+    design = analysis.design
     found = []
     for name in names:
-        groups = [g for g, group in enumerate(scene.groups) if group.name == name and group.tier == "named"]
+        groups = [g for g, group in enumerate(design.groups) if group.name == name and group.tier == "named"]
         if not groups:
-            known = sorted({group.name for group in scene.groups if group.tier == "named"})
+            known = sorted({group.name for group in design.groups if group.tier == "named"})
             raise InputError(f"{name!r} cannot be added to this measurement; possible are {', '.join(known)}")
         if not set(groups) & set(present):
-            found.append(max(groups, key=lambda g: float(np.sum(scene.score[scene.place(g)] ** 2))))
+            found.append(max(groups, key=lambda g: float(np.sum(design.score[design.place(g)] ** 2))))
     return found
+
+
+# Six-DOF readings: what they say about the instrument that took them, in the form of a diagnosis.
+#
+# An error of the instrument that depends on the distance alone is the same as a geometric error, so that no statistics
+# can name it; only what changes with direction, time or order shows. Hence names are tentative: a machine may bend so.
+
+
+NOTE = (
+    "an optical error that depends on the distance alone equals a geometric error: no statistics can tell the two apart"
+)
+#: What separates instrument and machine.
+ADVICE = (
+    "turn the target by 180 degrees and measure again: separates crosstalk fixed to the target from straightness",
+    "measure with a second target offset: separates crosstalk and detector gains from straightness",
+    "run forth and back three times: separates the drift of the beam from straightness",
+)
+
+
+@dataclass(frozen=True)
+class SixDofDiagnosis:
+    """What six-DOF readings show of their instrument."""
+
+    machine: Machine
+    suspicions: tuple[Suspicion, ...]
+
+    @property
+    def acceptable(self) -> bool:
+        """Hints are no reason to refuse the readings."""
+        return True
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``diagnosis.json``."""
+        names = {item.name for item in self.suspicions}
+        cards = {name: e.card for name, e in catalogue().items() if "sixdof" in e.card.kinds}
+        empty = {"before_rms_um": None, "after_rms_um": None}
+        return {
+            "verdict": "named" if self.suspicions else "none",
+            "effects": [_effect(item) for item in self.suspicions],
+            "unknown": [],
+            "invisible": [name for name in cards if name not in names and name != "beam_drift"],
+            "secondary": [],
+            "gap": {"train": empty, "noise_floor_um": None, "noise_floor_source": "assumed"},
+            "advice": list(ADVICE),
+            "reasons": [],
+            "notes": [NOTE],
+        }
+
+
+def _effect(item: Suspicion) -> dict[str, Any]:
+    return {
+        "name": item.name,
+        "alias_set": [{"name": item.name, "weight": 1.0}],
+        "parameters": {key: {"value": value, "u": None} for key, value in item.evidence.items()},
+        "confidence": 0.5,
+        "grade": "tentative",
+        "visible_fraction": None,
+        "axis": item.axis,
+        "reasons": [item.text],
+    }
+
+
+def diagnose_sixdof(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> SixDofDiagnosis:
+    """Return what the readings say about the instrument."""
+    return SixDofDiagnosis(machine, tuple(sixdof_health(machine, readings, instrument)))
+
+
+def sixdof_text(found: SixDofDiagnosis) -> str:
+    """Return the report as Markdown text."""
+    lines = [f"# Diagnosis of the six-DOF readings of {found.machine.name}", ""]
+    lines += [f"* **{item.name}** ({item.axis}): {item.text}" for item in found.suspicions] or ["* nothing stands out"]
+    return "\n".join([*lines, "", f"Note: {NOTE}.", "", *[f"* {text}" for text in ADVICE]]) + "\n"

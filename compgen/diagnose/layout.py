@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.core.csvio import FloatArray
+from compgen.data.csv_files import FloatArray
 from compgen.effects import Readings
 
 IntArray = NDArray[np.int64]
@@ -37,7 +37,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Layout:
+class MeasurementLayout:
     """The order of a measurement; T stops, n readings.
 
     Parameters
@@ -82,7 +82,7 @@ def _codes(columns: Sequence[FloatArray]) -> IntArray:
     return codes.ravel().astype(np.int64)
 
 
-def layout_of(readings: Readings, channel: IntArray, given_stop: IntArray | None = None) -> Layout:
+def layout_of(readings: Readings, channel: IntArray, given_stop: IntArray | None = None) -> MeasurementLayout:
     """Sort readings by stop and time.
 
     Parameters
@@ -94,7 +94,9 @@ def layout_of(readings: Readings, channel: IntArray, given_stop: IntArray | None
     seconds = readings.covariates.get("time_s")
     timed = seconds is not None and not bool(np.isnan(seconds).any())
     stop = _stops(readings, channel, seconds if timed else None) if given_stop is None else given_stop
-    time = _first(stop, seconds if timed and seconds is not None else np.arange(len(stop), dtype=np.float64))
+    time = np.asarray(
+        (seconds if timed and seconds is not None else np.arange(len(stop), dtype=np.float64))[_first_rows(stop)]
+    )
     order = np.argsort(time, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -104,15 +106,25 @@ def layout_of(readings: Readings, channel: IntArray, given_stop: IntArray | None
     run = _runs(readings, first)
     cell = _cells(readings, first, run)
     condition = _conditions(run, cell)
-    return Layout(stop, channel, time, timed, run, condition, cell, _numbers(run), _blocks(stop, channel))
+    # Number of each stop in its run, from -1 to +1; zeros for runs of one stop.
+    start = np.unique(run, return_index=True)[1]
+    count = np.bincount(run)
+    number = np.arange(len(run)) - start[run]
+    return MeasurementLayout(
+        stop,
+        channel,
+        time,
+        timed,
+        run,
+        condition,
+        cell,
+        np.asarray(np.where(count[run] > 1, 2.0 * number / np.maximum(count[run] - 1, 1) - 1.0, 0.0)),
+        _blocks(stop, channel),
+    )
 
 
 def _first_rows(stop: IntArray) -> IntArray:
     return np.unique(stop, return_index=True)[1].astype(np.int64)
-
-
-def _first(stop: IntArray, values: FloatArray) -> FloatArray:
-    return np.asarray(values[_first_rows(stop)])
 
 
 def _stops(readings: Readings, channel: IntArray, seconds: FloatArray | None) -> IntArray:
@@ -196,19 +208,11 @@ def _travel(position_mm: FloatArray, run: IntArray) -> FloatArray:
 
 
 def _conditions(run: IntArray, cell: IntArray) -> IntArray:
-    """Number alike the runs that go through the same cells: the smallest cell of a run stands for it."""
+    """Number alike the runs that go through the same cells: the smallest cell of a run represents it."""
     least = np.full(int(run.max()) + 1, np.iinfo(np.int64).max)
     np.minimum.at(least, run, cell)
     _, codes = np.unique(least, return_inverse=True)
     return codes.ravel().astype(np.int64)[run]
-
-
-def _numbers(run: IntArray) -> FloatArray:
-    """Number of each stop in its run, from -1 to +1; zeros for runs of one stop."""
-    start = np.unique(run, return_index=True)[1]
-    count = np.bincount(run)
-    number = np.arange(len(run)) - start[run]
-    return np.asarray(np.where(count[run] > 1, 2.0 * number / np.maximum(count[run] - 1, 1) - 1.0, 0.0))
 
 
 def _blocks(stop: IntArray, channel: IntArray) -> tuple[Block, ...]:

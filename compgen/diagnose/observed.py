@@ -1,25 +1,83 @@
-"""One form for every kind of measurement: scalar readings, the unknowns that place them, and their derivative.
-
-Reading = model(errors, placement) + effects + noise. Lengths are placed by stations and dead lengths, deviations by a
-rigid motion of their frame.
-"""
+"""One form for every kind of measurement: scalar readings, the unknowns that place them, and their derivative."""
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 
-from compgen.core.csvio import FloatArray
-from compgen.core.deviations import Deviations
-from compgen.core.lengths import Lengths
-from compgen.core.machine import Machine
-from compgen.diagnose.layout import IntArray, Layout, layout_of
-from compgen.diagnose.station_start import located
+from compgen.data.axis_runs import AxisRuns, read_axis_runs
+from compgen.data.csv_files import FloatArray
+from compgen.data.deviations import Deviations, read_deviations
+from compgen.data.lengths import Lengths, read_lengths
+from compgen.data.machine import Machine
+from compgen.data.records import detect_format
+from compgen.diagnose.layout import IntArray, MeasurementLayout, layout_of
 from compgen.effects import Readings, readings_of_deviations, readings_of_lengths
-from compgen.identify.task import dead_lengths_of
-from compgen.model.volumetric import tool_of
+from compgen.errors import InputError
+from compgen.identify.adjust.starts import StationStart, station_start
+from compgen.identify.tracer_lengths import dead_lengths_of
+from compgen.kinematics.first_order import tool_of
+
+# Start values of a station in closed form, refined on the distances; no search, so that gross errors show at once.
+
+
+REFINEMENTS = 4
+LEAST_SHARE = 1e-9
+
+
+def located(
+    target_mm: FloatArray, length_mm: FloatArray, group: IntArray, groups: int
+) -> tuple[StationStart, FloatArray]:
+    """Place and dead lengths of a station, and the residuals of its readings, (n,).
+
+    |P|^2 - L^2 = 2 P.s + 2 l L - (|s|^2 - l^2), linear in s, l and a constant for each set-up.
+    """
+    centre = target_mm.mean(axis=0)
+    scale = max(float(np.abs(target_mm - centre).max()), 1.0)
+    p, offset = (target_mm - centre) / scale, float(length_mm.mean())
+    reading = (length_mm - offset) / scale
+    member = (group[:, None] == np.arange(groups)).astype(np.float64)
+    design = np.hstack([2 * p, 2 * reading[:, None] * member, member])
+    target = np.einsum("ij,ij->i", p, p) - reading**2
+    solution, _, rank, _ = np.linalg.lstsq(design, target, rcond=LEAST_SHARE)
+    if rank < design.shape[1]:
+        found = station_start(target_mm, length_mm, group, groups)
+    else:
+        found = StationStart(solution[:3] * scale + centre, solution[3 : 3 + groups] * scale - offset)
+    return _refined(target_mm, length_mm, group, member, found)
+
+
+def _refined(
+    target_mm: FloatArray, length_mm: FloatArray, group: IntArray, member: FloatArray, start: StationStart
+) -> tuple[StationStart, FloatArray]:
+    best, residual = start, _residual(target_mm, length_mm, group, start)
+    for _ in range(REFINEMENTS):
+        line = target_mm - best.position_mm
+        unit = line / np.maximum(np.linalg.norm(line, axis=1), 1e-9)[:, None]
+        step = np.linalg.lstsq(np.hstack([-unit, -member]), residual, rcond=1e-9)[0]
+        moved = StationStart(best.position_mm + step[:3], best.dead_length_mm + step[3:])
+        new = _residual(target_mm, length_mm, group, moved)
+        if not np.sum(new**2) < np.sum(residual**2):
+            break
+        best, residual = moved, new
+    return best, residual
+
+
+def _residual(target_mm: FloatArray, length_mm: FloatArray, group: IntArray, start: StationStart) -> FloatArray:
+    distance = np.linalg.norm(target_mm - start.position_mm, axis=1)
+    return np.asarray(length_mm - distance + start.dead_length_mm[group])
+
+
+# One form for every kind of measurement: scalar readings, the unknowns that place them, and their derivative.
+#
+# Reading = model(errors, placement) + effects + noise. Lengths are placed by stations and dead lengths, deviations by a
+# rigid motion of their frame.
 
 
 @dataclass(frozen=True)
@@ -45,7 +103,7 @@ class Observed(ABC):
     machine: Machine
     value_mm: FloatArray
     poses: Poses
-    layout: Layout
+    layout: MeasurementLayout
     placement_names: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -63,6 +121,12 @@ class Observed(ABC):
     @abstractmethod
     def readings(self, tip_mm: FloatArray, placement: FloatArray) -> Readings:
         """The readings as effects see them."""
+
+    def minus(self, change_mm: FloatArray) -> Self:
+        """Return the same measurement with ``change_mm`` (n,) taken off its readings."""
+        changed = copy.copy(self)
+        changed.value_mm = self.value_mm - change_mm
+        return changed
 
     @abstractmethod
     def part(self, rows: IntArray) -> Observed:
@@ -84,13 +148,12 @@ class ObservedLengths(Observed):
             where = "" if setup is None else f" in set-up {setup[row]}"
             names.append(f"dead length of {lengths.stations[lengths.station[row]]}{where}")
         self.placement_names = tuple(names)
-        self.layout = layout_of(self._bare_readings(), lengths.station)
-
-    def _bare_readings(self) -> Readings:
-        """Readings with directions and ranges left open: all that the layout needs."""
+        # Readings with directions and ranges left open: all that the layout needs.
         far = self.lengths.position_mm.mean(axis=0) + np.array([0.0, 0.0, 1e5])
         tips = self.lengths.position_mm
-        return readings_of_lengths(self.machine, self.lengths, np.broadcast_to(far, tips.shape), tips)
+        self.layout = layout_of(
+            readings_of_lengths(self.machine, self.lengths, np.broadcast_to(far, tips.shape), tips), lengths.station
+        )
 
     def start(self) -> FloatArray:
         """Stations and dead lengths in closed form from the nominal targets."""
@@ -196,3 +259,35 @@ class ObservedDeviations(Observed):
     def part(self, rows: IntArray) -> ObservedDeviations:
         """Return some of the components."""
         return ObservedDeviations(self.machine, self.deviations, self.rows[rows])
+
+
+# Measurements that can be diagnosed, told apart by the columns of their files.
+
+
+Measurement = Lengths | Deviations | AxisRuns
+
+
+def read_diagnosed(paths: Sequence[str | Path]) -> Measurement:
+    """Read measurement files of one kind: tracer lengths, measured deviations or axis runs."""
+    kinds = {path: _kind(path) for path in paths}
+    if len(set(kinds.values())) > 1:
+        odd = next(path for path, kind in kinds.items() if kind != kinds[paths[0]])
+        message = f"holds {kinds[odd]}, and another file {kinds[paths[0]]}; diagnose them one after the other"
+        raise InputError(message, file=odd)
+    kind, files = kinds[paths[0]], list(paths)
+    if kind == "axis runs":
+        return read_axis_runs(files)
+    return read_deviations(files) if kind == "deviations" else read_lengths(files)
+
+
+def _kind(path: str | Path) -> str:
+    kind = detect_format(path)
+    if kind == "sixdof":
+        message = "holds six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
+        raise InputError(message, file=path)
+    if kind == "part":
+        message = (
+            "holds features of a part, which identify and accuracy take; diagnose takes lengths, deviations, axis runs"
+        )
+        raise InputError(message, file=path)
+    return {"axis": "axis runs", "deviations": "deviations"}.get(str(kind), "lengths")

@@ -1,30 +1,84 @@
-"""The verdict: names in three grades, what has no name, what the plan cannot see."""
+"""The verdict: names in three grades, what has no name, what the plan cannot see, and what to measure next."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 
-from compgen.core.names import SQUARENESS_NAMES
-from compgen.diagnose.alternatives import Alternative, alternatives
-from compgen.diagnose.analysis import Analysis
-from compgen.diagnose.evidence import HOMOGENEITY_P, contribution
+from compgen.data.csv_files import FloatArray
+from compgen.data.display import Bars, Drawable, Overview, Panel
+from compgen.data.error_table import ErrorTable
+from compgen.data.machine import Machine
+from compgen.data.names import MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_named
+from compgen.diagnose.analysis import HOMOGENEITY_P, Analysis, contribution
+from compgen.diagnose.base_fit import BaseFit, Part, least_norm, size_of
 from compgen.diagnose.groups import Group
-from compgen.diagnose.search import beside, gains, plain_covariates
+from compgen.diagnose.observed import Observed
+from compgen.diagnose.search import (
+    Alternative,
+    Design,
+    alternatives,
+    gains,
+    orthonormal,
+    plain_covariates,
+    remainder_of,
+)
 from compgen.effects import catalogue
+from compgen.kinematics.exact_chain import tip_position
+
+# The verdict: names in three grades, what has no name, what the plan cannot see.
+
 
 Grade = Literal["confirmed", "beside_unknown", "tentative"]
 Word = Literal["named", "none", "unknown", "not_decidable"]
 
-#: Names of which less than this is left beside the base model are never confirmed.
+
+class DisplayedDiagnosis(Drawable):
+    """How a diagnosis shows itself, of any measurement: from the content of its ``diagnosis.json``."""
+
+    machine: Machine
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``diagnosis.json``."""
+        raise NotImplementedError
+
+    def overview(self) -> Overview:
+        """The verdict, and each name with its grade and parameters."""
+        found = self.to_dict()
+        rows = tuple((x["name"], x["grade"], _parameters_text(x["parameters"])) for x in found["effects"])
+        names = f": {', '.join(name for name, _, _ in rows)}" if rows else ""
+        title = f"{self.machine.name}: {found['verdict'].replace('_', ' ')}{names}"
+        notes = (*(item["text"] for item in found["unknown"]), *found["reasons"])
+        return Overview(title, ("effect", "grade", "parameters"), rows, notes)
+
+    def panels(self) -> Sequence[Panel]:
+        """Root mean square of the residuals before and after, of the readings used and of those left out."""
+        gap = self.to_dict()["gap"]
+        shown = {key.removeprefix("heldout_"): pair for key, pair in gap.items() if isinstance(pair, dict)}
+        before = Bars("before", tuple(shown), tuple(pair["before_rms_um"] for pair in shown.values()))
+        after = Bars("after", tuple(shown), tuple(pair["after_rms_um"] for pair in shown.values()))
+        return [Panel("residuals of the readings used and left out", "rms (um)", bars=(before, after))]
+
+
+def _parameters_text(parameters: dict[str, dict[str, float | None]]) -> str:
+    """Parameters with their uncertainty in one line."""
+    texts = []
+    for name, item in parameters.items():
+        known = "" if item["u"] is None else f" +- {item['u']:.2g}"
+        texts.append(f"{name} = {item['value']:.4g}{known}")
+    return ", ".join(texts)
+
+
+#: Names of which less than this is left without the base model are never confirmed.
 LEAST_VISIBLE = 0.05
 #: A name is not confirmed if its chi-square is below this share of that of all members without a (firm) name.
 LEAST_SHARE = 0.1
 #: The same for a jump of the whole machine: among many times one suits any slow change a little.
 LEAST_JUMP_SHARE = 0.5
-#: p-value of the homogeneity below which a name is not confirmed beside something that has no name.
+#: p-value of the homogeneity below which a name is not confirmed next to something that has no name.
 HOMOGENEITY_BESIDE_P = 0.01
 #: Unevenness that explains less than this share of the chi-square of a name is its inexact shape, not another effect.
 SLIGHTLY_UNEVEN = 0.03
@@ -87,10 +141,10 @@ class Verdict:
 
 def verdict_of(analysis: Analysis) -> Verdict:
     """Draw the verdict."""
-    scene, evidence = analysis.scene, analysis.evidence
+    design, evidence = analysis.design, analysis.evidence
     members = analysis.chosen.members
-    names = [g for g in members if scene.groups[g].tier == "named"]
-    generic = [g for g in members if scene.groups[g].tier == "generic"]
+    names = [g for g in members if design.groups[g].tier == "named"]
+    generic = [g for g in members if design.groups[g].tier == "generic"]
     jumps = _common_jumps(analysis, names)
     names = [g for g in names if g not in jumps]
     names.sort(key=lambda g: -evidence.chi2[g])
@@ -105,12 +159,14 @@ def verdict_of(analysis: Analysis) -> Verdict:
     firm = [item for item in graded if item.grade != "tentative"]
     repeats = analysis.noise.source != "assumed"
     if not repeats:
-        firm = [item for item in graded if not _doubtful(item)]
+        firm = [
+            item for item in graded if not any(not reason.startswith("the noise is assumed") for reason in item.reasons)
+        ]
     word: Word = "named" if firm else "unknown" if unknown or graded else "none"
     if word == "unknown" and not unknown:
         unknown = [_resembling(analysis, graded[0])]
     if unknown:
-        graded = [_beside(item) for item in graded]
+        graded = [replace(item, grade="beside_unknown") if item.grade == "confirmed" else item for item in graded]
     reasons = [] if repeats else ["no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"]
     return Verdict(
         word,
@@ -123,27 +179,17 @@ def verdict_of(analysis: Analysis) -> Verdict:
     )
 
 
-def _doubtful(item: Named) -> bool:
-    return any(not reason.startswith("the noise is assumed") for reason in item.reasons)
-
-
-def _beside(item: Named) -> Named:
-    if item.grade != "confirmed":
-        return item
-    return Named(**{**item.__dict__, "grade": "beside_unknown"})
-
-
 def _common_jumps(analysis: Analysis, names: list[int]) -> list[int]:
     """Steps of two or more stations at the same time: the machine or the target jumped, not the stations."""
-    steps = [g for g in names if analysis.scene.groups[g].name.startswith("length_step_")]
+    steps = [g for g in names if analysis.design.groups[g].name.startswith("length_step_")]
     spacing = 12 * analysis.noise.spacing
     together = []
     for g in steps:
-        at = analysis.scene.groups[g].position
+        at = analysis.design.groups[g].position
         near = [
             h
             for h in steps
-            if h != g and at is not None and abs((analysis.scene.groups[h].position or 0) - at) < spacing
+            if h != g and at is not None and abs((analysis.design.groups[h].position or 0) - at) < spacing
         ]
         if near:
             together.append(g)
@@ -151,23 +197,23 @@ def _common_jumps(analysis: Analysis, names: list[int]) -> list[int]:
 
 
 def _owner(analysis: Analysis, generic: int, names: list[int], gain: float | None = None) -> int | None:
-    """The named member whose inexact shape a generic group is, if there is one; ``gain`` if it is no member."""
-    scene, evidence = analysis.scene, analysis.evidence
+    """The named member whose inexact shape a generic group is, if there is one; ``gain`` if it is not a member."""
+    design, evidence = analysis.design, analysis.evidence
     gain = evidence.chi2[generic] if gain is None else gain
-    own = plain_covariates(scene.groups[generic].covariates) - {"x", "y", "z"}
+    own = plain_covariates(design.groups[generic].covariates) - {"x", "y", "z"}
     for g in names:
-        covariates = plain_covariates(scene.groups[g].covariates)
-        if scene.groups[g].name.startswith(RUNOUT):  # a runout of any law is a matter of the angles of its own beam
-            covariates |= {"azimuth", "elevation", f"station_{scene.groups[g].name.removeprefix(RUNOUT)}"}
+        covariates = plain_covariates(design.groups[g].covariates)
+        if design.groups[g].name.startswith(RUNOUT):  # a runout of any law is a matter of the angles of its own beam
+            covariates |= {"azimuth", "elevation", f"station_{design.groups[g].name.removeprefix(RUNOUT)}"}
         if own and own <= covariates and gain < SHAPE_SHARE * evidence.chi2[g]:
             return g
     return None
 
 
 def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -> Named:
-    scene, evidence = analysis.scene, analysis.evidence
-    name, chi2, p = scene.groups[group].name, evidence.chi2[group], evidence.homogeneity_p[group]
-    visible = float(scene.visible[group])
+    design, evidence = analysis.design, analysis.evidence
+    name, chi2, p = design.groups[group].name, evidence.chi2[group], evidence.homogeneity_p[group]
+    visible = float(design.visible[group])
     reasons = []
     slight = evidence.uneven[group] < SLIGHTLY_UNEVEN * chi2
     inexact = inexact or (p < HOMOGENEITY_P and slight)
@@ -178,14 +224,14 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     failed = [g for g, own in evidence.homogeneity_p.items() if g != group and own < HOMOGENEITY_P]
     share = LEAST_JUMP_SHARE if name == "machine_jump" else LEAST_SHARE
     if generic and chi2 < share * sum(evidence.chi2[g] for g in (*generic, *failed)):
-        reasons.append("small beside what has no name")
+        reasons.append("small compared with what has no name")
     if name in NEVER_CONFIRMED or visible < LEAST_VISIBLE:
         reasons.append(f"the plan shows {100 * visible:.1f} % of it only: any misfit could be reshaped into it")
     if excess := _beyond_plausible(analysis, group):
         reasons.append(excess)
     if analysis.noise.source == "assumed":
         reasons.append("the noise is assumed, not measured")
-    others = tuple(alternatives(scene, analysis.rules, analysis.chosen, group))
+    others = tuple(alternatives(design, analysis.rules, analysis.chosen, group))
     weight = next((item.weight for item in others if item.name == name), 0.0)
     first = others[0].name if others else name
     return Named(
@@ -196,10 +242,10 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
 
 def _beyond_plausible(analysis: Analysis, group: int) -> str:
     """Say that a fitted parameter is far larger than on any machine."""
-    item = analysis.scene.groups[group]
+    item = analysis.design.groups[group]
     if item.effect is None:
         return ""
-    values, covariance, _ = contribution(analysis.scene, analysis.chosen, group)
+    values, covariance, _ = contribution(analysis.design, analysis.chosen, group)
     u = np.sqrt(np.diag(covariance))
     for parameter, value, own in zip(item.effect.card.parameters, values, u, strict=False):
         size = (abs(value) - 2 * own) / parameter.si_per_unit
@@ -209,20 +255,20 @@ def _beyond_plausible(analysis: Analysis, group: int) -> str:
 
 
 def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: list[int]) -> list[Unknown]:
-    scene, evidence = analysis.scene, analysis.evidence
+    design, evidence = analysis.design, analysis.evidence
     strongest = max((evidence.chi2[g] for g in names), default=0.0)
     directed = [d for d in evidence.directed if _owner(analysis, d.group, names, d.evidence) is None]
     shaped = len(directed) < len(evidence.directed) or len(generic) < sum(
-        scene.groups[g].tier == "generic" for g in analysis.chosen.members
+        design.groups[g].tier == "generic" for g in analysis.chosen.members
     )
     shaped = shaped and not directed and evidence.excess < SHAPE_SHARE * strongest
     found = [_of_group(analysis, g) for g in sorted(generic, key=lambda g: -evidence.chi2[g])]
     if jumps:
-        at = scene.groups[jumps[0]].position
+        at = design.groups[jumps[0]].position
         found.append(Unknown(("time",), "length", float("nan"), f"common jump of several stations at {at:g} s"))
     if not found and directed:
         for item in directed[:3]:
-            group = scene.groups[item.group]
+            group = design.groups[item.group]
             nearest = _nearest(analysis, item.group, item.evidence)
             found.append(Unknown(group.covariates, group.direction, float("nan"), group.name, item.group, nearest))
     if not found and evidence.lack_of_fit_z > 3.0 and not shaped:
@@ -233,41 +279,41 @@ def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: li
 
 
 def _of_group(analysis: Analysis, g: int) -> Unknown:
-    group: Group = analysis.scene.groups[g]
-    shape = contribution(analysis.scene, analysis.chosen, g)[2]
+    group: Group = analysis.design.groups[g]
+    shape = contribution(analysis.design, analysis.chosen, g)[2]
     nearest = _nearest(analysis, g, analysis.evidence.chi2[g])
     return Unknown(group.covariates, group.direction, float(np.sqrt(np.mean(shape**2))), group.name, g, nearest)
 
 
 def _nearest(analysis: Analysis, generic: int, chi2: float) -> str:
     """Name that explains most in the place of a generic group; none if it explains too little or is there already."""
-    scene = analysis.scene
+    design = analysis.design
     rest = [g for g in analysis.chosen.members if g != generic]
-    present = {scene.groups[g].name for g in rest}
+    present = {design.groups[g].name for g in rest}
     named = [
-        g for g, group in enumerate(scene.groups)
-        if group.tier == "named" and scene.size(g) and group.name not in present
+        g for g, group in enumerate(design.groups)
+        if group.tier == "named" and design.size(g) and group.name not in present
     ]  # fmt: skip
     if not named:
         return ""
-    own = gains(scene, beside(scene, rest), named)
+    own = gains(design, remainder_of(design, rest), named)
     best = int(np.argmax(own))
-    return scene.groups[named[best]].name if own[best] > RESEMBLES * chi2 else ""
+    return design.groups[named[best]].name if own[best] > RESEMBLES * chi2 else ""
 
 
 def _resembling(analysis: Analysis, item: Named) -> Unknown:
-    group = analysis.scene.groups[item.group]
+    group = analysis.design.groups[item.group]
     text = f"resembles {item.name} but {item.reasons[0] if item.reasons else 'is not certain'}"
     return Unknown(tuple(sorted(plain_covariates(group.covariates))), "", float("nan"), text, None, item.name)
 
 
 def _invisible(analysis: Analysis) -> tuple[str, ...]:
-    """Names that this plan hides: covariate missing or constant, or nothing left beside the base model."""
-    scene = analysis.scene
+    """Names that this plan hides: covariate missing or constant, or nothing left without the base model."""
+    design = analysis.design
     best: dict[str, float] = {}
-    for g, group in enumerate(scene.groups):
+    for g, group in enumerate(design.groups):
         if group.tier == "named":
-            best[group.name] = max(best.get(group.name, 0.0), float(scene.visible[g]))
+            best[group.name] = max(best.get(group.name, 0.0), float(design.visible[g]))
     of_base = {f"squareness_{name[1:]}" for name in SQUARENESS_NAMES if name in analysis.fit.basis.errors}
     hidden = [name for name, share in best.items() if share < INVISIBLE]
     lacking = [name for name in analysis.missing if _applies(analysis, name)]
@@ -287,3 +333,125 @@ def _applies(analysis: Analysis, name: str) -> bool:
         if covariate.startswith("approach") and readings.approach is None:
             return True
     return False
+
+
+# Which further measurement would decide: for alias sets, for near relatives, and for what this plan never shows.
+
+
+#: Correlation above which a relative is printed next to a name, however decisive the criterion looks.
+NEAR = 0.9
+
+
+def advice_of(analysis: Analysis, verdict: Verdict) -> tuple[str, ...]:
+    """Return the advice, the most useful first."""
+    cards = {name: effect.card for name, effect in catalogue(analysis.fit.readings.stations).items()}
+    found: list[str] = []
+    for item in verdict.named:
+        others = [other.name for other in item.alternatives if other.name != item.name]
+        for other in [*others, *relatives(analysis.design, item.group, others)]:
+            breaker = cards[item.name].breaker or cards[other].breaker
+            if breaker:
+                found.append(f"{breaker}: separates {item.name} from {other}")
+    if analysis.noise.source != "repeats":
+        found.append("measure every line at least twice, in random order: only repeats tell noise from effects")
+    if verdict.unknown and verdict.unknown[0].covariates:
+        depends = ", ".join(verdict.unknown[0].covariates)
+        found.append(f"vary {depends} by themselves, each line twice: shows the law of what has no name")
+    shown: dict[str, list[str]] = {}
+    for name in verdict.invisible:
+        if name in cards and cards[name].breaker:
+            shown.setdefault(cards[name].breaker, []).append(name)
+    found += [f"{how}: would show {', '.join(names)}, which this measurement cannot" for how, names in shown.items()]
+    return tuple(dict.fromkeys(found))
+
+
+def relatives(design: Design, group: int, known: Sequence[str]) -> list[str]:
+    """Names whose visible part is nearly that of a member."""
+    rows = design.rows([group])
+    found: dict[str, float] = {}
+    for g, other in enumerate(design.groups):
+        if (
+            other.tier != "named"
+            or other.name in known
+            or other.name == design.groups[group].name
+            or not design.size(g)
+        ):
+            continue
+        between = np.linalg.svd(rows[:, design.place(g)], compute_uv=False)
+        found[other.name] = max(
+            found.get(other.name, 0.0), float(between[: min(design.size(g), design.size(group))].min())
+        )
+    return [name for name, value in sorted(found.items(), key=lambda item: -item[1]) if value > NEAR][:2]
+
+
+# What has changed: a measurement against an earlier prediction, error by error.
+#
+# The prediction (an error file, with its effects if the machine file has some) takes the place of the unknown errors; the
+# base model then fits the difference, and says which errors differ by more than the noise allows.
+
+
+#: p-value (over the number of errors) below which an error has changed.
+SIGNIFICANT = 1e-3
+
+
+@dataclass(frozen=True)
+class Against:
+    """Residuals of the measurement against a prediction with only the placement free: before and after the change, mm."""
+
+    residual_mm: FloatArray
+    changes: tuple[dict[str, Any], ...]
+    rms_mm: float
+
+
+def compared(observed: Observed, analysis: Analysis, errors: ErrorTable) -> Against:
+    """Compare a measurement with a prediction.
+
+    Parameters
+    ----------
+    observed : the measurement.
+    analysis : its diagnosis, for the noise and the placement.
+    errors : the predicted errors.
+    """
+    fit = analysis.fit
+    # Reading minus prediction with stations and dead lengths (or the rigid motion) fitted, (n,).
+    poses = observed.poses
+    tip = tip_position(observed.machine, errors.at(poses.position_mm), poses.position_mm, poses.tool_mm)
+    at = size_of(fit.basis.parts(poses.position_mm))
+    placement = fit.unknowns[at : at + len(observed.placement_names)].copy()
+    for _ in range(8):
+        model, _, columns = observed.placed(tip, placement)
+        placement += least_norm(columns, observed.value_mm - model)
+    residual = np.asarray(observed.value_mm - observed.placed(tip, placement)[0])
+    return Against(residual, _changes(fit, analysis.design, residual), float(np.sqrt(np.mean(residual**2))))
+
+
+def _changes(fit: BaseFit, design: Design, residual: FloatArray) -> tuple[dict[str, Any], ...]:
+    """Errors whose curve, fitted to the difference, is significant in addition to all others; strongest first."""
+    from scipy.stats import chi2 as chi2_distribution  # imported here: slow to load
+
+    white = design.whiten(fit.jacobian)
+    target = design.whiten(residual)
+    solution = least_norm(white, target)
+    left = target - white @ solution
+    factor = max(1.0, float(left @ left) / max(len(left) - white.shape[1], 1))
+    found = []
+    parts = fit.basis.parts(fit.observed.poses.position_mm)
+    for part in parts:
+        place = np.arange(part.place.start, part.place.stop)
+        others = orthonormal(np.delete(white, place, axis=1))
+        own = white[:, place] - others @ (others.T @ white[:, place])
+        basis = orthonormal(own, least=1e-6)
+        chi2 = float(np.sum((basis.T @ target) ** 2)) / factor
+        p = float(chi2_distribution.sf(chi2, basis.shape[1])) * len(parts)
+        if p < SIGNIFICANT:
+            found.append(_change(part, solution[place], chi2, p))
+    return tuple(sorted(found, key=lambda item: -item["chi2"]))
+
+
+def _change(part: Part, coefficients: FloatArray, chi2: float, p: float) -> dict[str, Any]:
+    error = error_named(part.name)
+    curve = part.basis @ coefficients
+    unit = MM_PER_UM if error.kind == "linear" else RAD_PER_URAD
+    largest = float(np.abs(curve).max()) / unit
+    what = "value" if part.name in SQUARENESS_NAMES else "largest"
+    return {"error": part.name, what: largest, "unit": error.unit, "chi2": chi2, "p": min(p, 1.0)}

@@ -15,10 +15,19 @@ from compgen.effects.base import (
     Single,
     along,
 )
-from compgen.effects.catalogue import FAMILIES, catalogue, listed
-from compgen.effects.of_machine import ActiveEffect, active_effects, displacement_of, section_text
+from compgen.effects.catalogue import (
+    FAMILIES,
+    ActiveEffect,
+    active_effects,
+    advice_of_effects,
+    catalogue,
+    displacement_of,
+    effects_reversal,
+    listed,
+    section_text,
+    with_effects_reversal,
+)
 from compgen.effects.readings import Readings, readings_of_deviations, readings_of_lengths, readings_of_points
-from compgen.effects.reversal import advice_of_effects, effects_reversal, with_effects_reversal
 
 __all__ = [
     "ANY_STATION",

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from compgen.core.csvio import FloatArray
-from compgen.core.names import AXES, MM_PER_UM
+from compgen.data.csv_files import FloatArray
+from compgen.data.names import AXES, MM_PER_UM
 from compgen.effects.base import Card, DisplacementEffect, Effect, Parameter, Setting, along
 from compgen.effects.readings import Readings
 

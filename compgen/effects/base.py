@@ -9,13 +9,14 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from compgen.core.csvio import FloatArray
+from compgen.data.csv_files import FloatArray
+from compgen.data.names import AXES, MM_PER_UM
 from compgen.effects.readings import Readings
 
 #: What stands for the name of a station where the catalogue is listed without a measurement.
@@ -39,12 +40,20 @@ class Parameter:
 class Setting:
     """A number that an effect is not linear in: the time of a step, a pitch, the temperature that counts as zero.
 
-    ``needed`` says that nothing takes its place where it is not given.
+    ``needed`` says that nothing takes its place where it is not given; the mean of the covariate ``mean_of`` does.
     """
 
     name: str
     meaning: str
     needed: bool = False
+    mean_of: str = ""
+
+
+def reference_of(covariate: str) -> Setting:
+    """Return the setting of the temperature at which an effect is zero."""
+    return Setting(
+        "reference_c", "temperature that counts as zero; default: the mean of the readings", mean_of=covariate
+    )
 
 
 @dataclass(frozen=True)
@@ -80,6 +89,20 @@ class Card:
     scan: str = ""
     slow: bool = False
 
+    def named(self, **words: str) -> Card:
+        """Return the card with ``words`` in place of their names in braces, in all of its texts."""
+
+        def said(value: Any) -> Any:
+            if isinstance(value, str):
+                return value.format(**words)
+            if isinstance(value, tuple):
+                return tuple(said(item) for item in value)
+            if isinstance(value, Parameter | Setting):
+                return replace(value, **{key: said(text) for key, text in vars(value).items()})
+            return value
+
+        return replace(self, **{key: said(value) for key, value in vars(self).items()})
+
 
 class Effect(ABC):
     """One effect of the catalogue; ``settings`` holds those that are chosen."""
@@ -93,6 +116,10 @@ class Effect(ABC):
 
     def positions(self, readings: Readings) -> Sequence[float]:
         """Scan positions (e.g. times of a step) that the data leave open; empty if there is nothing to scan."""
+        return () if self.card.scan in self.settings else self.candidates(readings)
+
+    def candidates(self, readings: Readings) -> Sequence[float]:
+        """Scan positions where the setting is not chosen."""
         return ()
 
     def at(self, position: float) -> Self:
@@ -109,7 +136,14 @@ class Effect(ABC):
 
     def used(self, readings: Readings) -> dict[str, float]:
         """Settings that hold for these readings, chosen or following from them: what a machine file has to keep."""
-        return dict(self.settings)
+        return {**self.defaults(readings), **self.settings}
+
+    def defaults(self, readings: Readings) -> dict[str, float]:
+        """Settings that follow from the readings: the mean of a covariate where it counts as zero."""
+        means = (
+            (setting.name, readings.covariate(setting.mean_of)) for setting in self.card.settings if setting.mean_of
+        )
+        return {name: float(logged.mean()) for name, logged in means if logged is not None}
 
 
 class DisplacementEffect(Effect):
@@ -123,6 +157,24 @@ class DisplacementEffect(Effect):
         """Contract the displacement with the direction of each reading."""
         moved = self.displacement(readings)
         return None if moved is None else np.asarray(np.einsum("nd,ndk->nk", readings.direction, moved))
+
+
+class SingleAxisEffect(DisplacementEffect):
+    """An effect of one axis; its ``template`` is its card with ``{A}`` and ``{a}`` for the letter of the axis."""
+
+    template: ClassVar[Card]
+
+    def __init__(self, axis: int) -> None:
+        self.axis = axis
+        self.card = self.template.named(A=AXES[axis], a=AXES[axis].lower())
+
+
+def vector_parameters(
+    meaning: str, plausible: float, unit: str = "um", si_per_unit: float = MM_PER_UM
+) -> tuple[Parameter, ...]:
+    """Parameters ``cx_um``, ``cy_um``, ``cz_um`` of a displacement (or ``vx_...`` of a velocity); ``{}`` is the axis."""
+    letter = "c" if unit == "um" else "v"
+    return tuple(Parameter(f"{letter}{a.lower()}_{unit}", si_per_unit, meaning.format(a), plausible) for a in AXES)
 
 
 def along(axis: int, columns: FloatArray) -> FloatArray:
@@ -154,17 +206,6 @@ class Single(Family):
         return [self._make()]
 
 
-class PerAxis(Family):
-    """One effect for each axis; ``make`` takes its number 0, 1, 2."""
-
-    def __init__(self, name: str, make: Callable[[int], Effect]) -> None:
-        self.name, self._make = name, make
-
-    def members(self, stations: Sequence[str]) -> Sequence[Effect]:
-        """Those of X, Y and Z."""
-        return [self._make(axis) for axis in range(3)]
-
-
 class PerName(Family):
     """One effect for each of some fixed names (of errors, of classes); ``make`` takes the name."""
 
@@ -174,6 +215,13 @@ class PerName(Family):
     def members(self, stations: Sequence[str]) -> Sequence[Effect]:
         """Those of the names, in their order."""
         return [self._make(name) for name in self._names]
+
+
+class PerAxis(PerName):
+    """One effect for each axis; ``make`` takes its number 0, 1, 2."""
+
+    def __init__(self, name: str, make: Callable[[int], Effect]) -> None:
+        super().__init__(name, AXES, lambda letter: make(AXES.index(letter)))
 
 
 class PerStation(Family):

@@ -1,22 +1,145 @@
-"""Bounds on one curve: magnitude, slope, curvature, one direction; as numbers and as rows of linear inequalities."""
+"""Options and report of the fit, bounds as rows of inequalities, and one curve solved within its bounds."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from importlib import import_module
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
-from compgen.core.csvio import FloatArray
-from compgen.fit.result import ActiveBound
-from compgen.fit.smooth import Smoother
+from compgen.data.csv_files import FloatArray
+from compgen.data.declared import option
+from compgen.data.display import Drawable, Overview, Panel, shortened
+from compgen.data.error_table import ErrorTable
+from compgen.data.messages import nearest
+from compgen.data.names import CURVE_NAMES, error_named
+from compgen.errors import ConvergenceError, InputError
+from compgen.fit.smoother import Method, Smoother
+from compgen.fit.zeroing import FrameChange
+
+# What the fit returns: the fitted table, a report per curve, and what was moved out of the curves.
+
+
+@dataclass(frozen=True)
+class ActiveBound:
+    """A bound that the fitted curve touches, positions in mm.
+
+    ``max_abs`` at one node, ``max_slope`` and ``monotone`` between two, ``max_curvature`` over three.
+    """
+
+    bound: str
+    from_mm: float
+    to_mm: float
+
+
+@dataclass(frozen=True)
+class CurveReport:
+    """How one curve was fitted; amounts are in ``unit`` (um or urad).
+
+    Parameters
+    ----------
+    smoothness : the dimensionless weight that was used (:class:`compgen.fit.FitOptions` says what it means).
+    method : how the weight was found: ``REML`` (uncertainties known), ``GCV`` (unknown) or ``given``.
+    half_gain_mm : wave length that the smoothing halves, on even nodes; 0 if none is.
+    degrees_of_freedom : effective ones, trace of the smoother without bounds; ``free_nodes`` is their largest number.
+    rms_residual : root mean square of data minus fit, over all nodes, after the data were brought to zero ends.
+    reduced_chi_square : weighted square sum of the residuals over its expectation, trace of (1 - S)^2 (Buckley,
+        Eagleson & Silverman 1988, Biometrika 75, 189): near 1 if the uncertainties are right; nan where they are
+        unknown or where less than half a degree of freedom is left.
+    noise : standard deviation of the data's noise at unit weight, from the same quotient; nan if too little is left.
+    smoothing_bias_max, smoothing_bias_rms : how much the smoothing flattens a curve like the fitted one, S c - c.
+    smoothing_bias : the same per position, shape (n,).
+    active_bounds : where the curve touches a bound.
+    solver : ``direct``; ``active set`` when a bound is active (``Clarabel`` or ``OSQP`` where these find the active
+        bounds: curves of more than 301 independent nodes); ``cvxpy`` with constraints of your own.
+    correlated : whether the covariance of the nodes was used.
+    distrusted_mm : nodes that a robust loss gave less than their weight.
+    """
+
+    error: str
+    unit: str
+    smoothness: float
+    method: Method
+    half_gain_mm: float
+    degrees_of_freedom: float
+    free_nodes: int
+    rms_residual: float
+    reduced_chi_square: float
+    noise: float
+    smoothing_bias_max: float
+    smoothing_bias_rms: float
+    smoothing_bias: FloatArray = field(repr=False, compare=False)
+    active_bounds: tuple[ActiveBound, ...] = ()
+    solver: str = "direct"
+    correlated: bool = False
+    distrusted_mm: tuple[float, ...] = ()
+
+    def to_dict(self) -> dict[str, object]:
+        """Return plain values for JSON; unknown numbers are None."""
+        plain = {**asdict(self), "smoothing_bias": self.smoothing_bias.tolist()}
+        return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in plain.items()}
+
+
+@dataclass(frozen=True, repr=False)
+class FitResult(Drawable):
+    """Fitted ``errors`` with their uncertainty, the ``report`` by error name, and the ``change`` of the frame.
+
+    E of the input and E of the zeroed input differ by ``change``; the fit itself then only smooths.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> errors = compgen.read_errors("examples/zha-gantry.truth.errors.csv")
+    >>> fitted: compgen.FitResult = compgen.fit(machine, errors)
+    >>> fitted
+    <FitResult: 14 fitted curves: EXX, EYX, EZX, EAX, EBX, EXY and 8 more>
+    >>> fitted.report["EXX"].unit
+    'um'
+    """
+
+    errors: ErrorTable
+    report: Mapping[str, CurveReport]
+    change: FrameChange
+
+    def to_dict(self) -> dict[str, object]:
+        """Return reports and frame change as plain values for JSON."""
+        reports = {name: report.to_dict() for name, report in self.report.items()}
+        return {"curves": reports, "frame_change": self.change.to_dict()}
+
+    def overview(self) -> Overview:
+        """How each curve was smoothed."""
+        rows = tuple(
+            (
+                name,
+                f"{item.smoothness:.2g}",
+                item.method,
+                f"{item.rms_residual:.3f}",
+                f"{item.smoothing_bias_max:.3f}",
+                item.unit,
+            )
+            for name, item in self.report.items()
+        )
+        header = ("error", "smoothness", "chosen by", "residual rms", "bias max", "unit")
+        return Overview(f"{len(self.report)} fitted curves: {shortened(tuple(self.report))}", header, rows)
+
+    def panels(self) -> Sequence[Panel]:
+        """The fitted curves."""
+        return self.errors.panels()
+
+
+# Bounds on one curve: magnitude, slope, curvature, one direction; as numbers and as rows of linear inequalities.
+
 
 #: Bounds are kept to this fraction of them.
 KEPT = 1e-9
 #: Names of the bounds in the order of their rows: values (over one node), slopes (two), curvatures (three).
-KINDS = ("max_abs", "max_slope", "max_curvature")
+BOUND_KINDS = ("max_abs", "max_slope", "max_curvature")
 MONOTONE = "monotone"
 
 
@@ -53,10 +176,14 @@ class Bounds:
     def excess(self, position_mm: FloatArray, curve: FloatArray) -> tuple[float, float, float, float]:
         """By how much a curve (n,) breaks magnitude, slope, curvature and direction; 0 where it keeps them."""
         slope = np.diff(curve) / np.diff(position_mm)
-        bent = curvature(position_mm) * np.stack([curve[:-2], curve[1:-1], curve[2:]], axis=1)
-        found = (np.abs(curve).max(), np.abs(slope).max(initial=0.0), np.abs(bent.sum(axis=1)).max(initial=0.0))
+        bent = 0.0
+        if math.isfinite(self.max_curvature):
+            windows = np.stack([curve[:-2], curve[1:-1], curve[2:]], axis=1)
+            bent = np.abs((curvature(position_mm) * windows).sum(axis=1)).max(initial=0.0)
+        found = (np.abs(curve).max(), np.abs(slope).max(initial=0.0), bent)
         over = [max(0.0, float(value - limit)) for value, limit in zip(found, self.limits, strict=True)]
-        return over[0], over[1], over[2], float(np.max(-self.direction * slope, initial=0.0))
+        backward = float(np.max(-self.direction * slope, initial=0.0)) if self.direction else 0.0
+        return over[0], over[1], over[2], backward
 
     def kept_by(self, position_mm: FloatArray, curve: FloatArray) -> bool:
         """Whether a curve (n,) keeps its bounds at every node and between them."""
@@ -87,7 +214,11 @@ class Rows:
 
 def curvature(position_mm: FloatArray) -> FloatArray:
     """Coefficients (n - 2, 3) of c'' at the inner nodes: (slope after - slope before) over half the two steps, 1/mm^2."""
-    step = np.diff(position_mm)
+    return curvature_at(np.diff(position_mm))
+
+
+def curvature_at(step: FloatArray) -> FloatArray:
+    """Return the same from the steps (n - 1,) between nodes in mm; zero beside an infinite step."""
     before, after = step[:-1], step[1:]
     scale = 2 / (before + after)
     return np.stack([scale / before, -scale / before - scale / after, scale / after], axis=1)
@@ -136,6 +267,404 @@ def active_bounds(position_mm: FloatArray, active: FloatArray, bounds: Bounds) -
     for row in np.flatnonzero(active):
         kind, node = (0, row) if row < n else (1, row - n) if row < 2 * n - 1 else (2, row - 2 * n + 1)
         monotone = kind == 1 and bounds.direction != 0 and active[row] == -bounds.direction
-        name = MONOTONE if monotone else KINDS[kind]
+        name = MONOTONE if monotone else BOUND_KINDS[kind]
         found.append(ActiveBound(name, float(position_mm[node]), float(position_mm[node + kind])))
     return tuple(found)
+
+
+# What a user may ask of the fit: smoothness and bounds.
+
+
+ERROR_KINDS = ("linear", "angular")
+DIRECTIONS = {"increasing": 1, "decreasing": -1}
+_PER_M = 1e-3  # one per metre in one per mm
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Smoothness and bounds of the fit; everything may be left out.
+
+    Parameters
+    ----------
+    smoothness : dimensionless weight mu of the squared second differences in
+        ``sum((u0/u)^2 (c - y)^2) + mu |D2 c|^2``, with ``u0`` the harmonic root mean square of the uncertainties u
+        (all weights 1 where u is not known) and D2 the second difference over nodes at their mean spacing h. On even
+        nodes a wave of length L keeps the fraction ``1/(1 + mu (2 sin(pi h/L))^4)``: 0 keeps the data, 1 halves waves
+        of 6 nodes, 100 of 20 nodes, and mu much above (number of nodes/pi)^4 leaves a straight line (larger ones than
+        that needs are taken as if they were that). None: chosen from the data.
+    max_abs : largest magnitude of a fitted curve in mm or rad, by error name or by ``"linear"``, ``"angular"``; the
+        name goes before the kind.
+    max_slope : largest magnitude of its slope in mm/mm or rad/mm, likewise.
+    max_curvature : largest magnitude of its second derivative at the inner nodes (difference of the slopes beside a node
+        over half the distance between its neighbours) in mm/mm^2 or rad/mm^2, likewise.
+    monotone : ``"increasing"`` or ``"decreasing"`` by error name. A straightness is zero at both ends and cannot be.
+    robust : Huber's loss instead of squares, for data with outliers: a node pulls at most as if it were off by 1.345 of
+        its uncertainty. Where uncertainties are not known, their scale comes from the residuals.
+
+    Raises
+    ------
+    InputError
+        for a negative smoothness, a bound that is not positive, an unknown name.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> errors = compgen.read_errors("examples/zha-gantry.truth.errors.csv")
+    >>> fitted = compgen.fit(machine, errors, compgen.FitOptions(smoothness=1.0, max_abs={"linear": 0.02}))
+    >>> round(float(abs(fitted.errors.curves["EZZ"].value).max()), 6)  # 30 um without the bound
+    0.02
+    """
+
+    smoothness: float | None = option(
+        None, "Dimensionless weight of the second differences (0 keeps the data); default: chosen from the data."
+    )
+    max_abs: Mapping[str, float] = option(
+        factory=dict,
+        text="Largest magnitude of a fitted curve, um or urad. NAME is an error (EXX), or linear or angular for all of "
+        "that kind; may be given several times.",
+        metavar="NAME=LIMIT",
+    )
+    max_slope: Mapping[str, float] = option(
+        factory=dict, text="Largest slope of a fitted curve, um/m or urad/m. NAME as above.", metavar="NAME=LIMIT"
+    )
+    max_curvature: Mapping[str, float] = option(
+        factory=dict,
+        text="Largest second derivative of a fitted curve, um/m^2 or urad/m^2. NAME as above.",
+        metavar="NAME=LIMIT",
+    )
+    monotone: Mapping[str, str] = option(
+        factory=dict,
+        text="NAME=increasing or NAME=decreasing: the fitted curve goes one way only. NAME is an error, but not a "
+        "straightness.",
+        metavar="NAME=WAY",
+    )
+    robust: bool = option(False, "Huber's loss instead of squares: single nodes far off do not bend the curve.")
+
+    def __post_init__(self) -> None:
+        if self.smoothness is not None and not (math.isfinite(self.smoothness) and self.smoothness >= 0):
+            message = (
+                f"{self.smoothness!r} is not allowed; give a number >= 0, or leave it out to take it from the data"
+            )
+            raise InputError(message, field="smoothness")
+        for bound in ("max_abs", "max_slope", "max_curvature"):
+            for key, limit in getattr(self, bound).items():
+                _check_limit(bound, key, limit)
+        for key, direction in self.monotone.items():
+            _check_direction(key, direction)
+
+    @classmethod
+    def from_file_units(
+        cls,
+        smoothness: float | None = None,
+        max_abs_um_urad: Mapping[str, float] | None = None,
+        max_slope_um_m_urad_m: Mapping[str, float] | None = None,
+        max_curvature_um_m2_urad_m2: Mapping[str, float] | None = None,
+        monotone: Mapping[str, str] | None = None,
+        *,
+        robust: bool = False,
+    ) -> FitOptions:
+        """Build the options from um and urad, um/m and urad/m, um/m^2 and urad/m^2.
+
+        >>> FitOptions.from_file_units(max_abs_um_urad={"EXX": 20.0}).max_abs
+        {'EXX': 0.02}
+        """
+        slopes, bends = max_slope_um_m_urad_m or {}, max_curvature_um_m2_urad_m2 or {}
+        return cls(
+            smoothness,
+            {key: limit * _unit("max_abs", key) for key, limit in (max_abs_um_urad or {}).items()},
+            {key: limit * _unit("max_slope", key) * _PER_M for key, limit in slopes.items()},
+            {key: limit * _unit("max_curvature", key) * _PER_M**2 for key, limit in bends.items()},
+            dict(monotone or {}),
+            robust,
+        )
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Return the bounds (magnitude, slope) of one curve in mm or rad and per mm, inf where there is none."""
+        bounds = self.bounds(name)
+        return bounds.max_abs, bounds.max_slope
+
+    def bounds(self, name: str) -> Bounds:
+        """Return all bounds of one curve, in mm or rad."""
+        kind = error_named(name).kind
+        magnitude, slope, bend = (
+            limits.get(name, limits.get(kind, math.inf))
+            for limits in (self.max_abs, self.max_slope, self.max_curvature)
+        )
+        return Bounds(magnitude, slope, bend, DIRECTIONS.get(self.monotone.get(name, ""), 0))
+
+
+def _unit(bound: str, key: str) -> float:
+    _check_key(bound, key)
+    name = key if key in CURVE_NAMES else {"linear": "EXX", "angular": "EAX"}[key]
+    return error_named(name).si_per_unit
+
+
+def _check_key(bound: str, key: str) -> None:
+    if key not in CURVE_NAMES and key not in ERROR_KINDS:
+        known = (*ERROR_KINDS, *CURVE_NAMES)
+        raise InputError(f"{key!r} is neither a curve nor a kind of error; {nearest(key, known)}", field=bound)
+
+
+def _check_limit(bound: str, key: str, limit: float) -> None:
+    _check_key(bound, key)
+    if not limit > 0:
+        message = f"{limit!r} for {key} leaves no curve; a bound is a positive number, leave it out for none"
+        raise InputError(message, field=bound)
+
+
+def _check_direction(key: str, direction: str) -> None:
+    if key not in CURVE_NAMES:
+        raise InputError(f"{key!r} is not one of the curves; {nearest(key, CURVE_NAMES)}", field="monotone")
+    if direction not in DIRECTIONS:
+        raise InputError(
+            f"{direction!r} for {key} is not allowed; give one of {', '.join(DIRECTIONS)}", field="monotone"
+        )
+
+
+# One curve at a given smoothness within its bounds.
+#
+# minimise x^T A x / 2 - x^T g   subject to   lower <= G x <= upper
+#
+# in the unknowns of the smoother, with g = Z^T W y. The zero curve satisfies every bound, so the program always has a
+# solution. A free optimum that keeps its bounds is the solution. Otherwise a root F of the inverse of A turns the program
+# into that of the point nearest to the free optimum, x = free + F d with the least |d|; its multipliers are a
+# non-negative least-squares problem (Lawson & Hanson 1974, Solving Least Squares Problems, chapter 23). Its active bounds
+# become equations and are corrected one by one until the Karush-Kuhn-Tucker conditions (every bound kept, every
+# multiplier of the right sign) prove that the curve is the optimum. Curves with too many nodes for dense matrices begin
+# with the active bounds of a general solver. Where active bounds depend on one another, so that their multipliers are
+# not unique, the solver's own curve is taken if its duality gap is closed.
+
+
+DIRECT, ACTIVE_SET = "direct", "active set"
+#: Multipliers with the wrong sign up to this fraction of the largest are rounding.
+_ACTIVE_SET_SIGN = 1e-9
+#: Combinations of active rows that reach less than this fraction of the largest take no part.
+_DEPENDENT = 1e-13
+#: Largest duality gap, as a fraction of what the bounds cost, of a solution whose active rows depend on one another.
+_GAP = 1e-8
+#: Less than this fraction of the data is zero: what rounding leaves of a curve that its bounds keep there.
+_ROUNDING = 1e-15
+_UNTOUCHED: FloatArray = np.zeros(0)
+
+
+class CurveSolution(NamedTuple):
+    """A fitted ``curve`` (n,) in the unit of its data, the bounds that it touches, and who found it.
+
+    ``touched`` holds -1, 0, 1 for n values, n - 1 slopes and n - 2 curvatures; empty if no bound is touched.
+    """
+
+    curve: FloatArray
+    touched: FloatArray = _UNTOUCHED
+    solver: str = DIRECT
+
+
+def solve_curve(smoother: Smoother, mu: float, position_mm: FloatArray, y: FloatArray, bounds: Bounds) -> CurveSolution:
+    """Minimise the smoother's cost for data (n,) within bounds that count in the unit of ``y``.
+
+    A free optimum that keeps its bounds is the bounded one; only curves that break a bound need more.
+    """
+    curve = smoother.solve(mu, y[:, None])[:, 0]
+    if bounds.kept_by(position_mm, curve):
+        return CurveSolution(curve)
+    unit = max(float(np.abs(y).max()), float(np.finfo(float).tiny))  # solvers like numbers near 1
+    rows = constraint_rows(position_mm, smoother, *bounds.in_unit(unit).limits, bounds.direction)
+    found = fit_bounded(smoother, mu, y / unit, rows)
+    return found._replace(curve=np.where(np.abs(found.curve) > _ROUNDING, found.curve * unit, 0.0))
+
+
+def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: Rows) -> CurveSolution:
+    """Solve the program for data (n,); ``rows`` from :func:`compgen.fit.bounds.constraint_rows`.
+
+    Raises
+    ------
+    ConvergenceError
+        when no solver's result passes the optimality conditions.
+    """
+    free = smoother.solve(mu, y[:, None])[:, 0]
+    root = smoother.inverse_root(mu)
+    if root is not None:
+        found = _active_set(smoother, mu, free, rows, _nearest(root, free, rows))
+        if found is not None:
+            return CurveSolution(*found, ACTIVE_SET)
+    for solver, call in SOLVERS.items():
+        start = _general(smoother, mu, y, rows, call)
+        if start is None:
+            continue
+        curve, multiplier = start
+        size = np.abs(multiplier)
+        touched = np.where(size > 1e-6 * size.max(initial=0.0), np.sign(multiplier), 0.0)
+        found = _active_set(smoother, mu, free, rows, touched)
+        if found is None and _is_optimal(smoother, mu, free, rows, curve, multiplier):
+            found = curve, touched
+        if found is not None:
+            return CurveSolution(*found, solver)
+    raise ConvergenceError(
+        "the bounded fit found no optimum that passes its check; loosen the bounds or the smoothness"
+    )
+
+
+def _nearest(root: FloatArray, free: FloatArray, rows: Rows) -> FloatArray:
+    """Active rows (-1, 0, 1) of the point within the bounds that is nearest to the free optimum; a good guess at least.
+
+    With d in units of the greatest excess e, the rows G F over their lengths and the right side h = (G free - limit)/e,
+    min |d| subject to -G F d >= h has the multipliers u of min |(-G F)^T u|^2 + (h^T u - 1)^2, u >= 0.
+    """
+    from scipy.optimize import nnls  # imported here: slow to load
+
+    reach, value = rows.dense @ root, rows.dense @ free
+    length = np.linalg.norm(reach, axis=1)
+    above, below = (np.flatnonzero(np.isfinite(limit) & (length > 0)) for limit in (rows.upper, rows.lower))
+    row = np.concatenate([above, below])
+    excess = np.concatenate([value[above] - rows.upper[above], rows.lower[below] - value[below]]) / length[row]
+    sign = np.repeat([1.0, -1.0], [len(above), len(below)])
+    active = np.zeros(len(value))
+    if not excess.max(initial=0.0) > 0.0:
+        return active
+    excess /= excess.max()
+    system = np.vstack([-(sign / length[row]) * reach[row].T, excess])
+    try:
+        multiplier = nnls(system, np.append(np.zeros(reach.shape[1]), 1.0))[0]
+    except RuntimeError:  # too many steps: the rows most outside their limits are where the search begins
+        multiplier = np.maximum(excess, 0.0)
+    chosen = multiplier > _ACTIVE_SET_SIGN * multiplier.max()
+    active[row[chosen]] = sign[chosen]
+    return active
+
+
+#: Solves min x^T P x / 2 + q^T x, lower <= A x <= upper for (P, q, A, lower, upper): x and multipliers, None if it fails.
+_Solver = Callable[
+    [sp.csc_array, FloatArray, sp.csc_array, FloatArray, FloatArray], tuple[FloatArray, FloatArray] | None
+]
+
+
+def _general(
+    smoother: Smoother, mu: float, y: FloatArray, rows: Rows, call: _Solver
+) -> tuple[FloatArray, FloatArray] | None:
+    """Curve (n,) of a general solver, made to keep its bounds, and multipliers (m,), positive at upper limits."""
+    # unknowns scaled to 1 on the diagonal of A, and only the rows that have a limit
+    quadratic = smoother.matrix(mu)
+    scale = 1 / np.sqrt(quadratic.diagonal())
+    stretch: Any = sp.diags_array(scale)
+    used = np.flatnonzero(np.isfinite(rows.lower) | np.isfinite(rows.upper))
+    matrix = sp.csc_array(rows.matrix[used] @ stretch)
+    linear = -scale * smoother.load(y[:, None])[:, 0]
+    found = call(sp.csc_array(stretch @ quadratic @ stretch), linear, matrix, rows.lower[used], rows.upper[used])
+    if found is None or not np.isfinite(found[0]).all():
+        return None
+    multiplier = np.zeros(rows.matrix.shape[0])
+    multiplier[used] = found[1]
+    curve = smoother.expand((scale * found[0])[:, None])[:, 0]
+    # every smaller multiple of a curve keeps the bounds too
+    values = rows.dense @ curve
+    limit = np.where(values > 0, rows.upper, -rows.lower)
+    share = np.where((limit > 0) & np.isfinite(limit), np.abs(values) / np.where(limit > 0, limit, 1.0), 0.0)
+    return curve / max(1.0, float(share.max())), multiplier
+
+
+def _clarabel(
+    quadratic: sp.csc_array, linear: FloatArray, matrix: sp.csc_array, lower: FloatArray, upper: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    clarabel: Any = import_module("clarabel")
+    high, low = np.isfinite(upper), np.isfinite(lower)
+    one_sided = sp.csc_matrix(sp.vstack([matrix[high], -matrix[low]]))
+    limit = np.concatenate([upper[high], -lower[low]])
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
+    cones = [clarabel.NonnegativeConeT(len(limit))]
+    half = sp.csc_matrix(sp.triu(quadratic))
+    result = clarabel.DefaultSolver(half, linear, one_sided, limit, cones, settings).solve()
+    if "Solved" not in str(result.status):
+        return None
+    dual, multiplier = np.array(result.z), np.zeros(len(high))
+    multiplier[high] += dual[: int(high.sum())]
+    multiplier[low] -= dual[int(high.sum()) :]
+    return np.array(result.x), multiplier
+
+
+def _osqp(
+    quadratic: sp.csc_array, linear: FloatArray, matrix: sp.csc_array, lower: FloatArray, upper: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    osqp: Any = import_module("osqp")
+    solver = osqp.OSQP()
+    settings = {"eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000, "verbose": False}
+    solver.setup(sp.csc_matrix(sp.triu(quadratic)), linear, sp.csc_matrix(matrix), lower, upper, **settings)
+    result = solver.solve(raise_error=False)
+    return (result.x, result.y) if result.info.status in ("solved", "solved inaccurate") else None
+
+
+#: General solvers in the order in which they are tried.
+SOLVERS: dict[str, _Solver] = {"Clarabel": _clarabel, "OSQP": _osqp}
+
+
+def _is_optimal(
+    smoother: Smoother, mu: float, free: FloatArray, rows: Rows, curve: FloatArray, multiplier: FloatArray
+) -> bool:
+    """Whether the curve keeps its bounds and its duality gap is closed.
+
+    With e = x - free, cost e^T A e / 2 and the dual value for multipliers v (both against the free optimum), half the
+    squared distance to the optimum in the norm of A is at most their difference (A is the program's only curvature).
+    """
+    if np.abs(rows.excess(curve)).max(initial=0.0) > KEPT:
+        return False
+    e, v = curve - free, multiplier
+    cost = 0.5 * float(e @ smoother.apply(mu, e[:, None])[:, 0])
+    pull = rows.dense.T @ v
+    reach = smoother.inverse(mu, pull[:, None])[:, 0]
+    limit = np.where(v > 0, rows.upper, rows.lower)
+    value = float(pull @ free - np.sum(np.where(v != 0, v * limit, 0.0)) - 0.5 * pull @ reach)
+    return cost - value <= _GAP * cost
+
+
+def _active_set(
+    smoother: Smoother, mu: float, free: FloatArray, rows: Rows, active: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Curve and active rows that satisfy the optimality conditions, from a guess of the active rows; None if not found.
+
+    One row enters (the one most outside its bound) or leaves (the one with the most wrong multiplier) at a time.
+    """
+    active = active.copy()
+    for _ in range(20 + 4 * len(free)):
+        picked = np.flatnonzero(active)
+        sign = active[picked]
+        target = np.where(sign > 0, rows.upper[picked], -rows.lower[picked])
+        if not np.isfinite(target).all():
+            return None
+        signed = rows.dense[picked] * sign[:, None]
+        curve, multiplier = _equalities(smoother, mu, free, signed, target)
+        if len(picked) and multiplier.min() < -_ACTIVE_SET_SIGN * np.abs(multiplier).max():
+            active[picked[np.argmin(multiplier)]] = 0.0
+            continue
+        excess = rows.excess(curve)
+        worst = int(np.argmax(np.abs(excess)))
+        if abs(excess[worst]) <= KEPT:
+            return curve, active
+        if active[worst] != 0:
+            return None
+        active[worst] = np.sign(excess[worst])
+    return None
+
+
+def _equalities(
+    smoother: Smoother, mu: float, free: FloatArray, signed: FloatArray, target: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Curve (n,) with the ``signed`` rows (k, n) at ``target`` (k,), and their multipliers times the root of their reach.
+
+    Solved by the Schur complement of A, each row scaled to 1 on its diagonal, and refined against what is left.
+    """
+    if not len(signed):
+        return free, np.zeros(0)
+    reach = smoother.inverse(mu, signed.T)
+    schur = signed @ reach
+    scale = 1 / np.sqrt(np.maximum(np.diag(schur), np.finfo(float).tiny))
+    spread = reach * scale
+    value, vector = np.linalg.eigh(schur * scale * scale[:, None])
+    used = value > _DEPENDENT * value[-1]
+    value, vector = value[used], vector[:, used]
+    curve, multiplier = free, np.zeros(len(signed))
+    for _ in range(3):
+        more = vector @ (vector.T @ (scale * (signed @ curve - target)) / value)
+        curve = smoother.expand((curve - spread @ more)[:, None])[:, 0]
+        multiplier = multiplier + more
+    return curve, multiplier

@@ -1,8 +1,10 @@
 """Many curves in one banded system: their nodes follow one another, and nothing couples one curve with the next.
 
-The smoother of ``smooth.py`` for curves that are held at whole nodes: A = W + mu D^T D has half-bandwidth 2, held nodes
-keep their place with 1 on the diagonal. One factorisation serves all curves, whatever their nodes, weights and mu; the
-arithmetic is done over all nodes at once, so that twenty short curves cost little more than one.
+A = W + mu D2^T D2 of a curve with independent nodes that is fixed at whole nodes has half-bandwidth 2. Laid behind one
+another such curves are one :class:`compgen.fit.smoother.Smoother` whose second differences across two curves are zero.
+One factorisation serves all, whatever their nodes, weights and mu; each is refined by itself, so that no curve changes
+with the company it has. What keeps its bounds is finished; the others are solved by
+:func:`compgen.fit.bounds.solve_curve`.
 """
 
 from __future__ import annotations
@@ -10,260 +12,163 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import accumulate
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbsv, dpbtrs
 
-from compgen.core.csvio import FloatArray
-from compgen.core.kernels import use_compiled
-from compgen.errors import ConvergenceError
-from compgen.fit.bounds import Bounds
+from compgen.data.csv_files import FloatArray
+from compgen.fit.bounds import Bounds, CurveSolution, curvature_at, solve_curve
+from compgen.fit.smoother import REFINEMENTS, SETTLED, Smoother
 
-_SETTLED, _REFINEMENTS = 1e-12, 6
-#: With the largest diagonal of A below this many of the smallest weights the first solution has 9 digits or more.
-_EASY = 1e6
-#: Nodes from which loading the compiled solution pays for a single fit.
-_LARGE = 10_000_000
-_HELD = np.array([1.0, 0.0, 0.0])
-_TINY = float(np.finfo(float).tiny)
-IntArray = NDArray[np.intp]
+#: Half-bandwidth of A, and one more.
+_DIAGONALS = 3
+#: What is put behind the second differences of a curve of n nodes: it has n - 2 of them, or none.
+_NO_ROWS: FloatArray = np.zeros((2, 3))
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
-class CurveProblem:
-    """minimise sum w (c - y)^2 + mu |D2 c|^2 with c zero at the ``held`` nodes and within ``bounds``.
+class CurveProblem(NamedTuple):
+    """Data ``y`` (n,) at ``position_mm`` (n,), to be smoothed with weight ``mu`` within ``bounds`` in the unit of ``y``."""
 
-    ``position_mm``, ``y``, ``weight`` have shape (n,); ``mu`` is dimensionless, ``bounds`` count in the unit of ``y``.
-    """
-
+    smoother: Smoother
+    mu: float
     position_mm: FloatArray
     y: FloatArray
-    weight: FloatArray
-    held: tuple[int, ...]
-    mu: float
     bounds: Bounds = Bounds()
+
+
+def solve_curves(problems: Sequence[CurveProblem]) -> list[CurveSolution]:
+    """Minimise the cost of every curve within its bounds.
+
+    Curves with independent nodes that are fixed at whole nodes are solved together first.
+
+    Raises
+    ------
+    ConvergenceError
+        when no solver's result for a curve that breaks a bound passes the optimality conditions.
+    """
+    chosen = [k for k, problem in enumerate(problems) if _can_be_laid(problem.smoother)]
+    found = dict(zip(chosen, _within_bounds([problems[k] for k in chosen]), strict=True)) if chosen else {}
+    curves = [found.get(k) for k in range(len(problems))]
+    return [
+        solve_curve(*problem) if curve is None else CurveSolution(curve)
+        for problem, curve in zip(problems, curves, strict=True)
+    ]
+
+
+def _can_be_laid(smoother: Smoother) -> bool:
+    """Whether nodes are independent (no subclass) and every fixed functional is the value at a node."""
+    return type(smoother) is Smoother and all([other is None for _, other, _ in smoother.steps])
+
+
+def _within_bounds(problems: Sequence[CurveProblem]) -> list[FloatArray | None]:
+    """Fitted curves without bounds; None where a curve breaks its bounds or the factorisation fails."""
+    stack = Stack.build(problems)
+    c = stack.solve(np.concatenate([problem.y for problem in problems]))
+    if c is None:
+        return [None] * len(problems)
+    broken = _breaks(stack, problems, c).tolist()
+    ends = stack.starts + stack.sizes
+    return [
+        None if wrong else c[start:end]
+        for wrong, start, end in zip(broken, stack.starts.tolist(), ends.tolist(), strict=True)
+    ]
 
 
 @dataclass(frozen=True)
 class Stack:
-    """k curves with N nodes in all. Everything that acts on a held node is zero.
+    """k curves with N nodes in all.
 
-    ``starts`` (k,) and ``sizes`` (k,): where the curves stand; ``held``: the held nodes; ``per_mm`` (N,): inverse
-    distance from each node to the next of its curve, zero at the last; ``weight`` (N,); ``stiff`` (N,): mu times the
-    square of the factor of the difference of slopes that begins at a node; ``pull`` (N,): W y.
+    ``starts`` and ``sizes`` (k,): where the curves stand; ``laid``: one smoother of N nodes without eliminations;
+    ``fixed``: the nodes at zero; ``mu`` (N,).
     """
 
     starts: IntArray
     sizes: IntArray
-    held: IntArray
-    per_mm: FloatArray
-    weight: FloatArray
-    stiff: FloatArray
-    pull: FloatArray
+    laid: Smoother
+    fixed: IntArray
+    mu: FloatArray
 
     @classmethod
     def build(cls, problems: Sequence[CurveProblem]) -> Stack:
         """Lay the curves one behind the other."""
-        count = [len(problem.y) for problem in problems]
-        after = list(accumulate(count))
-        each = zip(after, count, problems, strict=True)
-        held = np.array([end - n + k for end, n, problem in each for k in problem.held], dtype=np.intp)
-        sizes, ends = np.array(count), np.array(after)
-        parts = [[p.position_mm for p in problems], [p.weight for p in problems], [p.y for p in problems]]
-        position, weight, pull = np.concatenate([part for kind in parts for part in kind]).reshape(3, -1)
-        weight[held] = 0.0
-        pull *= weight
-        starts = ends - sizes
-        mean = (position[ends - 1] - position[starts]) / np.maximum(sizes - 1, 1)
-        per_mm = _inverse_steps(position, ends)
-        level = np.array([2 * problem.mu for problem in problems]) * mean * mean * mean
-        return cls(starts, sizes, held, per_mm, weight, _stiffness(per_mm, level.repeat(sizes)), pull)
-
-    @cached_property
-    def free(self) -> FloatArray:
-        """0 at held nodes, else 1: (N,)."""
-        free = np.ones(len(self.weight))
-        free[self.held] = 0.0
-        return free
-
-    @cached_property
-    def bend(self) -> FloatArray:
-        """sqrt(mu) D2 (3, N), entry [i, j] of the row j acts on node j + i."""
-        bend = np.zeros((3, len(self.weight)))
-        root = np.sqrt(self.stiff[:-1])
-        bend[0, :-1], bend[2, :-1] = root * self.per_mm[:-1], root * self.per_mm[1:]
-        bend[1] = -bend[0] - bend[2]
-        bend *= windows(self.free)
-        return bend
-
-    def pick(self, chosen: BoolArray) -> Stack:
-        """Keep the chosen curves (k,)."""
-        nodes, sizes = self.of_each(chosen), self.sizes[chosen]
-        parts = (self.per_mm, self.weight, self.stiff, self.pull)
-        held = np.flatnonzero(self.free[nodes] == 0)
-        return Stack(np.cumsum(sizes) - sizes, sizes, held, *(part[nodes] for part in parts))
-
-    def of_each(self, values: Any) -> Any:
-        """Repeat one value per curve (k,) over its nodes (N,)."""
-        return np.asarray(values).repeat(self.sizes)
+        smoothers = [problem.smoother for problem in problems]
+        sizes = np.array([len(smoother.weight) for smoother in smoothers])
+        starts = np.cumsum(sizes) - sizes
+        rows: list[FloatArray] = []
+        fixed: list[int] = []
+        for start, smoother in zip(starts.tolist(), smoothers, strict=True):
+            rows += (smoother.rows, _NO_ROWS[: len(smoother.weight) - len(smoother.rows)])
+            fixed += [start + node for node, _, _ in smoother.steps]
+        laid = Smoother(
+            weight=np.concatenate([smoother.weight for smoother in smoothers]),
+            rows=np.asfortranarray(np.concatenate(rows)[:-2]),  # read by columns
+            steps=(),
+            free_weight=np.concatenate([smoother.free_weight for smoother in smoothers]),
+            penalty=np.concatenate([smoother.penalty[:_DIAGONALS] for smoother in smoothers], axis=1),
+        )
+        mu = np.array([problem.mu for problem in problems]).repeat(sizes)
+        return cls(starts, sizes, laid, np.array(fixed, dtype=np.intp), mu)
 
     def largest(self, values: FloatArray) -> FloatArray:
-        """Largest of node values (..., N) in each curve (..., k)."""
-        return np.maximum.reduceat(values, self.starts, axis=-1)
+        """Largest magnitude of node values (N,) in each curve (k,)."""
+        return np.asarray(np.maximum.reduceat(np.abs(values), self.starts))
 
-    def total(self, values: FloatArray) -> FloatArray:
-        """Sum of node values (..., N) over each curve (..., k)."""
-        return np.add.reduceat(values, self.starts, axis=-1)
+    def solve(self, y: FloatArray) -> FloatArray | None:
+        """Fitted curves (N,) for data (N,) without bounds; None if A is not positive definite.
 
-    def split(self, values: FloatArray) -> list[FloatArray]:
-        """Node values (N,) curve by curve."""
-        starts = self.starts.tolist()
-        return [values[start:end] for start, end in zip(starts, [*starts[1:], len(values)], strict=True)]
-
-    def slopes(self, c: FloatArray) -> FloatArray:
-        """Slope (N,) from each node to the next of its curve, zero at the last."""
-        slope = np.empty(len(c))
-        np.subtract(c[1:], c[:-1], out=slope[:-1])
-        slope[-1] = 0.0
-        slope *= self.per_mm
-        return slope
-
-    def band(self) -> FloatArray:
-        """A as a lower band (3, N), entry [d, j] couples j and j + d; held nodes have 1 on the diagonal."""
-        band, before, after = lower_band(len(self.weight)), self.per_mm[:-1], self.per_mm[1:]
-        one = self.stiff[:-1] * before
-        two = one * after  # first times last coefficient of a row
-        band[2, :-1], band[2, -1] = two, 0.0
-        one *= before
-        diagonal = self.weight.copy()
-        diagonal[:-1] += one
-        one += two  # first times middle, less its sign
-        beside = np.zeros(len(diagonal))
-        np.negative(one, out=beside[:-1])
-        diagonal[1:] += one
-        np.multiply(self.stiff[:-1], after, out=one)
-        one *= after
-        diagonal[2:] += one[:-1]
-        one += two  # middle times last, less its sign
-        diagonal[1:] += one
-        beside[1:] -= one
-        band[0], band[1] = diagonal, beside
-        self.hold(band)
-        return band
-
-    def hold(self, band: FloatArray) -> None:
-        """Cut the held nodes from a lower band (3, N), 1 on the diagonal."""
-        band.T[self.held] = _HELD
-        band[1, self.held - 1] = band[2, self.held - 2] = 0.0  # those past an end are zero anyway
-
-    def apply(self, c: FloatArray) -> FloatArray:
-        """A c for node values (N,) that are zero at held nodes, without forming the product of differences."""
-        product = spread(self.bend, gather(self.bend, c))
-        product += self.weight * c
-        return product
-
-    def solve(self) -> FloatArray:
-        """Fitted curves (N,) without bounds, refined against the product form of A."""
-        band = self.band()
-        own = self.weight.copy()
-        own[self.held] = 1.0
-        height, lowest = float(band[0].max()), float(own.min())
-        if height <= _EASY * lowest and len(own) > 1 and use_compiled(len(own), _LARGE):
-            return self._solved_at_once(band)
-        factor, solved, info = dpbsv(band, self.pull, lower=1, overwrite_ab=1)
+        Refined against the product form of A as in :meth:`compgen.fit.smoother.Smoother.inverse`, curve by curve.
+        """
+        band = self.mu * self.laid.penalty
+        band[0] += self.laid.free_weight
+        load = self._free(self.laid.load(y[:, None]))
+        factor, x, info = dpbsv(band, load, lower=1)
         if info:
-            raise _singular()
-        c: FloatArray = solved.ravel()
-        if height <= _EASY * lowest:
-            return c
-        for _ in range(_REFINEMENTS):
-            step = dpbtrs(factor, self.pull - self.apply(c), lower=1)[0].ravel()
-            c += step
-            if not (self.largest(np.abs(step)) > _SETTLED * self.largest(np.abs(c))).any():
+            return None
+        rough = np.ones(len(self.sizes), dtype=bool)
+        for _ in range(REFINEMENTS):
+            rest = load - self._apply(x)
+            step = dpbtrs(factor, rest, lower=1)[0]
+            x = x + (step if rough.all() else step * rough.repeat(self.sizes)[:, None])
+            rough &= ~(self.largest(step[:, 0]) <= SETTLED * self.largest(x[:, 0]))
+            if not rough.any():
                 break
-        return np.asarray(self.free * c)
+        return np.ascontiguousarray(self._free(x)[:, 0])
 
-    def _solved_at_once(self, band: FloatArray) -> FloatArray:
-        """Solve by the compiled loop: half the time of LAPACK for so narrow a band."""
-        from compgen.fit.compiled import band_solver
+    def _apply(self, c: FloatArray) -> FloatArray:
+        """A c for curves (N, 1) that are zero at fixed nodes, without forming the product of the second differences."""
+        weight, mu = self.laid.weight[:, None], self.mu[:, None]
+        return self._free(weight * c + mu * self.laid.bend_transposed(self.laid.bend(c)))
 
-        c = np.empty(len(self.pull))
-        if not band_solver()(band, self.pull, c):
-            raise _singular()
-        return c
-
-
-def _singular() -> ConvergenceError:
-    return ConvergenceError("the system of the smooth curves is not positive definite; lower the smoothness")
+    def _free(self, values: FloatArray) -> FloatArray:
+        """Put zeros at the fixed nodes of (N, 1)."""
+        values[self.fixed] = 0.0
+        return values
 
 
-def lower_band(n: int) -> FloatArray:
-    """Return room for a lower band (3, n) in the order of LAPACK, which works on it without a copy."""
-    return np.empty((n, 3)).T
-
-
-def _inverse_steps(position_mm: FloatArray, ends: IntArray) -> FloatArray:
-    per_mm = np.ones(len(position_mm))
-    np.subtract(position_mm[1:], position_mm[:-1], out=per_mm[:-1])
-    per_mm[ends - 1] = math.inf  # no step from one curve to the next
-    return np.divide(1.0, per_mm, out=per_mm)
-
-
-def _stiffness(per_mm: FloatArray, level: FloatArray) -> FloatArray:
-    """Square (N,) of the factor of rows of D2 by slopes, see :func:`compgen.fit.smooth.second_difference`.
-
-    With p, q the inverses of the steps beside a node a row is sqrt(mu h^3 2 p q/(p + q)) (p, -p - q, q); ``level`` (N,)
-    is 2 mu h^3.
-    """
-    first, second = per_mm[:-1], per_mm[1:]
-    stiff = np.empty(len(per_mm))
-    stiff[-1] = 0.0
-    inner = np.add(first, second, out=stiff[:-1])
-    inner += _TINY  # a curve of one node has no steps
-    np.divide(first, inner, out=inner)
-    inner *= second
-    inner *= level[:-1]
-    return stiff
-
-
-def curvature_rows(per_mm: FloatArray) -> FloatArray:
-    """Coefficients (3, N) of c'' in windows of three nodes; zero where a window leaves its curve."""
-    rows = np.zeros((3, len(per_mm)))
-    first, second = per_mm[:-1], per_mm[1:]
-    scale = 2 * (first / (first + second + _TINY)) * second  # 2 / (step before + step after)
-    rows[0, :-1], rows[2, :-1] = scale * first, scale * second
-    rows[1] = -rows[0] - rows[2]
-    return rows
-
-
-def curvatures_of(stack: Stack, c: FloatArray) -> FloatArray:
-    """Second derivative (N,) in the window that begins at each node, see :func:`compgen.fit.bounds.curvature`."""
-    return gather(curvature_rows(stack.per_mm), c)
-
-
-def windows(values: FloatArray) -> FloatArray:
-    """Values (N,) seen from the first, middle and last node of each window of three: (3, N), zero past the end."""
-    seen = np.zeros((3, len(values)))
-    seen[0], seen[1, :-1], seen[2, :-2] = values, values[1:], values[2:]
-    return seen
-
-
-def gather(rows: FloatArray, c: FloatArray) -> FloatArray:
-    """Rows (..., 3, N), each acting on three nodes, times node values (N,): (..., N)."""
-    out = rows[..., 0, :] * c
-    out[..., :-1] += rows[..., 1, :-1] * c[1:]
-    out[..., :-2] += rows[..., 2, :-2] * c[2:]
-    return out
-
-
-def spread(rows: FloatArray, v: FloatArray) -> FloatArray:
-    """Transposed rows (3, N) times row values (N,): (N,)."""
-    out: FloatArray = rows[0] * v
-    out[1:] += (rows[1] * v)[:-1]
-    out[2:] += (rows[2] * v)[:-2]
-    return out
+def _breaks(stack: Stack, problems: Sequence[CurveProblem], c: FloatArray) -> BoolArray:
+    """Which curves (k,) of a stack (N,) break a bound, as :meth:`compgen.fit.bounds.Bounds.kept_by` judges one."""
+    bounds = [problem.bounds for problem in problems]
+    wrong: BoolArray = stack.largest(c) > [bound.max_abs for bound in bounds]
+    steepest, bent = [bound.max_slope for bound in bounds], [bound.max_curvature for bound in bounds]
+    direction = [bound.direction for bound in bounds]
+    sloped, curved = any(direction) or min(steepest) < math.inf, min(bent) < math.inf
+    if not (sloped or curved):
+        return wrong
+    position = np.concatenate([problem.position_mm for problem in problems])
+    step = position[1:] - position[:-1]
+    step[stack.starts[1:] - 1] = math.inf  # no slope from one curve to the next
+    if sloped:
+        slope = np.zeros(len(c))
+        slope[:-1] = (c[1:] - c[:-1]) / step
+        wrong |= stack.largest(slope) > steepest
+        if any(direction):
+            wrong |= stack.largest(np.maximum(-slope * np.array(direction).repeat(stack.sizes), 0.0)) > 0
+    if curved:
+        bend = np.zeros(len(c))
+        bend[:-2] = (curvature_at(step) * np.stack([c[:-2], c[1:-1], c[2:]], axis=1)).sum(axis=1)
+        wrong |= stack.largest(bend) > bent
+    return wrong

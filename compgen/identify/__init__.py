@@ -1,15 +1,14 @@
 """From tracer lengths to error curves, stations and their uncertainty."""
 
+from compgen.identify.adjust.propagation import SystematicInputs
+from compgen.identify.any_measurement import describe, identify_measurement, read_measurement
 from compgen.identify.covariance import Covariance, joint_covariance, predict_uncertainty, read_covariance
-from compgen.identify.deviations import identify_deviations
-from compgen.identify.identify import identify
-from compgen.identify.known_stations import KnownStations, locate_stations, read_stations
-from compgen.identify.measurement import describe, identify_measurement, read_measurement
+from compgen.identify.identification import Identification, StationResult
 from compgen.identify.monte_carlo import SelfCheck, sample_errors, self_check
-from compgen.identify.noise import IdentifyOptions
-from compgen.identify.result import Identification, StationResult
-from compgen.identify.sixdof import SixDofMeasurement, identify_sixdof
-from compgen.identify.systematic import SystematicInputs
+from compgen.identify.options import IdentifyOptions, KnownStations, locate_stations, read_stations
+from compgen.identify.positions import identify_deviations
+from compgen.identify.six_dof import SixDofMeasurement, identify_sixdof
+from compgen.identify.tracer_lengths import identify
 
 __all__ = [
     "Covariance",

@@ -17,19 +17,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.core.csvio import FloatArray
-from compgen.core.error_table import Curve, ErrorTable
-from compgen.core.files import read_bytes, sha256_of
-from compgen.core.lengths import Lengths
-from compgen.core.machine import Machine
-from compgen.core.names import ERROR_INDEX, LARGEST, SQUARENESS_NAMES, error_named
-from compgen.core.points import Points
+from compgen.data.csv_files import FloatArray
+from compgen.data.display import Displayed, Overview
+from compgen.data.error_table import ErrorTable
+from compgen.data.files import read_bytes, sha256_of
+from compgen.data.lengths import Lengths, Points
+from compgen.data.machine import Machine
+from compgen.data.names import ERROR_INDEX, LARGEST, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
-from compgen.identify.parameters import ErrorParameters
-from compgen.identify.result import Identification, worst_uncertainty
-from compgen.identify.systematic import Contribution, Systematic, SystematicInputs, responses
-from compgen.model.basis import hat_matrix
-from compgen.model.volumetric import c_matrix
+from compgen.identify.adjust.propagation import Contribution, Systematic, SystematicInputs, responses
+from compgen.identify.adjust.unknowns import ErrorParameters
+from compgen.identify.identification import Identification, worst_uncertainty
+from compgen.kinematics.curves import hat_matrix
+from compgen.kinematics.first_order import c_matrix
 
 FILE_NAME = "identified.covariance.npz"
 FORMAT = "compgen covariance 1"
@@ -38,15 +38,15 @@ CHUNK = 1024
 _MEMBERS = ("format", "machine", "errors_sha256", "error", "position_mm", "unit", "station", "setup", "factor")
 
 
-@dataclass(frozen=True)
-class Covariance:
+@dataclass(frozen=True, repr=False)
+class Covariance(Displayed):
     """Covariance of k error values, S stations and g dead lengths, all in mm and rad.
 
     Parameters
     ----------
     error, position_mm : name and position (k,) of each error value, in the order of the errors file; the position of a
         squareness error is nan.
-    station, setup : name and set-up of each dead length (g,); the stations stand in the order of first mention.
+    station, setup : name and set-up of each dead length (g,); the stations are in the order of first mention.
     factor : shape (k + 3 S + g, r); ``factor @ factor.T`` is the covariance: error values, then x, y, z of every
         station, then dead lengths.
     machine, errors_sha256 : name of the machine, and SHA-256 of the errors file that it belongs to ("" for none).
@@ -81,6 +81,13 @@ class Covariance:
         first = len(self.error)
         rows = self.factor[first : first + 3 * len(self.stations)]
         return rows @ rows.T
+
+    def overview(self) -> Overview:
+        """How many values it covers."""
+        machine = f"{self.machine}, " if self.machine else ""
+        return Overview(
+            f"{machine}{len(self.error)} error values, {len(self.stations)} stations, {len(self.station)} dead lengths"
+        )
 
 
 def error_values(layout: ErrorParameters) -> Iterator[tuple[str, FloatArray, slice, FloatArray]]:
@@ -130,7 +137,7 @@ def joint_covariance(result: Identification) -> Covariance:
     return covariance_from_factor(result.layout, factor, [(item.station, item.setup) for item in result.stations])
 
 
-def covariance_of_values(errors: ErrorTable, factor: FloatArray, machine: str) -> Covariance:
+def covariance_of_values(errors: ErrorTable, factor: FloatArray, machine: str = "") -> Covariance:
     """Covariance of error values that a factor (k, r) in the order of the errors file describes; no stations."""
     names: list[str] = []
     positions = []
@@ -138,7 +145,37 @@ def covariance_of_values(errors: ErrorTable, factor: FloatArray, machine: str) -
         at = np.array([np.nan]) if name in errors.squareness else errors.curves[name].position_mm
         names += [name] * len(at)
         positions.append(at)
-    return Covariance(tuple(names), np.concatenate(positions), (), np.zeros(0, dtype=np.int64), factor, machine)
+    return Covariance(
+        tuple(names), np.concatenate([np.zeros(0), *positions]), (), np.zeros(0, dtype=np.int64), factor, machine
+    )
+
+
+def values_at_nodes(errors: ErrorTable, names: Sequence[str], position_mm: FloatArray) -> FloatArray:
+    """Values of a table by name and position, (k,), mm and rad."""
+    label, result = np.array(names), np.zeros(len(names))
+    for name in dict.fromkeys(names):
+        rows = label == name
+        result[rows] = (
+            errors.squareness[name][0] if name in SQUARENESS_NAMES else errors.curves[name].at(position_mm[rows])
+        )
+    return result
+
+
+def covariance_or_independent(
+    errors: ErrorTable, covariance: Covariance | None, machine: str = ""
+) -> Covariance | None:
+    """Return the covariance; without one that of independent values with their own u; None where a u is not known."""
+    if covariance is not None:
+        return covariance
+    u = errors.uncertainties()
+    return covariance_of_values(errors, np.diag(u), machine) if len(u) and np.isfinite(u).all() else None
+
+
+def normalized_error(difference: FloatArray, expanded: FloatArray) -> FloatArray:
+    """E_n number of each difference (ISO/IEC 17043): its size over its expanded uncertainty; 0 for nothing over nothing."""
+    size, expanded = np.abs(difference), np.asarray(expanded, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where((size == 0.0) & (expanded == 0.0), 0.0, size / expanded))
 
 
 # --- systematic inputs on top of the random part -------------------------------------------------------------------
@@ -152,10 +189,12 @@ def with_systematic(
         return result
     found = responses(machine, lengths, result.layout, result.adjustment, inputs)
     given = dict(inputs.items())
-    contributions = tuple(
-        Contribution(name, given[name], response, _worst_of(result, response)) for name, response in found.items()
-    )
-    systematic = Systematic(contributions, result.worst_u)
+    contributions = []
+    for name, response in found.items():
+        rows = [matrix @ response[columns] for _, _, columns, matrix in error_values(result.layout)]
+        worst = worst_uncertainty(_with_u(result.errors, np.vstack(rows)))
+        contributions.append(Contribution(name, given[name], response, worst))
+    systematic = Systematic(tuple(contributions), result.worst_u)
     joint = joint_covariance(replace(result, systematic=systematic))
     errors = _with_u(result.errors, joint.errors_factor)
     u = np.sqrt(np.einsum("ij,ij->i", joint.factor, joint.factor))[len(joint.error) :]
@@ -177,24 +216,9 @@ def with_systematic(
     )
 
 
-def _worst_of(result: Identification, response: FloatArray) -> dict[str, tuple[float, str]]:
-    rows = [matrix @ response[columns] for _, _, columns, matrix in error_values(result.layout)]
-    return worst_uncertainty(_with_u(result.errors, np.vstack(rows)))
-
-
 def _with_u(errors: ErrorTable, factor: FloatArray) -> ErrorTable:
-    """Return the table with the uncertainties of a factor (values, r) whose rows stand in the order of the table."""
-    u = np.sqrt(np.einsum("ij,ij->i", factor, factor))
-    curves, squareness, first = {}, {}, 0
-    for name in errors.names:
-        if name in errors.squareness:
-            squareness[name] = (errors.squareness[name][0], float(u[first]))
-            first += 1
-        else:
-            curve = errors.curves[name]
-            curves[name] = Curve(curve.position_mm, curve.value, u[first : first + len(curve.value)])
-            first += len(curve.value)
-    return errors.replace(curves=curves, squareness=squareness)
+    """Return the table with the uncertainties of a factor (values, r) whose rows are in the order of the table."""
+    return errors.with_values(u=np.sqrt(np.einsum("ij,ij->i", factor, factor)))
 
 
 # --- uncertainty of E ----------------------------------------------------------------------------------------------
@@ -278,17 +302,21 @@ def read_covariance(path: str | Path, errors: str | Path | None = None) -> Covar
         if it is another kind of file, cut, damaged, inconsistent, or belongs to another errors file.
     """
     source = Path(path)
-    members = _members(source, read_bytes(source))
-    covariance = _checked(source, members)
+    covariance = parse_covariance(read_bytes(source), source)
     if errors is not None:
         digest = sha256_of(read_bytes(errors))
         if digest != covariance.errors_sha256:
             raise InputError(
                 f"belongs to another errors file (SHA-256 {covariance.errors_sha256[:12]}...) than {errors} "
-                f"({digest[:12]}...); give the errors file that was written beside it, unchanged",
+                f"({digest[:12]}...); give the errors file that was written with it, unchanged",
                 file=source,
             )
     return covariance
+
+
+def parse_covariance(content: bytes, source: Path) -> Covariance:
+    """Read the contents of a ``*.covariance.npz`` file; ``source`` is what messages name."""
+    return _checked(source, _members(source, content))
 
 
 def _members(source: Path, content: bytes) -> dict[str, NDArray[np.generic]]:
@@ -303,7 +331,7 @@ def _members(source: Path, content: bytes) -> dict[str, NDArray[np.generic]]:
         raise InputError(f"is not a covariance file of this version (format {FORMAT!r})", file=source)
     missing = [name for name in _MEMBERS if name not in members]
     if missing:
-        raise InputError(f"lacks {', '.join(missing)}; write it anew with compgen identify", file=source)
+        raise InputError(f"lacks {', '.join(missing)}; write it again with volcomp identify", file=source)
     return members
 
 
@@ -319,7 +347,9 @@ def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covarianc
             errors_sha256=str(members["errors_sha256"]),
         )
     except (ValueError, TypeError) as error:
-        raise InputError(f"holds something else than numbers where they are due: {error}", file=source) from error
+        raise InputError(
+            f"contains something other than numbers where numbers are expected: {error}", file=source
+        ) from error
     unknown = [name for name in covariance.error if name not in ERROR_INDEX]
     if unknown:
         raise InputError(f"names {unknown[0]!r}, which is not one of the 21 errors", file=source)

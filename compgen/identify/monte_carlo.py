@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from compgen.core.csvio import FloatArray
-from compgen.core.lengths import Lengths
-from compgen.core.machine import Machine
-from compgen.core.parallel import Map
-from compgen.core.threads import one_thread
+from compgen.data.csv_files import FloatArray
+from compgen.data.lengths import Lengths
+from compgen.data.machine import Machine
 from compgen.errors import InputError
 from compgen.identify.covariance import Covariance
-from compgen.identify.identify import identify
-from compgen.identify.noise import IdentifyOptions
-from compgen.identify.result import Identification
+from compgen.identify.identification import Identification
+from compgen.identify.options import IdentifyOptions
+from compgen.identify.tracer_lengths import identify
+from compgen.kinematics.kernel_switch import one_thread
+from compgen.kinematics.parallel import Map
 
 
 def sample_errors(covariance: Covariance, count: int, seed: int = 0) -> FloatArray:
@@ -86,7 +86,17 @@ def self_check(
     used = np.flatnonzero(result.accepted)
     sigma_mm = adjustment.sigma_mm / np.sqrt(adjustment.weight[used])
     model_mm = (lengths.length_mm + result.residual_mm)[used]
-    plain = _rows(replace(lengths, approach=None), used)
+    plain = replace(
+        lengths,
+        station=lengths.station[used],
+        point=[lengths.point[k] for k in used.tolist()],
+        position_mm=lengths.position_mm[used],
+        tool_mm=None if lengths.tool_mm is None else lengths.tool_mm[used],
+        labels={name: values[used] for name, values in lengths.labels.items()},
+        covariates={},
+        origin=[lengths.origin[k] for k in used.tolist()] if len(lengths.origin) else (),
+        approach=None,
+    )
     options = IdentifyOptions(
         u_length_um=result.u_length_um, u_length_um_per_m=result.u_length_um_per_m, reject=False, temperature=False
     )
@@ -95,7 +105,7 @@ def self_check(
     for k, found in enumerate(mapper(replicate, ((seed, k) for k in range(replicates)))):
         values.append(found)
         progress(k + 1)
-    u = _uncertainties(result)
+    _, u = _figures(result)
     spread = np.std(values, axis=0, ddof=1)
     ratio = spread[u > 0] / u[u > 0]
     return SelfCheck(
@@ -122,27 +132,11 @@ class _Replicate:
         noise = np.random.default_rng(seed).standard_normal(len(self.model_mm))
         readings = replace(self.lengths, length_mm=self.model_mm + self.sigma_mm * noise)
         with one_thread():
-            return _values(identify(self.machine, readings, self.options))
+            return _figures(identify(self.machine, readings, self.options))[0]
 
 
-def _rows(lengths: Lengths, rows: np.ndarray[Any, Any]) -> Lengths:
-    return replace(
-        lengths,
-        station=lengths.station[rows],
-        point=[lengths.point[k] for k in rows],
-        position_mm=lengths.position_mm[rows],
-        tool_mm=None if lengths.tool_mm is None else lengths.tool_mm[rows],
-        labels={name: values[rows] for name, values in lengths.labels.items()},
-        covariates={},
-        origin=[lengths.origin[k] for k in rows] if len(lengths.origin) else (),
-    )
-
-
-def _values(result: Identification) -> FloatArray:
-    curves = [curve.value for curve in result.errors.curves.values()]
-    return np.concatenate([*curves, [value for value, _ in result.errors.squareness.values()]])
-
-
-def _uncertainties(result: Identification) -> FloatArray:
-    curves = [curve.u for curve in result.errors.curves.values()]
-    return np.concatenate([*curves, [u for _, u in result.errors.squareness.values()]])
+def _figures(result: Identification) -> tuple[FloatArray, FloatArray]:
+    """Values and standard uncertainties of all errors, curves first, mm and rad."""
+    curves, squareness = result.errors.curves.values(), result.errors.squareness.values()
+    value = np.concatenate([*(curve.value for curve in curves), [value for value, _ in squareness]])
+    return value, np.concatenate([*(curve.u for curve in curves), [u for _, u in squareness]])

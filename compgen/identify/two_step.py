@@ -1,42 +1,637 @@
-"""Identification in the steps of Zha & Zhang 2024, sections 4 and 5: self-calibration, transformation, separation.
-
-The tracers locate themselves and every target point without any knowledge of the machine; the points are placed in the
-machine frame; the errors follow from the placed points. As the correlation of the points is carried along in full, the
-result is that of the joint adjustment up to terms of second order; the joint one can use more readings.
-"""
+"""Tracer lengths in two steps (Zha & Zhang 2024, sections 4 and 5): self-calibration, transformation, separation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError
 
-from compgen.core.csvio import FloatArray
-from compgen.core.lengths import Lengths
-from compgen.core.names import MM_PER_UM
-from compgen.errors import ConvergenceError, UndeterminedError
-from compgen.identify.located import Located, TracerReadings, distinct_poses, locatable_readings, locate_points
-from compgen.identify.outliers import Rejected, accepted_readings
-from compgen.identify.rank import describe_rank
-from compgen.identify.separation import LEVER_MM, SeparationProblem, frame_rotation
-from compgen.identify.solver import Solution, factorise, solve
-from compgen.identify.state import IntArray, State
-from compgen.model.exact import tip_position
-from compgen.model.rotation import cross_matrices
+from compgen.data.csv_files import FloatArray
+from compgen.data.deviations import Deviations
+from compgen.data.lengths import Lengths
+from compgen.data.names import MM_PER_UM
+from compgen.errors import ConvergenceError, InputError, UndeterminedError
+from compgen.identify.adjust.problem import LEVER_MM, SeparationProblem, frame_rotation
+from compgen.identify.adjust.rank import determined_factor
+from compgen.identify.adjust.robust import MOST_ROUNDS, Rejected, accepted_readings, check_rejected
+from compgen.identify.adjust.solver import LeastSquaresSolution, factorise, solve
+from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State
+from compgen.kinematics.exact_chain import cross_matrices, tip_position
+from compgen.kinematics.first_order import tool_of
 
-MOST_ROUNDS = 20
-#: With fewer readings kept than this share, model and readings do not belong together.
-LEAST_KEPT = 0.7
+# Tracers and points as a network of distances: its normal equations with the points eliminated one by one.
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """n readings of S stations (with G dead lengths) to m points; every point has a reading.
+
+    ``point``, ``station``, ``group`` (dead length) are indices (n,), ``length_mm`` and ``sigma_mm`` (n,) the reading
+    and its standard uncertainty.
+    """
+
+    point: IntArray
+    station: IntArray
+    group: IntArray
+    length_mm: FloatArray
+    sigma_mm: FloatArray
+
+    def taken(self, rows: IntArray) -> Sightings:
+        """Return the readings of these rows, in this order."""
+        where = self.point[rows], self.station[rows], self.group[rows]
+        return Sightings(*where, self.length_mm[rows], self.sigma_mm[rows])
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Stations (S, 3), dead lengths (G,) and points (m, 3) in one frame, mm."""
+
+    stations_mm: FloatArray
+    dead_length_mm: FloatArray
+    points_mm: FloatArray
+
+    def moved(self, rotation: FloatArray, translation_mm: FloatArray) -> Frame:
+        """Return the same after x -> R x + t."""
+        return Frame(
+            self.stations_mm @ rotation.T + translation_mm,
+            self.dead_length_mm,
+            self.points_mm @ rotation.T + translation_mm,
+        )
+
+
+@dataclass(frozen=True)
+class Network:
+    """Sightings in the order of their points, the first reading of each point (m,), and the free unknowns (q,)."""
+
+    sightings: Sightings
+    first: IntArray
+    free: IntArray
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Readings linearised at a frame: residuals, cost, and the normal equations with the points split off.
+
+    Parameters
+    ----------
+    residual_mm, cost : model minus reading (n,), and half the weighted sum of squares.
+    information, coupling, station_matrix : blocks of points (m, 3, 3), points by stations (m, 3, q), stations (q, q).
+    reduced : stations with the points eliminated, (q, q).
+    point_gradient, station_gradient : (m, 3) and (q,).
+    """
+
+    residual_mm: FloatArray
+    cost: float
+    information: FloatArray
+    coupling: FloatArray
+    station_matrix: FloatArray
+    reduced: FloatArray
+    point_gradient: FloatArray
+    station_gradient: FloatArray
+
+
+def residuals(data: Network, frame: Frame) -> tuple[FloatArray, FloatArray]:
+    """Model minus reading (n,) and unit lines of sight (n, 3)."""
+    seen = data.sightings
+    sight = frame.points_mm[seen.point] - frame.stations_mm[seen.station]
+    distance = np.sqrt(np.einsum("ij,ij->i", sight, sight))
+    return distance - frame.dead_length_mm[seen.group] - seen.length_mm, sight / distance[:, None]
+
+
+def cost(data: Network, frame: Frame) -> float:
+    """Half the weighted sum of squares."""
+    residual, _ = residuals(data, frame)
+    return 0.5 * float(np.sum((residual / data.sightings.sigma_mm) ** 2))
+
+
+def linearise(data: Network, frame: Frame) -> Linear:
+    """Normal equations at a frame; ``reduced`` is the Schur complement of the points."""
+    seen = data.sightings
+    residual, unit = residuals(data, frame)
+    weight = 1.0 / seen.sigma_mm**2
+    points, columns = len(frame.points_mm), frame.stations_mm.size + len(frame.dead_length_mm)
+    outer = weight[:, None, None] * unit[:, :, None] * unit[:, None, :]
+    information = np.add.reduceat(outer, data.first, axis=0)
+    pulled = (weight * residual)[:, None] * unit
+    own = 3 * seen.station[:, None] + np.arange(3)
+    dead = frame.stations_mm.size + seen.group
+    coupling = _scatter(seen.point, own, outer, points, columns)
+    coupling += _scatter(seen.point, dead[:, None], weight[:, None, None] * unit[:, :, None], points, columns)
+    station_matrix = _station_matrix(own, dead, outer, weight[:, None] * unit, columns)
+    gradient = np.zeros(columns)
+    gradient -= np.bincount(own.ravel(), pulled.ravel(), columns)
+    gradient -= np.bincount(dead, weight * residual, columns)
+    free = data.free
+    coupling, station_matrix = -coupling[:, :, free], station_matrix[np.ix_(free, free)]
+    flat = coupling.reshape(-1, len(free))
+    reduced = station_matrix - flat.T @ solved(information, coupling).reshape(-1, len(free))
+    return Linear(
+        residual_mm=residual,
+        cost=0.5 * float(np.dot(weight, residual**2)),
+        information=information,
+        coupling=coupling,
+        station_matrix=station_matrix,
+        reduced=0.5 * (reduced + reduced.T),
+        point_gradient=np.add.reduceat(pulled, data.first, axis=0),
+        station_gradient=gradient[free],
+    )
+
+
+def _station_matrix(
+    own: IntArray, dead: IntArray, outer: FloatArray, weighted_unit: FloatArray, columns: int
+) -> FloatArray:
+    """Block of stations and dead lengths: columns ``own`` (n, 3) and ``dead`` (n,) of each reading."""
+    matrix = np.zeros((columns, columns))
+    np.add.at(matrix, (own[:, :, None], own[:, None, :]), outer)
+    cross = np.zeros((columns, columns))
+    np.add.at(cross, (own, dead[:, None]), weighted_unit)
+    matrix += cross + cross.T
+    weight = np.einsum("nii->n", outer)  # u is a unit vector
+    matrix[np.diag_indices(columns)] += np.bincount(dead, weight, columns)
+    return matrix
+
+
+def _scatter(point: IntArray, column: IntArray, values: FloatArray, points: int, columns: int) -> FloatArray:
+    """Sum values (n, 3, k) into (points, 3, columns) at point (n,) and column (n, k)."""
+    index = (point[:, None, None] * 3 + np.arange(3)[:, None]) * columns + column[:, None, :]
+    summed = np.bincount(index.ravel(), values.ravel(), points * 3 * columns)
+    return np.asarray(summed, dtype=np.float64).reshape(points, 3, columns)
+
+
+def solved(information: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve for every point: information (m, 3, 3), right side (m, 3, k); UndeterminedError for a singular point."""
+    try:
+        return np.asarray(np.linalg.solve(information, right))
+    except np.linalg.LinAlgError:
+        raise UndeterminedError(
+            "a point lies in line with its stations, or all its stations lie on one line; it cannot be located", []
+        ) from None
+
+
+# Self-calibration of tracers in their own frame (Zha & Zhang 2024, eq. 12-19): no machine model, no commanded position.
+#
+# Unknown are the stations, the dead lengths and every target point:
+#
+#     | x_j - s_i | - d_i = l_ij
+#
+# The frame is that of eq. 17: the first station in the origin, the second on the x axis, the third in the xy plane. Least
+# squares by Levenberg-Marquardt. A point appears in its own readings only, so its three unknowns are eliminated point by
+# point; what remains is a normal matrix of the stations and dead lengths alone.
+
+
+#: A point is located by at least this many stations; only from one more on does it help to locate them.
+LOCATING_STATIONS = 3
+TOLERANCE_MM = 1e-8
+MAX_ITERATIONS = 100
+#: Eigenvalues of the scaled normal matrix of the stations below this are zero: the stations are not determined.
+ZERO_EIGENVALUE = 1e-12
+#: Sine of the angle at the first station from which the third one may define the xy plane.
+OFF_THE_LINE = 0.02
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """Optimum of a self-calibration; q = 3 S + G - 6 unknowns of the stations are left in the frame of eq. 17.
+
+    Parameters
+    ----------
+    frame : stations, dead lengths and points.
+    free : which of the 3 S + G coordinates and dead lengths are unknown, indices (q,).
+    information : of each point with the stations fixed, (m, 3, 3), 1/mm^2.
+    lever : movement of each point when an unknown of the stations moves, (m, 3, q).
+    station_information : of the stations and dead lengths, the points eliminated, (q, q), 1/mm^2.
+    residual_mm : model minus reading, (n,).
+    chi_square, degrees_of_freedom, iterations : of the adjustment; the machine has no part in it.
+    """
+
+    frame: Frame
+    free: IntArray
+    information: FloatArray
+    lever: FloatArray
+    station_information: FloatArray
+    residual_mm: FloatArray
+    chi_square: float
+    degrees_of_freedom: int
+    iterations: int
+
+    def mirrored(self) -> SelfCalibration:
+        """Return the mirror image in the xy plane, which explains the readings as well."""
+        flip = np.array([1.0, 1.0, -1.0])
+        stations = len(self.frame.stations_mm)
+        signs = np.concatenate([np.tile(flip, stations), np.ones(len(self.frame.dead_length_mm))])[self.free]
+        frame = Frame(self.frame.stations_mm * flip, self.frame.dead_length_mm, self.frame.points_mm * flip)
+        return replace(
+            self,
+            frame=frame,
+            information=self.information * np.outer(flip, flip),
+            lever=self.lever * flip[:, None] * signs,
+            station_information=self.station_information * np.outer(signs, signs),
+        )
+
+    def own_covariance(self) -> FloatArray:
+        """Covariance of each point with the stations fixed, (m, 3, 3), mm^2."""
+        return np.asarray(np.linalg.inv(self.information))
+
+    def station_covariance(self) -> FloatArray:
+        """Covariance of the unknowns of the stations, (q, q), mm^2."""
+        return np.asarray(np.linalg.inv(self.station_information))
+
+    def covariance(self) -> FloatArray:
+        """Covariance of each point in the frame of the stations, (m, 3, 3), mm^2; points share the stations' part."""
+        return self.own_covariance() + self.lever @ self.station_covariance() @ self.lever.transpose(0, 2, 1)
+
+
+def self_calibrate(sightings: Sightings, start: Frame) -> SelfCalibration:
+    """Locate stations and points from readings alone.
+
+    Parameters
+    ----------
+    sightings : every point is seen by three stations or more; points with four or more locate the stations.
+    start : rough values in any frame; only the start uses them, and they choose between the two mirror images.
+
+    Raises
+    ------
+    UndeterminedError
+        if the readings leave more open than the frame: too few points, stations or points in a plane or on a line.
+    ConvergenceError
+        if no optimum is reached.
+    """
+    order = np.argsort(sightings.point, kind="stable")
+    unknowns = np.arange(start.stations_mm.size + len(start.dead_length_mm))
+    data = Network(
+        sightings.taken(order),
+        np.searchsorted(sightings.point[order], np.arange(len(start.points_mm))),
+        np.setdiff1d(unknowns, _fixed_coordinates(start.stations_mm)).astype(np.int64),
+    )
+    frame, step, iterations = _minimise(data, _to_own_frame(start))
+    residual = np.empty(len(order))
+    residual[order] = step.residual_mm
+    return SelfCalibration(
+        frame=frame,
+        free=data.free,
+        information=step.information,
+        lever=-solved(step.information, step.coupling),
+        station_information=step.reduced,
+        residual_mm=residual,
+        chi_square=2.0 * step.cost,
+        degrees_of_freedom=len(order) - 3 * len(start.points_mm) - len(data.free),
+        iterations=iterations,
+    )
+
+
+def frame_stations(stations_mm: FloatArray) -> tuple[int, int, int]:
+    """Return the stations that define origin, x axis and xy plane: the first three, or a later one off their line."""
+    along = stations_mm[1] - stations_mm[0]
+    others = stations_mm[2:] - stations_mm[0]
+    sine = np.linalg.norm(np.cross(along, others), axis=1) / (
+        np.linalg.norm(along) * np.maximum(np.linalg.norm(others, axis=1), 1e-9)
+    )
+    third = int(np.argmax(sine > OFF_THE_LINE)) if np.any(sine > OFF_THE_LINE) else int(np.argmax(sine))
+    return 0, 1, 2 + third
+
+
+def _to_own_frame(start: Frame) -> Frame:
+    """Turn and shift into the frame of eq. 17."""
+    origin, second, third = (start.stations_mm[k] for k in frame_stations(start.stations_mm))
+    x = (second - origin) / np.linalg.norm(second - origin)
+    y = (third - origin) - x * float(x @ (third - origin))
+    length = float(np.linalg.norm(y))
+    if length < 1e-6:
+        raise UndeterminedError("all stations lie on one line; the tracers cannot locate themselves", [])
+    y /= length
+    rotation = np.stack([x, y, np.cross(x, y)])
+    frame = start.moved(rotation, -rotation @ origin)
+    coordinates = frame.stations_mm.ravel()
+    coordinates[_fixed_coordinates(start.stations_mm)] = 0.0
+    return replace(frame, stations_mm=coordinates.reshape(-1, 3))
+
+
+def _fixed_coordinates(stations_mm: FloatArray) -> list[int]:
+    """Places of the six zeros of eq. 17 among the coordinates of all stations."""
+    first, second, third = frame_stations(stations_mm)
+    return [3 * first, 3 * first + 1, 3 * first + 2, 3 * second + 1, 3 * second + 2, 3 * third + 2]
+
+
+def _minimise(data: Network, start: Frame) -> tuple[Frame, Linear, int]:
+    """Levenberg-Marquardt (eq. 19) with the points eliminated; the damping starts at zero."""
+    frame, linear, damping = start, linearise(data, start), 0.0
+    _check_rank(linear, data)
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        points, stations = _step(linear, damping)
+        size = max(float(np.abs(points).max()), float(np.abs(stations).max()))
+        candidate = _moved(frame, points, stations, data.free)
+        if not cost(data, candidate) <= linear.cost * (1 + 1e-9) + 1e-12:
+            damping = max(10.0 * damping, 1e-6)
+            if damping > 1e6:
+                break
+            continue
+        frame, linear = candidate, linearise(data, candidate)
+        if size < TOLERANCE_MM and not damping:
+            _check_rank(linear, data)
+            return frame, linear, iteration
+        damping = damping / 10.0 if damping > 1e-8 else 0.0
+    raise ConvergenceError(
+        "the self-calibration of the tracers found no optimum; check station labels and units, or use the joint method"
+    )
+
+
+def _step(linear: Linear, damping: float) -> tuple[FloatArray, FloatArray]:
+    """Steps of the points (m, 3) and of the free unknowns of the stations (q,)."""
+    information, reduced = linear.information, linear.reduced
+    flat = linear.coupling.reshape(-1, linear.coupling.shape[2])
+    if damping:
+        information = information * (1.0 + damping * np.eye(3))
+        damped = linear.station_matrix + damping * np.diag(np.diag(linear.station_matrix))
+        reduced = damped - flat.T @ solved(information, linear.coupling).reshape(flat.shape)
+    own = solved(information, linear.point_gradient[:, :, None])[:, :, 0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), 1e-300))
+    right = (linear.station_gradient - flat.T @ own.ravel()) * scale
+    stations = -scale * np.linalg.solve(reduced * np.outer(scale, scale), right)
+    moved = solved(information, (linear.coupling @ stations)[:, :, None])[:, :, 0]
+    return -own - moved, stations
+
+
+def _moved(frame: Frame, points: FloatArray, stations: FloatArray, free: IntArray) -> Frame:
+    everything = np.concatenate([frame.stations_mm.ravel(), frame.dead_length_mm])
+    everything[free] += stations
+    split = frame.stations_mm.size
+    return Frame(everything[:split].reshape(-1, 3), everything[split:], frame.points_mm + points)
+
+
+def _check_rank(linear: Linear, data: Network) -> None:
+    """UndeterminedError if the points leave more of the stations open than the frame of eq. 17."""
+    freedom = len(linear.residual_mm) - linear.point_gradient.size - len(data.free)
+    if freedom < 0:
+        raise UndeterminedError(
+            f"the self-calibration has {len(linear.residual_mm)} readings for {linear.point_gradient.size} coordinates "
+            f"of points and {len(data.free)} unknowns of the stations; more points seen by four stations are needed, or "
+            "the joint method, which needs no point of its own",
+            [],
+        )
+    scale = 1.0 / np.sqrt(np.diag(linear.station_matrix))
+    eigenvalues = np.linalg.eigvalsh(linear.reduced * np.outer(scale, scale))
+    open_directions = int(np.count_nonzero(eigenvalues < ZERO_EIGENVALUE))
+    if open_directions:
+        raise UndeterminedError(
+            f"the tracers cannot locate themselves: {open_directions} direction(s) of the stations remain undetermined (all "
+            "stations, or all points, in a plane?); use the joint method, which knows how the machine moves",
+            [],
+        )
+
+
+# From the tracers' frame into the machine's (Zha & Zhang 2024, eq. 20), in closed form.
+
+
+#: A mirror image is believed when it fits this much better than the proper placement.
+MIRROR_RATIO = 0.5
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Rigid motion x -> R x + t from one frame into another, with what it leaves.
+
+    Parameters
+    ----------
+    rotation, translation_mm : R (3, 3), a rotation, never a reflection, and t (3,).
+    rms_mm : weighted root mean square distance that is left.
+    mirrored : the points fit only as their mirror image: the frame they come from is left-handed.
+    """
+
+    rotation: FloatArray
+    translation_mm: FloatArray
+    rms_mm: float
+    mirrored: bool
+
+    def apply(self, points_mm: FloatArray) -> FloatArray:
+        """Return points (n, 3) in the other frame."""
+        return points_mm @ self.rotation.T + self.translation_mm
+
+
+def place(
+    points_mm: FloatArray, target_mm: FloatArray, weight: FloatArray | None = None, anchor: int | None = None
+) -> Placement:
+    """Return the rigid motion that brings points (n, 3) closest to targets (n, 3): eq. 20 by singular values.
+
+    Parameters
+    ----------
+    points_mm, target_mm : corresponding points in the two frames.
+    weight : of each point, (n,); default 1.
+    anchor : index of a point that is brought onto its target exactly (the paper's machine origin); default none: the
+        weighted centroids are brought together, which is the minimum.
+
+    Raises
+    ------
+    UndeterminedError
+        if the points lie on one line.
+    """
+    w = np.ones(len(points_mm)) if weight is None else weight / weight.mean()
+    share = w / w.sum() if anchor is None else (np.arange(len(w)) == anchor).astype(np.float64)
+    here, there = share @ points_mm, share @ target_mm
+    left, size, right = np.linalg.svd((target_mm - there).T @ (w[:, None] * (points_mm - here)))
+    if size[1] <= 1e-12 * size[0]:
+        raise UndeterminedError("the points lie on one line; nothing tells how the frame is turned about it", [])
+    hand = 1.0 if np.linalg.det(left @ right) > 0 else -1.0
+    proper = _rotated(left, right, hand, points_mm - here, target_mm - there, w)
+    image = _rotated(left, right, -hand, points_mm - here, target_mm - there, w)
+    rotation, rms = proper
+    return Placement(rotation, there - rotation @ here, rms, image[1] < MIRROR_RATIO * rms)
+
+
+def _rotated(
+    left: FloatArray, right: FloatArray, hand: float, points: FloatArray, targets: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, float]:
+    rotation = left @ np.diag([1.0, 1.0, hand]) @ right
+    rest = points @ rotation.T - targets
+    return rotation, float(np.sqrt(np.average(np.sum(rest**2, axis=1), weights=weight)))
+
+
+def placed_covariance(
+    own: FloatArray, lever: FloatArray, shared: FloatArray, points_mm: FloatArray, weight: FloatArray
+) -> FloatArray:
+    """Covariance of each point against the best-fit placement of all of them, (n, 3, 3), mm^2.
+
+    Parameters
+    ----------
+    own : covariance of each point by itself, (n, 3, 3).
+    lever, shared : (n, 3, q) and (q, q); the points share the part lever shared lever^T.
+    points_mm, weight : as for :func:`place`, the points in the final frame.
+    """
+    w = weight / weight.mean()
+    share = w / w.sum()
+    arms = cross_matrices(points_mm - share @ points_mm)
+    rigid = np.concatenate([np.broadcast_to(np.eye(3), own.shape), -arms], axis=2)  # movement by (shift, turn)
+    moment = np.einsum("n,nji,njk->ik", w, arms, arms)
+    turning = np.linalg.solve(moment, w[:, None, None] * arms)
+    taken = np.concatenate(
+        [share[:, None, None] * np.eye(3), turning], axis=1
+    )  # (shift, turn) by each point, (n, 6, 3)
+    own_part = taken @ own  # (n, 6, 3)
+    total = np.einsum("nij,nkj->ik", own_part, taken)
+    cross = rigid @ own_part
+    rest = lever - rigid @ np.einsum("nij,njq->iq", taken, lever)
+    placed = own - cross - cross.transpose(0, 2, 1) + rigid @ total @ rigid.transpose(0, 2, 1)
+    return np.asarray(placed + rest @ shared @ rest.transpose(0, 2, 1))
+
+
+# Points that tracers have located: self-calibration and transformation (Zha & Zhang 2024, eq. 12-20).
+
+
+MIN_STATIONS = 4
+
+
+@dataclass(frozen=True)
+class TracerReadings:
+    """Tracer readings as the joint method has prepared them; n readings.
+
+    Parameters
+    ----------
+    lengths, layout : the readings, and the unknown errors of the machine.
+    group : index of the dead length of each reading, (n,).
+    sigma_mm : standard uncertainty of each reading, (n,).
+    start : rough stations and dead lengths.
+    """
+
+    lengths: Lengths
+    layout: ErrorParameters
+    group: IntArray
+    sigma_mm: FloatArray
+    start: State
+
+
+@dataclass(frozen=True)
+class Located:
+    """Points that the tracers have located.
+
+    Parameters
+    ----------
+    rows, point : the readings that were used, and the point of each, (k,).
+    position_mm, tool_mm : poses of the points, (m, 3).
+    calibration : of the tracers in their own frame, right-handed as the machine.
+    placement : from that frame into the machine's; ``anchored`` if it was fixed at the reference point.
+    deviations : measured tip minus nominal one in the machine frame; the uncertainty is that against the best-fit
+        placement of all points.
+    covariance_mm2 : the same as a covariance of each point, (m, 3, 3).
+    """
+
+    rows: IntArray
+    point: IntArray
+    position_mm: FloatArray
+    tool_mm: FloatArray
+    calibration: SelfCalibration
+    placement: Placement
+    anchored: bool
+    deviations: Deviations
+    covariance_mm2: FloatArray
+
+    @property
+    def measured_mm(self) -> FloatArray:
+        """Measured tips in the machine frame, (m, 3)."""
+        return self.placement.apply(self.calibration.frame.points_mm)
+
+
+def distinct_poses(readings: TracerReadings) -> tuple[FloatArray, IntArray]:
+    """Distinct positions with their tools (m, 6), and the pose of each reading (n,)."""
+    lengths = readings.lengths
+    tool = np.broadcast_to(tool_of(readings.layout.machine, lengths.tool_mm), lengths.position_mm.shape)
+    poses, pose = np.unique(np.column_stack([lengths.position_mm, tool]), axis=0, return_inverse=True)
+    return poses, pose.ravel().astype(np.int64)
+
+
+def locatable_readings(readings: TracerReadings, pose: IntArray, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """TracerReadings whose pose is seen by three stations or more; InputError if they cannot locate the tracers."""
+    lengths = readings.lengths
+    names = lengths.stations
+    seen = np.zeros((int(pose.max()) + 1, len(names)), dtype=bool)
+    seen[pose[keep], lengths.station[keep]] = True
+    by_pose = seen.sum(axis=1)
+    advice = (
+        "; self-calibration leaves three unknown coordinates for each point, so at least four stations must see common "
+        "points. Use the joint method (--method joint), which needs three stations and no common point"
+    )
+    file = lengths.origin[0][0] if lengths.origin else None
+    if by_pose.max() < MIN_STATIONS:
+        raise InputError(f"no point is seen by more than {by_pose.max()} of {len(names)} stations{advice}", file=file)
+    located = by_pose >= LOCATING_STATIONS
+    lonely = [name for name, sees in zip(names, seen[located].any(axis=0), strict=True) if not sees]
+    if lonely:
+        raise InputError(f"station {lonely[0]!r} shares no point with three others{advice}", file=file)
+    rows = located[pose]
+    groups = np.setdiff1d(readings.group, readings.group[keep & rows])
+    if len(groups):
+        row = int(np.flatnonzero(readings.group == groups[0])[0])
+        name = names[lengths.station[row]]
+        raise InputError(f"a set-up of station {name!r} shares no point with three others{advice}", file=file)
+    return np.asarray(rows)
+
+
+def locate_points(readings: TracerReadings, poses: FloatArray, pose: IntArray, rows: IntArray) -> Located:
+    """Self-calibrate and place (eq. 12-20) with the readings ``rows`` (k,); ``poses`` (m, 6), ``pose`` of each reading (n,)."""
+    lengths = readings.lengths
+    present, point = np.unique(pose[rows], return_inverse=True)
+    point = point.ravel().astype(np.int64)
+    position_mm, tool_mm = poses[present, :3], poses[present, 3:]
+    nominal = position_mm + tool_mm
+    sightings = Sightings(
+        point, lengths.station[rows], readings.group[rows], lengths.length_mm[rows], readings.sigma_mm[rows]
+    )
+    start = Frame(readings.start.stations_mm, readings.start.dead_length_mm, nominal)
+    calibration = self_calibrate(sightings, start)
+    own = calibration.own_covariance()
+    weight = 1.0 / np.trace(own, axis1=1, axis2=2)
+    # the pose at the machine's reference point, if it was measured once, is brought onto it
+    away = np.abs(position_mm - np.array(readings.layout.machine.reference_point_mm)).max(axis=1)
+    at = np.flatnonzero(away < 1e-6)
+    anchor = int(at[0]) if len(at) == 1 else None
+    placement = place(calibration.frame.points_mm, nominal, weight, anchor)
+    if placement.mirrored:
+        calibration = calibration.mirrored()
+        own = calibration.own_covariance()
+        placement = place(calibration.frame.points_mm, nominal, weight, anchor)
+    turn = placement.rotation
+    measured = placement.apply(calibration.frame.points_mm)
+    shared = calibration.station_covariance()
+    covariance = placed_covariance(turn @ own @ turn.T, turn @ calibration.lever, shared, measured, weight)
+    deviations = _deviations(readings, position_mm, tool_mm, measured, covariance)
+    return Located(
+        rows, point, position_mm, tool_mm, calibration, placement, anchor is not None, deviations, covariance
+    )
+
+
+def _deviations(
+    readings: TracerReadings,
+    position_mm: FloatArray,
+    tool_mm: FloatArray,
+    measured_mm: FloatArray,
+    covariance: FloatArray,
+) -> Deviations:
+    lengths = readings.lengths
+    kept = {key: lengths.metadata[key] for key in ("date",) if key in lengths.metadata}
+    return Deviations(
+        position_mm=position_mm,
+        deviation_mm=measured_mm - position_mm - tool_mm,
+        u_mm=np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)),
+        tool_mm=None if lengths.tool_mm is None else tool_mm,
+        metadata={"machine": readings.layout.machine.name, **kept, "source": "compgen identify"},
+    )
+
+
+# Identification in the steps of Zha & Zhang 2024, sections 4 and 5: self-calibration, transformation, separation.
+#
+# The tracers locate themselves and every target point without any knowledge of the machine; the points are placed in the
+# machine frame; the errors follow from the placed points. As the correlation of the points is carried along in full, the
+# result is that of the joint adjustment up to terms of second order; the joint one can use more readings.
+
+
+TOO_MANY = "readings do not fit the model; check the machine file's chain, the station labels and the units"
 
 
 @dataclass(frozen=True)
 class TwoSteps:
     """Result: the optimum with the unknowns of the joint method, which readings count, the points, what to report."""
 
-    solution: Solution
+    solution: LeastSquaresSolution
     accepted: NDArray[np.bool_]
     rejected: tuple[Rejected, ...]
     located: Located
@@ -67,7 +662,7 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
         residual = _length_residuals(readings, poses, pose, state)
         lonely = np.flatnonzero(keep & ~used)
         again = accepted_readings(residual / readings.sigma_mm) if reject else keep
-        _check_enough(again)
+        check_rejected(again, TOO_MANY)
         if np.array_equal(again, keep):
             break
         keep = again
@@ -78,15 +673,6 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
         located=located,
         summary=_summary(readings, located, solution),
     )
-
-
-def _check_enough(keep: NDArray[np.bool_]) -> None:
-    rejected = int(np.count_nonzero(~keep))
-    if rejected > (1.0 - LEAST_KEPT) * len(keep):
-        raise ConvergenceError(
-            f"{rejected} of {len(keep)} readings do not fit the model; check the machine file's chain, the station "
-            "labels and the units before anything is rejected"
-        )
 
 
 def _separation(readings: TracerReadings, located: Located) -> SeparationProblem:
@@ -104,21 +690,16 @@ def _separation(readings: TracerReadings, located: Located) -> SeparationProblem
     )
 
 
-def _solve(problem: SeparationProblem, located: Located, readings: TracerReadings) -> Solution:
+def _solve(problem: SeparationProblem, located: Located, readings: TracerReadings) -> LeastSquaresSolution:
     """Step 3: eq. 21-28."""
-    matrix = problem.normal_matrix(problem.start)
-    try:
-        factor = factorise(matrix)
-    except LinAlgError:
+
+    def names() -> list[str]:
         stations = [f"{name} {letter}" for name in readings.lengths.stations for letter in "xyz"]
         everything = [*stations, *(f"dead length {k + 1}" for k in range(len(readings.start.dead_length_mm)))]
-        names = problem.unknown_names(tuple(everything[k] for k in located.calibration.free))
-        rank = describe_rank(matrix, names)
-        raise UndeterminedError(
-            f"the {len(located.position_mm)} located points determine {rank.rank} of {rank.size} unknowns; "
-            + "; ".join(rank.combinations[:8]),
-            list(rank.combinations),
-        ) from None
+        return problem.unknown_names(tuple(everything[k] for k in located.calibration.free))
+
+    what = f"the {len(located.position_mm)} located points"
+    factor, _ = determined_factor(problem.normal_matrix(problem.start), names, what, suspicious=0.0)
     return solve(problem, problem.start, factor)
 
 
@@ -135,8 +716,8 @@ def _joint_state(problem: SeparationProblem, state: State, located: Located) -> 
 
 
 def _joint_solution(
-    problem: SeparationProblem, solution: Solution, located: Located, state: State, sigma_mm: float
-) -> Solution:
+    problem: SeparationProblem, solution: LeastSquaresSolution, located: Located, state: State, sigma_mm: float
+) -> LeastSquaresSolution:
     """The same optimum with the joint method's unknowns; readings of ``sigma_mm`` get weight 1."""
     size, errors = problem.size, problem.parameters.size
     change = np.eye(size)
@@ -144,7 +725,9 @@ def _joint_solution(
     back = np.linalg.inv(change)
     matrix = back.T @ problem.normal_matrix(solution.state) @ back * sigma_mm**2
     factor = factorise(0.5 * (matrix + matrix.T))
-    return Solution(state, solution.cost * sigma_mm**2, factor, solution.iterations, solution.factorisations)
+    return LeastSquaresSolution(
+        state, solution.cost * sigma_mm**2, factor, solution.iterations, solution.factorisations
+    )
 
 
 def _station_derivative(problem: SeparationProblem, state: State, located: Located, joint: State) -> FloatArray:
@@ -182,7 +765,7 @@ def _not_located(lengths: Lengths, rows: IntArray, residual_mm: FloatArray) -> t
     return tuple(found)
 
 
-def _summary(readings: TracerReadings, located: Located, solution: Solution) -> dict[str, Any]:
+def _summary(readings: TracerReadings, located: Located, solution: LeastSquaresSolution) -> dict[str, Any]:
     """Return what each step leaves, for ``identify.json``."""
     calibration = located.calibration
     points = len(located.position_mm)

@@ -1,7 +1,16 @@
 """Planning a measurement: what it will determine, how well, and better places for the stations."""
 
-from compgen.plan.plan import Plan, VolumeUncertainty, plan, plan_of, planned_noise
-from compgen.plan.planned import Planned, planned
+from compgen.plan.prediction import (
+    Plan,
+    Planned,
+    PlanVisibility,
+    VolumeUncertainty,
+    plan,
+    plan_of,
+    plan_visibility,
+    planned,
+    planned_noise,
+)
 from compgen.plan.stations import (
     Box,
     PlannedStations,
@@ -14,18 +23,17 @@ from compgen.plan.stations import (
     regions_of,
     shell_around,
 )
-from compgen.plan.suggest import Candidate, Suggestion, candidate_trajectories, judge_trajectories, suggest
-from compgen.plan.visibility import PlanVisibility, plan_visibility
+from compgen.plan.suggest import Suggestion, TrajectoryCandidate, candidate_trajectories, judge_trajectories, suggest
 
 __all__ = [
     "Box",
-    "Candidate",
     "Plan",
     "Planned",
     "PlanVisibility",
     "PlannedStations",
     "Shell",
     "Suggestion",
+    "TrajectoryCandidate",
     "VolumeUncertainty",
     "box_from_text",
     "candidate_trajectories",

@@ -10,10 +10,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.core.csvio import FloatArray, format_csv, read_csv
-from compgen.core.lengths import POSITION_COLUMNS
-from compgen.core.machine import Machine
-from compgen.core.text import nearest, one_line
+from compgen.data.csv_files import FloatArray, format_csv, read_csv
+from compgen.data.lengths import POSITION_COLUMNS
+from compgen.data.machine import Machine
+from compgen.data.messages import nearest, one_line
 from compgen.errors import InputError
 
 #: Columns of the ``stations.csv`` of ``volcomp identify`` that a plan does not need.
@@ -58,7 +58,15 @@ class PlannedStations:
 
 
 def planned_stations(positions: Mapping[str, Sequence[float]]) -> PlannedStations:
-    """Return stations by name, with one pass each."""
+    """Return stations by name, with one pass each.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> stations = compgen.planned_stations({"LT1": (158.8, -1456.7, -349.7), "LT2": (-113.1, -1671.7, -349.4)})
+    >>> stations.names
+    ('LT1', 'LT2')
+    """
     index = np.arange(len(positions))
     where = np.array(list(positions.values()), dtype=np.float64).reshape(-1, 3)
     return PlannedStations(tuple(positions), where, np.column_stack([index, 0 * index]))
@@ -83,11 +91,11 @@ def read_stations(path: str | Path) -> PlannedStations:
         earlier = first.setdefault((name, None), row)
         if first.setdefault((name, int(setup[row])), row) != row:
             raise table.fail(
-                row, "station", f"{one_line(name)!r} stands here twice; tell set-ups apart in a column setup"
+                row, "station", f"{one_line(name)!r} is listed twice; distinguish set-ups by a column setup"
             )
         if np.max(np.abs(where[row] - where[earlier])) > 1e-6:
             message = (
-                f"{one_line(name)!r} stands at another place than in line {table.lines[earlier]}; a tracer that was "
+                f"{one_line(name)!r} is at a different position than in line {table.lines[earlier]}; a tracer that was "
                 "moved is another station"
             )
             raise table.fail(row, "x_mm", message)
@@ -238,7 +246,7 @@ def read_boxes(path: str | Path) -> dict[str, Box]:
     boxes: dict[str, Box] = {}
     for row, name in enumerate(table.names("station")):
         if name in boxes:
-            raise table.fail(row, "station", f"{one_line(name)!r} stands here a second time")
+            raise table.fail(row, "station", f"{one_line(name)!r} is listed twice")
         lower, upper = values[row, 0::2], values[row, 1::2]
         if np.any(lower > upper):
             axis = int(np.argmax(lower > upper))

@@ -7,20 +7,19 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy.linalg import LinAlgError
+from numpy.linalg import LinAlgError
 from scipy.linalg.lapack import dtrtri
 
-from compgen.core.csvio import FloatArray
-from compgen.core.machine import Machine
-from compgen.core.names import MM_PER_UM
-from compgen.core.points import Points
-from compgen.core.threads import one_thread
+from compgen.data.csv_files import FloatArray
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError
-from compgen.identify.noise import ReadingNoise
-from compgen.identify.solver import factorise
-from compgen.model.grid import volume_grid
-from compgen.plan.plan import Plan, plan_of
-from compgen.plan.planned import NEAREST_MM, Planned, planned
+from compgen.identify.adjust.solver import factorise
+from compgen.identify.options import ReadingNoise
+from compgen.kinematics.kernel_switch import one_thread
+from compgen.kinematics.volume_grid import volume_grid
+from compgen.plan.prediction import NEAREST_MM, Plan, Planned, plan_of, planned
 from compgen.plan.stations import PlannedStations, Region
 from compgen.simulate.trajectory import Line, Trajectory, trajectory_points
 
@@ -187,7 +186,7 @@ def points_of(found: Planned) -> Points:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class TrajectoryCandidate:
     """A trajectory with its number of points and what it would reach; ``worst_um`` is infinite if undetermined."""
 
     name: str
@@ -219,13 +218,9 @@ def candidate_trajectories(machine: Machine) -> dict[str, FloatArray]:
             found[f"lattice {count} x {count}"] = _lattice(machine, count)
     found["6 faces"] = trajectory_points(Trajectory("faces"), machine)
     found["full grid"] = trajectory_points(Trajectory("grid"), machine)
-    unique = {name: _each_once(points) for name, points in found.items()}
+    first = {name: np.unique(points, axis=0, return_index=True)[1] for name, points in found.items()}
+    unique = {name: points[np.sort(first[name])] for name, points in found.items()}  # each point once
     return dict(sorted(unique.items(), key=lambda item: len(item[1])))
-
-
-def _each_once(points: FloatArray) -> FloatArray:
-    _, first = np.unique(points, axis=0, return_index=True)
-    return points[np.sort(first)]
 
 
 def _cross_lines(machine: Machine) -> FloatArray:
@@ -266,20 +261,20 @@ def judge_trajectories(
     *,
     target_um: float,
     progress: Progress = lambda _: None,
-) -> tuple[list[Candidate], Candidate | None]:
+) -> tuple[list[TrajectoryCandidate], TrajectoryCandidate | None]:
     """Judge the candidates from the smallest on, and return them with the first that reaches the target, if any does.
 
     ``target_um`` is the largest standard uncertainty of E in the volume that is allowed, um.
     """
     if not (np.isfinite(target_um) and target_um > 0):
         raise InputError(f"the target is {target_um:g} um; a number above zero is expected")
-    judged: list[Candidate] = []
+    judged: list[TrajectoryCandidate] = []
     with one_thread():
         for name, position_mm in candidate_trajectories(machine).items():
             progress(f"judging trajectory: {name}")
             result = plan_of(planned(machine, stations, Points(position_mm), noise))
             worst, rms = result.volume.worst_um, result.volume.rms_um
-            judged.append(Candidate(name, position_mm, result.determined, worst, rms))
+            judged.append(TrajectoryCandidate(name, position_mm, result.determined, worst, rms))
             if result.determined and worst <= target_um:
                 return judged, judged[-1]
     return judged, None

@@ -1,4 +1,4 @@
-"""What the options of a control would buy: tables for the terminal, and ``options.md``."""
+"""What the options of a control would buy: tables for the terminal, `options.md` and `explain.md`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from compgen.verify.capability import Capability, ControlResult, Left
-from compgen.verify.levels import LABELS
-from compgen.verify.residuals import Residuals
+from compgen.controls.shared.base import Usage
+from compgen.data.messages import um_text
+from compgen.tables.judge import Residuals
+from compgen.tables.options import CORRECTED_UM, LABELS, Capability, ControlResult, Explanation, Left, LevelResult
+
+# What the options of a control would buy: tables for the terminal, and ``options.md``.
+
 
 #: Errors that leave less than this at every tool and level are not listed, um.
 LISTED_FROM_UM = 0.1
@@ -25,13 +29,8 @@ LEGEND = (
 )
 
 
-def um(value: float) -> str:
-    """A figure in um: two decimals below 10, none from 1000 on."""
-    return f"{value:.{2 if abs(value) < 9.995 else 1 if abs(value) < 999.95 else 0}f}"
-
-
 def _three(figures: Residuals) -> str:
-    return f"{um(figures.max_um)} / {um(figures.rms_um)} / {um(figures.p95_um)}"
+    return f"{um_text(figures.max_um)} / {um_text(figures.rms_um)} / {um_text(figures.p95_um)}"
 
 
 def tool_name(tool_mm: Sequence[float]) -> str:
@@ -56,12 +55,12 @@ def _gain(before_um: float | None, after_um: float) -> str:
         return ""
     gain = before_um - after_um
     worth = gain > max(LEAST_GAIN * before_um, LEAST_GAIN_UM)
-    return f"{um(gain)} um, {100.0 * gain / before_um:.0f} %" if worth else "nothing"
+    return f"{um_text(gain)} um, {100.0 * gain / before_um:.0f} %" if worth else "nothing"
 
 
 def control_rows(result: Capability) -> list[list[str]]:
     """Rows control, level, left, left*, remark."""
-    return [[item.label, _level(item), *_figures(item.left), _remark(item)] for item in result.controls]
+    return [[item.label, _level(item), *_left_cells(item.left), _remark(item)] for item in result.controls]
 
 
 def _level(item: ControlResult) -> str:
@@ -70,7 +69,7 @@ def _level(item: ControlResult) -> str:
     return LABELS[item.level] + (", " + LABELS["directional"].lstrip("+ ") if item.directional else "")
 
 
-def _figures(left: Left | None) -> list[str]:
+def _left_cells(left: Left | None) -> list[str]:
     return ["-", "-"] if left is None else [_three(left.after), _three(left.rigid_removed)]
 
 
@@ -92,14 +91,14 @@ def error_rows(result: Capability, tool: int) -> list[list[str]]:
     for name in result.levels[0].by_tool[tool][1]:
         values = [result.level(key).by_tool[tool][1][name] for key in _shown_levels(result)]
         if max(values) >= LISTED_FROM_UM:
-            rows.append([name, *map(um, values)])
+            rows.append([name, *map(um_text, values)])
     return rows
 
 
 def tool_rows(result: Capability) -> list[list[str]]:
     """Rows tool offset and, by level, largest / rms of all errors together as it stands."""
     return [
-        [tool_name(tool), *(um(result.level(key).by_tool[k][0].after.max_um) for key in _shown_levels(result))]
+        [tool_name(tool), *(um_text(result.level(key).by_tool[k][0].after.max_um) for key in _shown_levels(result))]
         for k, tool in enumerate(result.tools_mm)
     ]
 
@@ -148,9 +147,10 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
 
 def options_markdown(result: Capability) -> str:
     """Return ``options.md``."""
-    zone = "the whole travel" if result.zone_mm is None else _zone_words(result)
+    ends = zip("XYZ", result.zone_mm or (), strict=False)
+    zone = ", ".join(f"{axis} {part[0]:g} ... {part[1]:g} mm" for axis, part in ends if part is not None)
     parts = [
-        f"# Options for {result.machine}\n\nJudged at {result.points} points over {zone}.\n",
+        f"# Options for {result.machine}\n\nJudged at {result.points} points over {zone or 'the whole travel'}.\n",
         "## What each level of option leaves\n\n"
         + markdown_table(["tables hold", "left, um (max / rms / p95)", "left*, um", "buys"], level_rows(result)),
         LEGEND + "\n",
@@ -170,6 +170,137 @@ def options_markdown(result: Capability) -> str:
     return "\n".join(parts)
 
 
-def _zone_words(result: Capability) -> str:
-    ends = zip("XYZ", result.zone_mm or (), strict=False)
-    return ", ".join(f"{axis} {part[0]:g} ... {part[1]:g} mm" for axis, part in ends if part is not None)
+# ``explain.md``: what a control's table corrects, what stays and why, what the next option buys, what it uses.
+
+
+#: An error counts as corrected, in part at least, if less than this share of it stays.
+LEAST_HELP = 0.9
+#: What a control of each level holds, in words.
+HOLDS = {
+    "pitch": "positioning along each axis",
+    "squareness": "positioning, straightness and squareness",
+    "products": "positioning, straightness, squareness, and angles as products of tables",
+    "volumetric": "all errors of its volumetric model, at the tool in use",
+}
+
+
+def explanation_markdown(item: Explanation) -> str:
+    """Return ``explain.md``."""
+    parts = [
+        f"# {item.controller} on {item.machine}\n\nThis control holds {HOLDS[item.level]}.{_improvement(item)}\n",
+        _corrected(item),
+        _stays(item),
+        _next(item),
+        _nodes(item),
+        _limits(item),
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def _improvement(item: Explanation) -> str:
+    if item.own is None or item.own.left is None:
+        return ""
+    before, after = item.options.level("nothing").left.rigid_removed, item.own.left.rigid_removed
+    return (
+        f" The error over the volume goes from {um_text(before.max_um)} to {um_text(after.max_um)} um (largest) and from "
+        f"{um_text(before.rms_um)} to {um_text(after.rms_um)} um (rms), the best-fit rigid motion taken out, "
+        "by the file as it is written."
+    )
+
+
+def _corrected(item: Explanation) -> str:
+    helped = [fate for fate in item.fates if fate.after_um < LEAST_HELP * fate.before_um]
+    rows = [[fate.name, um_text(fate.before_um), um_text(fate.after_um)] for fate in helped]
+    if not rows:
+        return ""
+    return "## What it corrects\n\n" + markdown_table(["error", "displacement before, um", "left, um"], rows)
+
+
+def _stays(item: Explanation) -> str:
+    rows = [[fate.name, um_text(fate.after_um), fate.why] for fate in item.fates if fate.after_um > CORRECTED_UM]
+    table = markdown_table(["error", "left, um", "why"], rows) if rows else f"Nothing above {CORRECTED_UM:g} um.\n"
+    notes = "".join(f"\n{note[0].upper()}{note[1:]}.\n" for note in item.notes)
+    other = ""
+    if item.level != "volumetric":
+        tools = [f"{um_text(left.after.max_um)} um at {tool}" for tool, left in _by_tool(item)]
+        other = (
+            "\nThe tables were made for the tool offset of the machine file. With others an angular error acts at another "
+            f"lever; the largest error that the best table of this level leaves is {', '.join(tools)}.\n"
+        )
+    return "## What stays, and why\n\n" + table + other + notes
+
+
+def _by_tool(item: Explanation) -> list[tuple[str, Left]]:
+    results = item.options.level(item.level).by_tool
+    return [
+        (tool_name(tool) if any(tool) else "no offset", left)
+        for tool, (left, _) in zip(item.options.tools_mm, results, strict=True)
+    ]
+
+
+def _next(item: Explanation) -> str:
+    current = item.options.level(item.level)
+    following = _following(item, current)
+    if not following:
+        return "## What the next option would buy\n\nNothing more: this is the highest level for these errors.\n"
+    rows = [
+        [result.label, um_text(result.left.rigid_removed.max_um), um_text(result.left.rigid_removed.rms_um)]
+        for result in (current, *following)
+    ]
+    return "## What the next option would buy\n\n" + markdown_table(
+        ["tables hold", "largest left, um", "rms left, um"], rows
+    )
+
+
+def _following(item: Explanation, current: LevelResult) -> list[LevelResult]:
+    found, result = [], item.options.after(current.key)
+    while result is not None:
+        if not (result.key == "directional" and item.own is not None and item.own.directional):
+            found.append(result)
+        result = item.options.after(result.key)
+    return found
+
+
+def _nodes(item: Explanation) -> str:
+    rows = [
+        [
+            axis,
+            f"{int(node['nodes'])}",
+            f"{node['first_mm']:g} ... {node['last_mm']:g}",
+            f"{node['smallest_step_mm']:g} ... {node['largest_step_mm']:g}",
+        ]
+        for axis, node in item.nodes.items()
+    ]
+    steps = [
+        [f"{step.output} along {step.along}", um_text(step.step_um), f"{step.from_mm:g} ... {step.to_mm:g}"]
+        for step in item.steps
+    ]
+    text = "## Nodes, rounding, steps\n\n" + markdown_table(["over", "nodes", "from ... to, mm", "step, mm"], rows)
+    text += f"\nRounding changes the correction of an axis by at most {item.rounding_um:.3g} um.\n"
+    if steps:
+        headings = ["correction", "largest step between nodes, um", "between, mm"]
+        text += "\n" + markdown_table(headings, steps)
+    return text
+
+
+def _limits(item: Explanation) -> str:
+    text = "## Limits used\n\n"
+    if item.usage:
+        text += "Smallest margin first.\n\n" + markdown_table(
+            ["limit", "used", "allowed", "used, %", "margin"], [_usage_row(usage) for usage in item.usage]
+        )
+    else:
+        text += "The control states no limits of its own.\n"
+    return text + "".join(f"\nBroken: {violation}.\n" for violation in item.violations)
+
+
+def _usage_row(usage: Usage) -> list[str]:
+    name = usage.name if usage.stated else f"{usage.name}, usual default"
+    allowed, margin = usage.allowed, usage.allowed - usage.used
+    return [
+        name,
+        f"{usage.used:.4g} {usage.unit}",
+        f"{allowed:g} {usage.unit}",
+        f"{100 * usage.share:.0f}",
+        f"{margin:.4g}",
+    ]

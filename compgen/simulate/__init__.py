@@ -1,21 +1,22 @@
 """A virtual machine and virtual instruments: measurement files whose truth is known."""
 
-from compgen.simulate.axis_runs import AxisLaser
-from compgen.simulate.diagonals import DiagonalLaser
 from compgen.simulate.effects import EFFECTS, Effect
-from compgen.simulate.laser_tracer import LaserTracer, Station
+from compgen.simulate.lasers import AxisLaser, DiagonalLaser, LaserTracer, Station
 from compgen.simulate.run import (
+    INSTRUMENTS,
     AxisSimulation,
+    Instrument,
+    Scenario,
     Simulation,
     SixDofSimulation,
     actual_tips,
+    read_scenario,
     simulate,
     simulate_axis_runs,
     simulate_sixdof,
     write_simulation,
 )
-from compgen.simulate.scenario import INSTRUMENTS, Instrument, Scenario, read_scenario
-from compgen.simulate.sixdof_measurement import SimulatedSixDof
+from compgen.simulate.sixdof import SimulatedSixDof
 from compgen.simulate.trajectory import Line, Stops, Trajectory, plan_stops, trajectory_points
 from compgen.simulate.truth import RandomErrors, TruthPlan, draw_truth
 

@@ -1,37 +1,220 @@
-"""Run a scenario on a virtual machine: true errors -> tips -> readings -> files."""
+"""From a scenario to measurement files on a virtual machine.
+
+:func:`read_scenario` reads what is measured and how; :func:`simulate`, :func:`simulate_axis_runs` and
+:func:`simulate_sixdof` draw the true errors, move the tool tip by the exact chain and the effects, and let the instrument
+read it; :func:`write_simulation` writes the readings and the truth.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import inspect
+import re
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
-from compgen.core.axis_runs import AxisRuns, format_axis_runs
-from compgen.core.csvio import FloatArray
-from compgen.core.diagonals import Diagonals, format_diagonals
-from compgen.core.error_table import ErrorTable, format_errors
-from compgen.core.files import OutputFolder
-from compgen.core.lengths import Lengths, format_lengths
-from compgen.core.machine import Machine
+from compgen.data import toml_files
+from compgen.data.axis_runs import AxisRuns, Diagonals, format_axis_runs, format_diagonals
+from compgen.data.csv_files import FloatArray
+from compgen.data.display import Displayed, Overview
+from compgen.data.error_table import ErrorTable, format_errors
+from compgen.data.files import OutputFolder
+from compgen.data.lengths import Lengths, format_lengths
+from compgen.data.machine import Machine
+from compgen.data.registry import call_problem
 from compgen.errors import InputError
-from compgen.model.exact import tip_position
-from compgen.simulate.effects import Effect, LengthEffect, RunEffect, Sights
-from compgen.simulate.laser_tracer import LaserTracer, Station
-from compgen.simulate.scenario import LineLaser, Scenario
-from compgen.simulate.session import plan_session, with_temperatures
-from compgen.simulate.sixdof_measurement import SimulatedSixDof
-from compgen.simulate.trajectory import Stops, plan_stops
-from compgen.simulate.truth import child_seeds, draw_truth, random_stream
-from compgen.sixdof.readings import SixDof, format_sixdof
+from compgen.instruments.sixdof_readings import SixDof, format_sixdof
+from compgen.kinematics.exact_chain import tip_position
+from compgen.simulate.effects import Effect, LengthEffect, RunEffect, Sights, SimulatedEffect, read_effects
+from compgen.simulate.lasers import (
+    AxisLaser,
+    DiagonalLaser,
+    LaserTracer,
+    Station,
+    read_axis_laser,
+    read_diagonal_laser,
+    read_laser_tracer,
+)
+from compgen.simulate.sixdof import SimulatedSixDof, read_sixdof_measurement
+from compgen.simulate.trajectory import (
+    Session,
+    Stops,
+    Temperature,
+    Trajectory,
+    plan_session,
+    plan_stops,
+    read_session,
+    read_temperatures,
+    read_trajectory,
+    with_temperatures,
+)
+from compgen.simulate.truth import RandomErrors, TruthPlan, child_seeds, draw_truth, random_stream, read_truth_plan
+
+# What an effect or an instrument of a plug-in must be; said when it is registered.
+
+
+#: How the methods of an instrument are called.
+OBSERVE = ("stops", "tip_mm", "rng")
+
+
+def check_effect(name: str, thing: Any) -> tuple[Any, list[str]]:
+    """A reader: takes the section ``[[effects]]`` of a scenario and returns a function of machine and stops."""
+    return thing, call_problem(thing, ["section"], f"its reader {_name_of(thing)}")
+
+
+def check_instrument(name: str, thing: Any) -> tuple[Any, list[str]]:
+    """A reader: takes the section ``[instrument]`` of a scenario and returns an object with passes and observe.
+
+    A class that the reader names as what it returns is looked at here, the object itself when a scenario is read.
+    """
+    problems = call_problem(thing, ["section"], f"its reader {_name_of(thing)}")
+    if not problems:
+        try:
+            made = typing.get_type_hints(thing).get("return")
+        except (TypeError, NameError, AttributeError):
+            made = None
+        if inspect.isclass(made) and made is not object:
+            problems += instrument_problems(made)
+    return thing, problems
+
+
+def instrument_problems(thing: Any) -> list[str]:
+    """Say what an instrument, or its class, lacks."""
+    is_class = inspect.isclass(thing)
+    name = thing.__name__ if is_class else type(thing).__name__
+    known = {*dir(thing), *(getattr(thing, "__annotations__", {}) if is_class else ())}
+    problems = [] if "passes" in known else [f"{name} has no passes (how often the machine runs its trajectory)"]
+    observe = getattr(thing, "observe", None)
+    if is_class and inspect.isfunction(observe):
+        observe = observe.__get__(object())
+    return problems + call_problem(observe, OBSERVE, f"{name}.observe")
+
+
+def _name_of(thing: Any) -> str:
+    return getattr(thing, "__name__", type(thing).__name__)
+
+
+# Scenario files: true errors, instrument and trajectory of a simulated measurement.
+
+
+class Instrument(Protocol):
+    """What every simulated instrument has; one with ``stations`` says where they truly are."""
+
+    @property
+    def passes(self) -> int:
+        """How often the machine runs its trajectory."""
+
+    def observe(self, stops: Stops, tip_mm: FloatArray, rng: np.random.Generator) -> Lengths:
+        """Return the readings at stops whose true tips are ``tip_mm`` (n, 3) in the workpiece frame."""
+
+
+LineLaser = AxisLaser | DiagonalLaser
+AnyInstrument = Instrument | SimulatedSixDof | LineLaser
+#: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
+INSTRUMENTS: dict[str, Callable[[toml_files.Section], AnyInstrument]] = {
+    "laser-tracer": read_laser_tracer,
+    "sixdof": read_sixdof_measurement,
+    "axis-laser": read_axis_laser,
+    "diagonal-laser": read_diagonal_laser,
+}
+
+
+@dataclass(frozen=True, repr=False)
+class Scenario(Displayed):
+    """A simulated measurement; ``name`` begins the names of its files, ``seed`` starts every random number."""
+
+    instrument: AnyInstrument
+    seed: int
+    name: str = "simulated"
+    errors: TruthPlan = field(default_factory=lambda: TruthPlan(random=RandomErrors()))
+    trajectory: Trajectory = field(default_factory=Trajectory)
+    source: Path | None = None
+    effects: tuple[SimulatedEffect, ...] = ()
+    session: Session | None = None
+    temperatures: Mapping[str, Temperature] = field(default_factory=dict)
+
+    def overview(self) -> Overview:
+        """Name, seed, instrument, and the number of effects."""
+        effects = f", {len(self.effects)} effects" if self.effects else ""
+        return Overview(f"{self.name}, seed {self.seed}, {type(self.instrument).__name__}{effects}")
+
+
+def read_scenario(path: str | Path) -> Scenario:
+    """Read a scenario TOML strictly, and the error file that it may name.
+
+    Raises
+    ------
+    InputError
+        with file, line and key for anything that is missing, unknown or impossible.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> scenario = compgen.read_scenario("examples/zha-gantry.scenario.toml")
+    >>> scenario.name, scenario.seed
+    ('zha-gantry', 190)
+    """
+    root = toml_files.read_toml(path)
+    source = Path(path)
+    name = root.take("name", _file_name, "simulated")
+    seed = root.take("seed", toml_files.whole(0))
+    errors = read_truth_plan(root.section("errors", required=False), source.parent)
+    instrument = root.section("instrument")
+    kind = instrument.take("type", toml_files.choice(*INSTRUMENTS))
+    scenario = Scenario(
+        instrument=_instrument(kind, instrument),
+        seed=seed,
+        name=name,
+        errors=errors,
+        trajectory=read_trajectory(root.section("trajectory", required=False)),
+        source=source,
+        effects=read_effects(root.sections("effects")),
+        session=read_session(root.section("session")) if "session" in root else None,
+        temperatures=read_temperatures(root.section("temperatures", required=False)),
+    )
+    root.finish()
+    if isinstance(scenario.instrument, SimulatedSixDof):
+        for key in ("trajectory", "effects", "session", "temperatures"):
+            if key in root.data:
+                raise root.fail(key, "belongs to other instruments; a six-DOF instrument runs along the axes")
+    if isinstance(scenario.instrument, LineLaser):
+        for key in ("trajectory", "session"):
+            if key in root.data:
+                raise root.fail(
+                    key, "belongs to other instruments; a laser along axes or diagonals runs to and fro along each"
+                )
+    return scenario
+
+
+def _instrument(kind: str, section: toml_files.Section) -> AnyInstrument:
+    made = INSTRUMENTS[kind](section)
+    if isinstance(made, SimulatedSixDof | LineLaser):
+        return made
+    problems = instrument_problems(made)
+    if problems:
+        raise section.fail("type", "; ".join(problems))
+    return made
+
+
+def _file_name(value: Any) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,80}", value):
+        raise ValueError("a file name of letters, digits, '.', '_' and '-' without an ending is expected")
+    return value
+
+
+# Run a scenario on a virtual machine: true errors -> tips -> readings -> files.
+
 
 #: Children of the seed: one for the errors, one for the noise, one for the order of a session.
 ERROR_STREAM, NOISE_STREAM, ORDER_STREAM = 0, 1, 2
 
 
-@dataclass(frozen=True)
-class Simulation:
+@dataclass(frozen=True, repr=False)
+class Simulation(Displayed):
     """The measurement of a virtual machine, and what is really true of it.
 
     Parameters
@@ -46,6 +229,11 @@ class Simulation:
     lengths: Lengths
     truth: ErrorTable
     stations: tuple[Station, ...]
+
+    def overview(self) -> Overview:
+        """The readings and the true errors."""
+        truth = self.truth.overview()
+        return Overview(f"{self.name}, {self.lengths.overview().title}", truth.header, truth.rows)
 
 
 @dataclass(frozen=True)
@@ -105,6 +293,18 @@ def simulate(
     ------
     InputError
         if the trajectory leaves the machine's travel.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> scenario = compgen.read_scenario("examples/zha-gantry.scenario.toml")
+    >>> measured = compgen.simulate(machine, scenario)
+    >>> measured
+    <Simulation: zha-gantry, 10648 readings of LT1, LT2, LT3, LT4>
+    >>> again, other = compgen.simulate(machine, scenario), compgen.simulate(machine, scenario, seed=191)
+    >>> [bool((item.lengths.length_mm == measured.lengths.length_mm).all()) for item in (again, other)]
+    [True, False]
     """
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
@@ -167,7 +367,7 @@ def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = Non
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
     if not isinstance(scenario.instrument, SimulatedSixDof):
-        raise InputError("is no six-DOF instrument; call simulate", file=scenario.source, field="[instrument] type")
+        raise InputError("is not a six-DOF instrument; call simulate", file=scenario.source, field="[instrument] type")
     truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
     readings = scenario.instrument.measure(machine, truth, random_stream(seeds, NOISE_STREAM))
     metadata = {**_common(machine, used_seed), **readings.metadata}
@@ -180,7 +380,7 @@ def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = 
     seeds = np.random.SeedSequence(used_seed)
     if not isinstance(scenario.instrument, LineLaser):
         raise InputError(
-            "is no laser along axes or diagonals; call simulate", file=scenario.source, field="[instrument] type"
+            "is not a laser along axes or diagonals; call simulate", file=scenario.source, field="[instrument] type"
         )
     truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
     moving = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect | RunEffect)]
@@ -205,16 +405,32 @@ def _described(machine: Machine, truth: ErrorTable, seed: int) -> ErrorTable:
     return truth.replace(metadata={**common, "source": "simulated truth", "reference_point_mm": reference})
 
 
+#: Ending and writer of the file of each kind of readings.
+_FORMATS: dict[type, tuple[str, Callable[[Any], str]]] = {
+    Diagonals: (".diagonals.csv", format_diagonals),
+    AxisRuns: (".axis.csv", format_axis_runs),
+    SixDof: (".sixdof.csv", format_sixdof),
+    Lengths: (".lengths.csv", format_lengths),
+}
+
+
 def write_simulation(simulation: Simulation | SixDofSimulation | AxisSimulation, folder: str | Path) -> dict[str, Path]:
-    """Write the readings, e.g. ``<name>.lengths.csv``, and ``truth.errors.csv``; return paths by file name."""
+    """Write the readings, e.g. ``<name>.lengths.csv``, and ``truth.errors.csv``; return paths by file name.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> scenario = compgen.read_scenario("examples/zha-gantry.scenario.toml")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = compgen.write_simulation(compgen.simulate(machine, scenario), folder)
+    >>> sorted(paths)
+    ['truth.errors.csv', 'zha-gantry.lengths.csv']
+    """
     output = OutputFolder(folder)
-    if isinstance(simulation, AxisSimulation) and isinstance(simulation.readings, Diagonals):
-        output.add(f"{simulation.name}.diagonals.csv", format_diagonals(simulation.readings))
-    elif isinstance(simulation, AxisSimulation) and isinstance(simulation.readings, AxisRuns):
-        output.add(f"{simulation.name}.axis.csv", format_axis_runs(simulation.readings))
-    elif isinstance(simulation, SixDofSimulation):
-        output.add(f"{simulation.name}.sixdof.csv", format_sixdof(simulation.readings))
-    elif isinstance(simulation, Simulation):
-        output.add(f"{simulation.name}.lengths.csv", format_lengths(simulation.lengths))
+    readings = simulation.lengths if isinstance(simulation, Simulation) else simulation.readings
+    suffix, text_of = _FORMATS[type(readings)]
+    output.add(f"{simulation.name}{suffix}", text_of(readings))
     output.add("truth.errors.csv", format_errors(simulation.truth))
     return output.commit()

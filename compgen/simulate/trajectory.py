@@ -1,24 +1,32 @@
-"""The trajectory of a simulated measurement: which points the machine visits, in which order and when."""
+"""Which points the machine visits, in which order and when: passes over a grid, or sessions of many runs.
+
+A :class:`Trajectory` gives the points, a :class:`Session` repeats its lines under several loads and feeds; both end as
+:class:`Stops` in order of time, with temperatures beside them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.core import tomlio
-from compgen.core.csvio import FloatArray
-from compgen.core.machine import Machine, Vector3
-from compgen.core.names import AXES
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine, Vector3
+from compgen.data.names import AXES, SECONDS_PER_HOUR, SECONDS_PER_MIN
+from compgen.data.toml_files import setting
 from compgen.errors import InputError
 from compgen.simulate.truth import counts
 
+# The trajectory of a simulated measurement: which points the machine visits, in which order and when.
+
+
 #: Decimals of commanded positions in mm: 0.1 um, no finer than a lengths file keeps, so that writing loses nothing.
 POSITION_DECIMALS = 4
-SECONDS_PER_MIN = 60.0
 
 Levels = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -27,9 +35,16 @@ Levels = tuple[FloatArray, FloatArray, FloatArray]
 class Line:
     """A straight line of ``points`` equally spaced points, ends included, in mm."""
 
-    from_mm: Vector3
-    to_mm: Vector3
-    points: int
+    from_mm: Vector3 = setting(toml_files.vector3)
+    to_mm: Vector3 = setting(toml_files.vector3)
+    points: int = setting(toml_files.whole(2))
+
+
+def _tools(value: Any) -> tuple[Vector3, ...]:
+    tools = toml_files.vectors3(value)
+    if len(set(tools)) != len(tools):
+        raise ValueError("each tool offset may be given once")
+    return tools
 
 
 @dataclass(frozen=True)
@@ -52,11 +67,11 @@ class Trajectory:
     counts: tuple[int, int, int] | None = None
     levels_mm: tuple[FloatArray | None, FloatArray | None, FloatArray | None] = (None, None, None)
     lines: tuple[Line, ...] = ()
-    there_and_back: bool = True
-    tools_mm: tuple[Vector3, ...] = ()
-    feed_mm_min: float = 1000.0
-    dwell_s: float = 3.0
-    start_mm: Vector3 | None = None
+    there_and_back: bool = setting(toml_files.word_for({"there-and-back": True, "once": False}), True, key="runs")
+    tools_mm: tuple[Vector3, ...] = setting(_tools, ())
+    feed_mm_min: float = setting(toml_files.positive, 1000.0)
+    dwell_s: float = setting(toml_files.positive, 3.0)
+    start_mm: Vector3 | None = setting(toml_files.vector3, None)
 
 
 @dataclass(frozen=True)
@@ -94,50 +109,28 @@ class Stops:
 # --- reading -----------------------------------------------------------------------------------------------------
 
 
-def read_trajectory(section: tomlio.Section) -> Trajectory:
+def read_trajectory(section: toml_files.Section) -> Trajectory:
     """Read the ``[trajectory]`` section of a scenario strictly."""
-    kind = section.take("type", tomlio.choice(*(*BLOCKS, "lines")), "grid")
-    lines = tuple(_read_line(entry) for entry in section.sections("lines")) if kind == "lines" else ()
+    kind = section.take("type", toml_files.choice(*(*BLOCKS, "lines")), "grid")
+    lines = (
+        tuple(toml_files.read_settings(Line, entry) for entry in section.sections("lines")) if kind == "lines" else ()
+    )
     if kind == "lines" and not lines:
         raise section.fail("lines", "is missing; type = 'lines' needs [[trajectory.lines]] with from_mm, to_mm, points")
     explicit = [] if kind == "lines" else [section.take(f"{axis.lower()}_mm", _levels, None) for axis in AXES]
-    trajectory = Trajectory(
+    return toml_files.read_settings(
+        Trajectory,
+        section,
         kind=kind,
         counts=None if kind == "lines" else section.take("levels", counts, None),
-        levels_mm=(explicit[0], explicit[1], explicit[2]) if explicit else (None, None, None),
+        levels_mm=tuple(explicit) or (None, None, None),
         lines=lines,
-        there_and_back=section.take("runs", tomlio.choice("there-and-back", "once"), "there-and-back") != "once",
-        tools_mm=section.take("tools_mm", _tools, ()),
-        feed_mm_min=section.take("feed_mm_min", tomlio.positive, 1000.0),
-        dwell_s=section.take("dwell_s", tomlio.positive, 3.0),
-        start_mm=section.take("start_mm", tomlio.vector3, None),
     )
-    section.finish()
-    return trajectory
-
-
-def _read_line(entry: tomlio.Section) -> Line:
-    line = Line(
-        entry.take("from_mm", tomlio.vector3),
-        entry.take("to_mm", tomlio.vector3),
-        entry.take("points", tomlio.whole(2)),
-    )
-    entry.finish()
-    return line
 
 
 def _levels(value: Any) -> FloatArray:
-    items = tomlio.numbers(value)
-    return np.array(items if len(items) == 1 else tomlio.ascending(value))
-
-
-def _tools(value: Any) -> tuple[Vector3, ...]:
-    if not isinstance(value, list) or not value:
-        raise ValueError("a list of tool offsets [[x, y, z], ...] is expected")
-    tools = tuple(tomlio.vector3(item) for item in value)
-    if len(set(tools)) != len(tools):
-        raise ValueError("each tool offset may be given once")
-    return tools
+    items = toml_files.numbers(value)
+    return np.array(items if len(items) == 1 else toml_files.ascending(value))
 
 
 # --- points ------------------------------------------------------------------------------------------------------
@@ -274,3 +267,165 @@ def approach_of(moves: FloatArray) -> FloatArray:
     moving = moves != 0
     last = np.maximum.accumulate(np.where(moving, np.arange(len(moves))[:, None], 0), axis=0)
     return np.sign(np.take_along_axis(moves, last, axis=0))
+
+
+# A measurement session of runs: every line at several loads and feeds, repeated, in random order, with temperatures.
+#
+# A session labels its readings (line, repeat, run, block, setup) and logs feed, load and temperatures, as a diagnosis
+# needs them.
+
+
+#: Lead-in before the first stop of a run, as a share of the way to the second.
+LEAD_IN = 0.05
+
+
+def _conditions(value: Any) -> tuple[float, ...]:
+    items = tuple(toml_files.not_negative(item) for item in toml_files.numbers(value))
+    if not items or len(set(items)) != len(items):
+        raise ValueError("a list of different numbers that are not negative is expected")
+    return items
+
+
+def _feeds(value: Any) -> tuple[float, ...]:
+    return tuple(toml_files.positive(item) for item in _conditions(value))
+
+
+@dataclass(frozen=True)
+class Session:
+    """How often and under which conditions the lines are run.
+
+    Parameters
+    ----------
+    repeats : runs of every line under equal conditions.
+    loads_kg, feeds_mm_min : conditions, each of which every line is run at; empty: no load logged, the trajectory's feed.
+    shuffled : random order of the runs within each set-up.
+    jitter : largest shift of each point along its line, as a share of the line's length; the same in repeats.
+    """
+
+    repeats: int = setting(toml_files.whole(1, 1000), 1)
+    loads_kg: tuple[float, ...] = setting(_conditions, ())
+    feeds_mm_min: tuple[float, ...] = setting(_feeds, ())
+    shuffled: bool = setting(toml_files.word_for({"as-listed": False, "random": True}), False, key="order")
+    jitter: float = setting(toml_files.share(0.5, "the line's length"), 0.0)
+
+
+@dataclass(frozen=True)
+class Temperature:
+    """One channel over time: base + ramp t + cycle sin(2 pi t / period) + warm-up (1 - exp(-t / time constant))."""
+
+    base_c: float = setting(toml_files.number, 20.0)
+    ramp_k_per_h: float = setting(toml_files.number, 0.0)
+    cycle_k: float = setting(toml_files.number, 0.0)
+    cycle_s: float = setting(toml_files.positive, SECONDS_PER_HOUR)
+    warmup_k: float = setting(toml_files.number, 0.0)
+    warmup_s: float = setting(toml_files.positive, SECONDS_PER_HOUR)
+
+    def at(self, time_s: FloatArray) -> FloatArray:
+        """Temperature in degC at times (n,)."""
+        cycle = self.cycle_k * np.sin(2.0 * np.pi * time_s / self.cycle_s)
+        warmup = self.warmup_k * -np.expm1(-time_s / self.warmup_s)
+        return np.asarray(self.base_c + self.ramp_k_per_h * time_s / SECONDS_PER_HOUR + cycle + warmup)
+
+
+def read_session(section: toml_files.Section) -> Session:
+    """Read the ``[session]`` section of a scenario strictly."""
+    return toml_files.read_settings(Session, section)
+
+
+def read_temperatures(section: toml_files.Section) -> dict[str, Temperature]:
+    """Read the ``[temperatures.NAME]`` sections of a scenario strictly; the column is ``temp_NAME_c``."""
+    return {name: toml_files.read_settings(Temperature, section.section(name)) for name in section.data}
+
+
+def plan_session(
+    session: Session, trajectory: Trajectory, machine: Machine, passes: int, rng: np.random.Generator
+) -> Stops:
+    """Return the stops of all runs in order of time: for each pass of the instrument and each set-up its runs.
+
+    Raises
+    ------
+    InputError
+        if a point lies outside the machine's travel.
+    """
+    lines = [_jittered(line, session.jitter, machine, rng) for line in _lines(trajectory, machine)]
+    check_stops(np.concatenate(lines), machine)
+    tools = np.round(np.array(trajectory.tools_mm or [machine.tool_offset_mm]), POSITION_DECIMALS)
+    conditions = list(
+        product(range(len(lines)), session.loads_kg or (0.0,), session.feeds_mm_min or (trajectory.feed_mm_min,))
+    )
+    rows: list[tuple[float, ...]] = []
+    points: list[FloatArray] = []
+    for block, (_, setup) in enumerate(product(range(passes), range(len(tools))), start=1):
+        runs = [(*condition, repeat) for repeat in range(1, session.repeats + 1) for condition in conditions]
+        order = rng.permutation(len(runs)) if session.shuffled else np.arange(len(runs))
+        for line, load, feed, repeat in (runs[k] for k in order):
+            points.append(lines[line])
+            rows.append((len(lines[line]), block, setup + 1, len(rows) + 1, line + 1, repeat, load, feed))
+    return _stops(session, trajectory, machine, np.concatenate(points), np.array(rows), tools)
+
+
+def _lines(trajectory: Trajectory, machine: Machine) -> list[FloatArray]:
+    """Lines one after another, each also backwards where the trajectory goes there and back; other kinds are one line."""
+    if trajectory.kind != "lines":
+        return passes_of(trajectory, machine)
+    there = [np.linspace(line.from_mm, line.to_mm, line.points) for line in trajectory.lines]
+    return [way for line in there for way in ([line, line[::-1]] if trajectory.there_and_back else [line])]
+
+
+def _jittered(line: FloatArray, jitter: float, machine: Machine, rng: np.random.Generator) -> FloatArray:
+    if jitter > 0.0:
+        shift = rng.uniform(-jitter, jitter, len(line))
+        line = np.clip(line + shift[:, None] * (line[-1] - line[0]), machine.lower_mm, machine.upper_mm)
+    return np.asarray(np.round(line, POSITION_DECIMALS) + 0.0)
+
+
+def _stops(
+    session: Session,
+    trajectory: Trajectory,
+    machine: Machine,
+    position_mm: FloatArray,
+    runs: FloatArray,
+    tools: FloatArray,
+) -> Stops:
+    counts = runs[:, 0].astype(int)
+    each = np.repeat(runs, counts, axis=0)
+    feed = each[:, 7]
+    way_mm, approach, distance_mm = _ways(position_mm, counts, trajectory.start_mm or machine.reference_point_mm)
+    travel_s = distance_mm / feed * SECONDS_PER_MIN
+    travel_s[0] = 0.0
+    names = ("block", "setup", "run", "line", "repeat")
+    labels = {name: each[:, k].astype(np.int64) for k, name in enumerate(names, start=1)}
+    return Stops(
+        position_mm=position_mm,
+        point=label_points(position_mm),
+        run=labels.pop("run"),
+        time_s=np.cumsum(travel_s + trajectory.dwell_s),
+        approach=approach,
+        tool_mm=tools[labels["setup"] - 1] if trajectory.tools_mm else None,
+        covariates={"feed_mm_min": feed, **({"load_kg": each[:, 6]} if session.loads_kg else {})},
+        labels=labels if len(tools) > 1 else {name: labels[name] for name in ("block", "line", "repeat")},
+        way_mm=way_mm,
+    )
+
+
+def _ways(
+    position_mm: FloatArray, counts: NDArray[np.int64], start_mm: Vector3
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Last motion to each stop (n, 3), last directions (n, 3) and distance travelled since the stop before (n,).
+
+    Every run is begun from a lead-in before its first stop, so that this is approached like the others.
+    """
+    first = np.cumsum(counts) - counts
+    follow = np.minimum(first + 1, first + counts - 1)
+    lead_in = position_mm[first] - LEAD_IN * (position_mm[follow] - position_mm[first])
+    path = np.insert(position_mm, first, lead_in, axis=0)
+    moves = np.diff(path, axis=0, prepend=[start_mm])
+    stops = np.delete(np.arange(len(path)), first + np.arange(len(first)))
+    length = np.cumsum(np.linalg.norm(moves, axis=1))[stops]
+    return moves[stops], approach_of(moves)[stops], np.diff(length, prepend=0.0)
+
+
+def with_temperatures(stops: Stops, temperatures: Mapping[str, Temperature]) -> Stops:
+    """Return the stops with the temperature of every channel at their times."""
+    logged = {f"temp_{name}_c": channel.at(stops.time_s) for name, channel in temperatures.items()}
+    return replace(stops, covariates={**stops.covariates, **logged})

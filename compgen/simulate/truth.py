@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from compgen.core import tomlio
-from compgen.core.csvio import FloatArray
-from compgen.core.error_table import Curve, ErrorTable, read_errors
-from compgen.core.machine import Machine
-from compgen.core.names import (
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import Curve, ErrorTable, read_errors
+from compgen.data.machine import Machine
+from compgen.data.messages import nearest
+from compgen.data.names import (
     CURVE_NAMES,
     ERROR_INDEX,
     MM_PER_UM,
@@ -21,13 +22,32 @@ from compgen.core.names import (
     ErrorName,
     error_named,
 )
-from compgen.core.text import nearest
-from compgen.model import modelled_errors
+from compgen.kinematics import modelled_errors
 
 #: Number of harmonics in a drawn curve; harmonic k bends k half-waves into the travel.
 HARMONICS = 3
 
 PeakRange = tuple[float, float]
+
+
+def _peak_range(value: Any) -> PeakRange:
+    items = toml_files.numbers(value)
+    if len(items) != 2 or not 0 <= items[0] <= items[1]:
+        raise ValueError("two numbers [smallest, largest], not negative and in this order, are expected")
+    return items[0], items[1]
+
+
+def counts(value: Any) -> tuple[int, int, int]:
+    """One whole number for all three axes, or three for X, Y and Z, each at least 2 (a check for TOML values)."""
+    items = value if isinstance(value, list) else [value] * 3
+    if len(items) != 3:
+        raise ValueError("a whole number, or three for X, Y and Z, is expected")
+    x, y, z = (toml_files.whole(2, 10001)(item) for item in items)
+    return x, y, z
+
+
+def _peak(key: str, unit: float) -> Any:
+    return toml_files.setting(_peak_range, (10 * unit, 30 * unit), key=key, unit=unit)
 
 
 @dataclass(frozen=True)
@@ -37,10 +57,10 @@ class RandomErrors:
     ``nodes`` gives the number of nodes of the curves on X, Y, Z; None takes the machine's nodes.
     """
 
-    linear_peak_mm: PeakRange = (10 * MM_PER_UM, 30 * MM_PER_UM)
-    angular_peak_rad: PeakRange = (10 * RAD_PER_URAD, 30 * RAD_PER_URAD)
-    squareness_peak_rad: PeakRange = (10 * RAD_PER_URAD, 30 * RAD_PER_URAD)
-    nodes: tuple[int, int, int] | None = None
+    linear_peak_mm: PeakRange = _peak("linear_peak_um", MM_PER_UM)
+    angular_peak_rad: PeakRange = _peak("angular_peak_urad", RAD_PER_URAD)
+    squareness_peak_rad: PeakRange = _peak("squareness_peak_urad", RAD_PER_URAD)
+    nodes: tuple[int, int, int] | None = toml_files.setting(counts, None)
 
 
 @dataclass(frozen=True)
@@ -57,7 +77,7 @@ class TruthPlan:
     random: RandomErrors | None = None
 
 
-def read_truth_plan(section: tomlio.Section, folder: Path) -> TruthPlan:
+def read_truth_plan(section: toml_files.Section, folder: Path) -> TruthPlan:
     """Read the ``[errors]`` section of a scenario; a relative ``file`` counts from ``folder``.
 
     Raises
@@ -65,12 +85,12 @@ def read_truth_plan(section: tomlio.Section, folder: Path) -> TruthPlan:
     InputError
         for unknown keys or errors, a unit that does not fit the error, a file beside random errors.
     """
-    file = section.take("file", tomlio.text, None)
-    drawn = section.take("random", tomlio.flag, file is None)
+    file = section.take("file", toml_files.text, None)
+    drawn = section.take("random", toml_files.flag, file is None)
     if file is not None and drawn:
         raise section.fail("random", "errors come from a file already; give either file or random = true")
     table = read_errors(folder / file) if file is not None else ErrorTable()
-    random = _read_random(section) if drawn else None
+    random = toml_files.take_settings(RandomErrors, section) if drawn else None
     given = ErrorTable(
         {**table.curves, **_read_curves(section)},
         {**table.squareness, **_read_squareness(section.section("squareness_urad", required=False))},
@@ -79,40 +99,7 @@ def read_truth_plan(section: tomlio.Section, folder: Path) -> TruthPlan:
     return TruthPlan(given, random)
 
 
-def _read_random(section: tomlio.Section) -> RandomErrors:
-    default = RandomErrors()
-    linear_um = section.take("linear_peak_um", _peak_range, None)
-    angular_urad = section.take("angular_peak_urad", _peak_range, None)
-    squareness_urad = section.take("squareness_peak_urad", _peak_range, None)
-    return RandomErrors(
-        linear_peak_mm=_scaled(linear_um, MM_PER_UM) or default.linear_peak_mm,
-        angular_peak_rad=_scaled(angular_urad, RAD_PER_URAD) or default.angular_peak_rad,
-        squareness_peak_rad=_scaled(squareness_urad, RAD_PER_URAD) or default.squareness_peak_rad,
-        nodes=section.take("nodes", counts, None),
-    )
-
-
-def _scaled(limits: PeakRange | None, unit: float) -> PeakRange | None:
-    return None if limits is None else (limits[0] * unit, limits[1] * unit)
-
-
-def _peak_range(value: Any) -> PeakRange:
-    items = tomlio.numbers(value)
-    if len(items) != 2 or not 0 <= items[0] <= items[1]:
-        raise ValueError("two numbers [smallest, largest], not negative and in this order, are expected")
-    return items[0], items[1]
-
-
-def counts(value: Any) -> tuple[int, int, int]:
-    """One whole number for all three axes, or three for X, Y and Z, each at least 2 (a check for TOML values)."""
-    items = value if isinstance(value, list) else [value] * 3
-    if len(items) != 3:
-        raise ValueError("a whole number, or three for X, Y and Z, is expected")
-    x, y, z = (tomlio.whole(2, 10001)(item) for item in items)
-    return x, y, z
-
-
-def _read_curves(section: tomlio.Section) -> dict[str, Curve]:
+def _read_curves(section: toml_files.Section) -> dict[str, Curve]:
     curves: dict[str, Curve] = {}
     for entry in section.sections("curve"):
         name = entry.take("name", _curve_name)
@@ -123,12 +110,12 @@ def _read_curves(section: tomlio.Section) -> dict[str, Curve]:
     return curves
 
 
-def _read_curve(entry: tomlio.Section, error: ErrorName) -> Curve:
-    position_mm = np.array(entry.take("position_mm", tomlio.ascending))
+def _read_curve(entry: toml_files.Section, error: ErrorName) -> Curve:
+    position_mm = np.array(entry.take("position_mm", toml_files.ascending))
     key, other = ("value_um", "value_urad") if error.unit == "um" else ("value_urad", "value_um")
     if other in entry:
         raise entry.fail(other, f"{error.name} is given in {error.unit}; write {key}")
-    value = np.array(entry.take(key, tomlio.numbers))
+    value = np.array(entry.take(key, toml_files.numbers))
     if len(value) != len(position_mm):
         raise entry.fail(key, f"has {len(value)} values for {len(position_mm)} positions; give one for each")
     return Curve(position_mm, value * error.si_per_unit, np.full(len(value), np.nan))
@@ -142,8 +129,8 @@ def _curve_name(value: Any) -> str:
     return str(value)
 
 
-def _read_squareness(section: tomlio.Section) -> dict[str, tuple[float, float]]:
-    given = {name: section.take(name, tomlio.number, None) for name in SQUARENESS_NAMES}
+def _read_squareness(section: toml_files.Section) -> dict[str, tuple[float, float]]:
+    given = {name: section.take(name, toml_files.number, None) for name in SQUARENESS_NAMES}
     section.finish()
     return {name: (value * RAD_PER_URAD, np.nan) for name, value in given.items() if value is not None}
 

@@ -17,14 +17,13 @@ from plant import (
 )
 
 import compgen
-from compgen.core.error_table import Curve, ErrorTable
-from compgen.model import volumetric_error
-from compgen.model.grid import volume_grid
-from compgen.recal.change import spread_of
-from compgen.recal.drift import Drift, DriftSettings, FigureDrift, drift_report
-from compgen.recal.drift_data import Calibration, aligned, calibrations_of
-from compgen.recal.drift_words import interval_of
-from compgen.recal.store import open_store
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.fleet.change import Calibration, aligned, calibrations_of
+from compgen.fleet.drift import Drift, DriftSettings, FigureDrift, drift_report, interval_of
+from compgen.fleet.store import open_store
+from compgen.identify.covariance import covariance_or_independent
+from compgen.kinematics import volumetric_error
+from compgen.kinematics.volume_grid import volume_grid
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def _exact(year: Year, at: datetime) -> Calibration:
     table = year.factory.truth("mill-a", at)
     curves = {name: Curve(c.position_mm, c.value, np.full(len(c.value), UM)) for name, c in table.curves.items()}
     known = ErrorTable(curves, {name: (value, URAD) for name, (value, _) in table.squareness.items()})
-    return Calibration(at, known, spread_of(known, None))
+    return Calibration(at, known, covariance_or_independent(known, None))
 
 
 def steps_of(drift: Drift) -> dict[str, tuple[int, Held | None]]:

@@ -15,10 +15,10 @@ from pathlib import Path
 from factory import HOUR, Year, begin
 from plant import CONTROL, day_of
 
-from compgen.recal import actions, logs
-from compgen.recal.database import StoreError
-from compgen.recal.job import read_job
-from compgen.verify import read_tables
+from compgen.fleet import actions, logs
+from compgen.fleet.database import StoreError
+from compgen.fleet.job import read_job
+from compgen.tables import read_tables
 
 NAME = "mill-a"
 DAY = timedelta(days=1)

@@ -16,15 +16,15 @@ import people
 from people import Decision
 from plant import CRASH, MONTHS, NAMES, Factory, active_tables, day_of
 
-from compgen.recal import actions, logs
-from compgen.recal.drift import Drift, DriftSettings, drift_of_store
-from compgen.recal.exclude import exclude
-from compgen.recal.history_report import write_history_report
-from compgen.recal.job import Job, read_job
-from compgen.recal.overview import history
-from compgen.recal.records import TableRecord
-from compgen.recal.runner import MachineOutcome, run_jobs
-from compgen.recal.store import Store, open_store
+from compgen.fleet import actions, logs
+from compgen.fleet.decisions import exclude
+from compgen.fleet.drift import Drift, DriftSettings, drift_of_store
+from compgen.fleet.history_page import write_history_report
+from compgen.fleet.job import Job, read_job
+from compgen.fleet.records import TableRecord
+from compgen.fleet.runner import MachineOutcome, run_jobs
+from compgen.fleet.status import history
+from compgen.fleet.store import Store, open_store
 
 HOUR = timedelta(hours=1)
 #: Months (0 is January) in which something out of the ordinary arrives.

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from compgen.recal import actions, decisions
-from compgen.recal.job import Job
-from compgen.recal.records import TableRecord
-from compgen.recal.store import Clock, open_store
+from compgen.fleet import actions, decisions
+from compgen.fleet.job import Job
+from compgen.fleet.records import TableRecord
+from compgen.fleet.store import Clock, open_store
 
 
 @dataclass(frozen=True)

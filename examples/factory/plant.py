@@ -12,16 +12,15 @@ from pathlib import Path
 import numpy as np
 
 import compgen
-from compgen.core.deviations import Deviations, format_deviations
-from compgen.core.error_table import ErrorTable, format_errors
-from compgen.core.lengths import format_lengths
-from compgen.core.points import Points
-from compgen.model.exact import exact_error, tip_position
-from compgen.model.grid import volume_grid
-from compgen.recal.job import Job
-from compgen.recal.store import open_store
-from compgen.simulate import RandomErrors, TruthPlan, draw_truth
-from compgen.verify import ReadTables, read_tables
+from compgen.data.deviations import Deviations, format_deviations
+from compgen.data.error_table import ErrorTable, format_errors
+from compgen.data.lengths import Points, format_lengths
+from compgen.fleet.job import Job
+from compgen.fleet.store import open_store
+from compgen.kinematics.exact_chain import exact_error, tip_position
+from compgen.kinematics.volume_grid import volume_grid
+from compgen.simulate import RandomErrors, Scenario, TruthPlan, draw_truth
+from compgen.tables import ReadTables, read_tables
 
 MONTHS = 12
 BEGIN = datetime(2026, 1, 5, 6, 0, tzinfo=UTC)
@@ -190,7 +189,7 @@ class Factory:
             curves[f"E{axis}{axis}"] = replace(curve, value=curve.value + growth)
         return ErrorTable(curves, table.squareness)
 
-    def scenario(self, name: str, at: datetime, part: str = "") -> compgen.Scenario:
+    def scenario(self, name: str, at: datetime, part: str = "") -> Scenario:
         """Write the scenario of one measurement, which `volcomp simulate` reads as well, and return it."""
         title = f"{name}-{at:%Y-%m-%d}{part}"
         seed = [self.seed, NAMES.index(name), at.toordinal(), len(part)]

@@ -9,7 +9,7 @@ from pathlib import Path
 import checks
 from factory import Year, begin, months
 
-from compgen.recal import logs
+from compgen.fleet import logs
 
 #: Fixed tolerance of the forecasts from a part of the year, against the first calibration.
 EARLY_TOLERANCE_URAD = 15.0

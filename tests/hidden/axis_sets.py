@@ -1,7 +1,8 @@
 """Hidden sessions of ISO 230-2 on one axis: a kind and a seed give the rows of a file and the key.
 
 Five runs there and back of 5 to 11 targets. Kinds: ``null``, ``warmup``, ``backlash``, ``lost_motion``, ``step``,
-``bad_run``, ``several`` (two or three of these), ``unlisted`` (an effect that no catalogue has). Nothing here knows how
+``bad_run``, ``several`` (two or three of these), ``unlisted`` (an effect that no catalogue has), ``further`` (more of such,
+each seed the next of ``FURTHER``). Nothing here knows how
 compgen models any of them: a warm-up is a heat balance stepped from reading to reading, noise with a memory is stepped
 likewise, a reversal is what stays behind after each turn.
 """
@@ -14,7 +15,9 @@ from pathlib import Path
 import numpy as np
 
 RUNS = 5
-KINDS = ("null", "warmup", "backlash", "lost_motion", "step", "bad_run", "several", "unlisted")
+KINDS = ("null", "warmup", "backlash", "lost_motion", "step", "bad_run", "several", "unlisted", "further")
+#: Kinds whose effect has no name.
+NAMELESS = ("unlisted", "further")
 NAMES = {
     "warmup": "warmup_drift",
     "backlash": "backlash_{axis}",
@@ -22,9 +25,15 @@ NAMES = {
     "step": "step_between_runs",
     "bad_run": "bad_run",
 }
-#: Shares of the kinds in a benchmark of 300 sets.
+#: Effects of the kind ``further``.
+FURTHER = (
+    "the scatter grows", "the drift grows along the axis", "one direction drifts", "a jump that fades", "a drift that turns",
+    "the reversal changes at once", "every run has its own scale", "slipping back", "a wave that moves from run to run",
+)  # fmt: skip
+#: Shares of the kinds in a benchmark of 300 sets; ``further`` is beside these.
 SHARES = {
     "null": 60, "warmup": 50, "backlash": 35, "lost_motion": 35, "step": 30, "bad_run": 30, "several": 40, "unlisted": 20,
+    "further": 90,
 }  # fmt: skip
 
 
@@ -125,6 +134,31 @@ class _Session:
         own = self.rng.standard_normal(len(self.targets))
         return "every target creeps", 2 * size * self.share * (own - own.mean())[self.target]
 
+    def further(self, law: str, noise: np.ndarray) -> np.ndarray:
+        rng, size = self.rng, self.rng.uniform(4, 12) * self.rng.choice([-1, 1])
+        levelling = -np.expm1(-self.share / rng.uniform(0.2, 2.0))
+        if law == "the scatter grows":
+            return noise * self.share * rng.uniform(3, 6)
+        if law == "the drift grows along the axis":
+            return 3 * size * levelling * self.along ** rng.integers(1, 3)
+        if law == "one direction drifts":
+            return 3 * size * levelling * (self.sign == rng.choice([-1, 1]))
+        if law == "a jump that fades":
+            since = self.share - rng.uniform(0.1, 0.7)
+            return size * np.where(since >= 0, np.exp(-np.maximum(since, 0) / rng.uniform(0.05, 0.3)), 0.0)
+        if law == "a drift that turns":
+            turn = rng.uniform(0.3, 0.7)
+            back = 1 - (self.share - turn) / (1 - turn) * rng.uniform(0.6, 1.2)
+            return 1.7 * size * np.where(self.share < turn, self.share / turn, back)
+        if law == "the reversal changes at once":
+            return size * self.sign * (self._leg() >= rng.integers(3, 2 * RUNS - 1))
+        if law == "every run has its own scale":
+            return 2 * size * (self.along - 0.5) * rng.standard_normal(RUNS)[self.run - 1]
+        if law == "slipping back":
+            return 2 * size * ((self.share * rng.uniform(2, 5) + rng.uniform()) % 1)
+        waves, phase = rng.uniform(1, 3), rng.uniform(0.7, 2.5)
+        return size * np.sin(2 * np.pi * self.along * waves + self.run * phase)
+
     def shown(self, name: str, effect: np.ndarray) -> float:
         """RMS of what an effect does: against the mean of its target and direction, or half the reversal."""
         if name == "backlash":
@@ -146,8 +180,9 @@ def make(kind: str, seed: int) -> AxisSet:
     session = _Session(rng, targets)
     sigma = float(np.exp(rng.uniform(np.log(0.3), np.log(5.0))))
     memory = 0.0 if rng.random() < 0.5 else float(rng.uniform(0.2, 0.8))
+    noise = session.noise(sigma, memory)
     values = (
-        session.noise(sigma, memory)
+        noise
         + (8 * rng.standard_normal() * (session.along - 0.5))
         + 5 * np.sin(rng.uniform(2, 9) * session.along + rng.uniform(0, 6))
     )
@@ -168,6 +203,11 @@ def make(kind: str, seed: int) -> AxisSet:
         label, effect = session.unlisted()
         values = values + effect
         ratio.append(session.shown(label, effect) / of_mean)
+    if kind == "further":
+        label = FURTHER[seed % len(FURTHER)]
+        effect = session.further(label, noise)
+        values = values + effect
+        ratio.append(session.shown(label, effect) / of_mean)
     axis = "XYZ"[int(rng.integers(3))]
     rows = [
         (float(targets[k]), int(d), int(run), float(v)) for (k, d, run), v in zip(session.steps, values, strict=True)
@@ -185,7 +225,7 @@ def outcome(case: AxisSet, diagnosis: dict) -> str:
     if case.kind == "null":
         return "clean" if diagnosis["verdict"] == "none" and not diagnosis["effects"] else "alarm"
     truth = sorted(case.names)
-    if case.kind == "unlisted":
+    if case.kind in NAMELESS:
         return "misnamed" if names else "unknown" if diagnosis["unknown"] else "silent"
     if names == truth:
         return "exact"

@@ -1,24 +1,34 @@
-"""Elements of a certificate: names, texts that are safe in XML, and quantities as the D-SI schema has them.
-
-The tree is made with the standard library, which escapes every text; nothing is ever put together from strings.
-"""
+"""Elements of a certificate as XML, and their check against the schema on the user's disk."""
 
 from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 from xml.etree import ElementTree
 
 from compgen.errors import InputError
+
+if TYPE_CHECKING:
+    from xmlschema import XMLSchema10
+
+
+# Elements of a certificate: names, texts that are safe in XML, and quantities as the D-SI schema has them.
+#
+# The tree is made with the standard library, which escapes every text; nothing is ever put together from strings.
+
 
 Element = ElementTree.Element
 
 DCC, SI = "https://ptb.de/dcc", "https://ptb.de/si"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
-#: Releases of the DCC schema that can be written, the newest last; 3.3.0 stands on D-SI 2.2.1, 3.2.1 on D-SI 2.1.0.
+#: Releases of the DCC schema that can be written, the newest last; 3.3.0 builds on D-SI 2.2.1, 3.2.1 on D-SI 2.1.0.
 VERSIONS = ("3.2.1", "3.3.0")
 NEWEST = VERSIONS[-1]
 #: Language of the program's own texts; texts of the user carry no language.
@@ -96,7 +106,7 @@ def plain_list(values: Sequence[float | None]) -> str:
 
 def real(value: float | None, unit: str, version: str, expanded: Mapping[str, Any] | None = None) -> Element:
     """Return ``si:real``; ``expanded`` holds uncertainty, coverageFactor, coverageProbability and distribution."""
-    return si("real", si("value", plain_number(value)), si("unit", unit), _expanded(expanded, version))
+    return si("real", si("value", plain_number(value)), si("unit", unit), _uncertainty(expanded, "", version))
 
 
 def real_list(item: Mapping[str, Any], version: str) -> Element:
@@ -105,45 +115,32 @@ def real_list(item: Mapping[str, Any], version: str) -> Element:
         "realListXMLList",
         si("valueXMLList", plain_list(item["valueXMLList"])),
         si("unitXMLList", " ".join(item["unitXMLList"])),
-        _expanded_list(item.get("expandedUncXMLList"), version),
+        _uncertainty(item.get("expandedUncXMLList"), "XMLList", version),
     )
 
 
-def _expanded(expanded: Mapping[str, Any] | None, version: str) -> Element | None:
-    """Expanded uncertainty of one value: D-SI 2.2 has a new form, and calls the one before deprecated."""
+def _uncertainty(expanded: Mapping[str, Any] | None, suffix: str, version: str) -> Element | None:
+    """Expanded uncertainty of a value or (suffix XMLList) of a list: D-SI 2.2 has a new form and deprecates the former."""
     if expanded is None:
         return None
-    shared = _coverage(expanded, "")
-    uncertainty = plain_number(expanded["uncertainty"])
-    if version == "3.2.1":
-        return si("expandedUnc", si("uncertainty", uncertainty), *shared)
-    return si("measurementUncertaintyUnivariate", si("expandedMU", si("valueExpandedMU", uncertainty), *shared))
-
-
-def _expanded_list(expanded: Mapping[str, Any] | None, version: str) -> Element | None:
-    if expanded is None:
-        return None
-    shared = _coverage(expanded, "XMLList")
-    uncertainties = plain_list(expanded["uncertaintyXMLList"])
-    if version == "3.2.1":
-        return si("expandedUncXMLList", si("uncertaintyXMLList", uncertainties), *shared)
-    inner = si("expandedMUXMLList", si("valueExpandedMUXMLList", uncertainties), *shared)
-    return si("measurementUncertaintyUnivariateXMLList", inner)
-
-
-def _coverage(expanded: Mapping[str, Any], suffix: str) -> list[Element]:
-    return [
+    coverage = [
         si(f"coverageFactor{suffix}", plain_number(expanded["coverageFactor"])),
         si(f"coverageProbability{suffix}", plain_number(expanded["coverageProbability"])),
         si(f"distribution{suffix}", str(expanded["distribution"])),
     ]
+    values = expanded[f"uncertainty{suffix}"]
+    text = plain_list(values) if suffix else plain_number(values)
+    if version == "3.2.1":
+        return si(f"expandedUnc{suffix}", si(f"uncertainty{suffix}", text), *coverage)
+    inner = si(f"expandedMU{suffix}", si(f"valueExpandedMU{suffix}", text), *coverage)
+    return si(f"measurementUncertaintyUnivariate{suffix}", inner)
 
 
 def check_version(version: str) -> str:
     """Return ``version`` if certificates of that release can be written."""
     if version not in VERSIONS:
         raise InputError(
-            f"release {version or 'without a number'} of the DCC schema; {' and '.join(VERSIONS)} can be written"
+            f"release {version or 'without a number'} of the DCC schema is not supported; use {' or '.join(VERSIONS)}"
         )
     return version
 
@@ -154,3 +151,99 @@ def serialised(root: Element) -> bytes:
     ElementTree.indent(tree)
     text = ElementTree.tostring(tree, encoding="unicode")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()
+
+
+# The DCC schema on the user's disk: found with what it imports, without network, and asked whether a document is valid.
+
+
+#: Faults of a document that a message names.
+MOST_FAULTS = 5
+
+
+@dataclass(frozen=True)
+class DccSchema:
+    """A DCC schema that was read, and its release."""
+
+    path: Path
+    version: str
+    rules: XMLSchema10
+
+    def faults(self, document: bytes) -> list[str]:
+        """Return what is wrong with ``document``: one line each with its place; empty if it is valid."""
+        found = self.rules.iter_errors(document.decode("utf-8"), use_location_hints=False)
+        return [f"{error.path or '/'}: {' '.join(str(error.reason or error.message).split())[:300]}" for error in found]
+
+    def check(self, document: bytes) -> None:
+        """Raise InputError unless ``document`` is valid."""
+        faults = self.faults(document)
+        if faults:
+            more = f"; and {len(faults) - MOST_FAULTS} more" if len(faults) > MOST_FAULTS else ""
+            listed = "; ".join(faults[:MOST_FAULTS])
+            raise InputError(
+                f"the certificate is not valid by this schema and was not written: {listed}{more}", file=self.path
+            )
+
+
+def read_schema(path: str | Path) -> DccSchema:
+    """Read ``dcc.xsd`` and the schemas that it imports from the disk.
+
+    An import with a relative path is followed. One with a web address is looked for below the folder of the schema, by
+    the end of its path: for ``https://ptb.de/si/v2.2.1/SI_Format.xsd`` as ``si/v2.2.1/SI_Format.xsd``, then
+    ``v2.2.1/SI_Format.xsd``, then ``SI_Format.xsd``. The W3C's schema of XML signatures comes with the library.
+
+    Raises
+    ------
+    InputError
+        where a file is missing or is not a DCC schema of a release that can be written.
+    """
+    try:
+        import xmlschema
+        from xmlschema.exceptions import XMLSchemaException
+    except ImportError as error:
+        raise InputError("the check against a schema needs xmlschema: python -m pip install 'compgen[dcc]'") from error
+    source = Path(path)
+    if not source.is_file():
+        raise InputError("no such file; give the path of dcc.xsd", file=source)
+    folder = source.resolve().parent
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", xmlschema.XMLSchemaImportWarning)
+            warnings.simplefilter("error", xmlschema.XMLSchemaIncludeWarning)
+            rules = xmlschema.XMLSchema10(
+                str(source.resolve()),
+                allow="local",
+                uri_mapper=lambda uri: local_copy(uri, folder),
+            )
+    except (XMLSchemaException, Warning, OSError, SyntaxError) as error:
+        raise InputError(f"cannot be used as a schema: {_reason(error)}", file=source) from error
+    return DccSchema(source, _release(rules, source), rules)
+
+
+def _release(rules: XMLSchema10, source: Path) -> str:
+    if rules.target_namespace != DCC:
+        raise InputError(f"describes {rules.target_namespace or 'no namespace'}, not {DCC}; give dcc.xsd", file=source)
+    try:
+        return check_version(str(rules.root.get("version", "")))
+    except InputError as error:
+        raise InputError(error.message, file=source) from None
+
+
+def _reason(error: BaseException) -> str:
+    """The first line of the message, with what to do about an import that is not on the disk."""
+    text = str(error).strip().partition("\n")[0].rstrip(":. ")[:400]
+    if "remote" in text or isinstance(error, Warning):
+        text += "; put the schemas that it imports into its folder (compgen uses no network)"
+    return text
+
+
+def local_copy(uri: str, folder: Path) -> str:
+    """Return the address of the file below ``folder`` that a web address refers to; ``uri`` itself if there is none."""
+    address = urlsplit(uri)
+    if address.scheme not in ("http", "https"):
+        return uri
+    parts = [part for part in address.path.split("/") if part not in ("", ".", "..")]
+    for first in range(len(parts)):
+        candidate = folder.joinpath(*parts[first:])
+        if candidate.is_file():
+            return candidate.as_uri()
+    return uri

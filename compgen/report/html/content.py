@@ -1,4 +1,4 @@
-"""The report as plain data: what ``report.json`` holds, and what page, dossier and terminal say."""
+"""The report as plain data: what `report.json` holds, with the figures of ISO 230 and the limitations."""
 
 from __future__ import annotations
 
@@ -8,13 +8,171 @@ from typing import Any
 
 import numpy as np
 
-from compgen.core.error_table import ErrorTable
-from compgen.core.names import error_named
-from compgen.export import program_version
-from compgen.report.html.curves import COVERAGE, describe_error
-from compgen.report.html.folder import ControlFolder, ResultFolder
-from compgen.report.html.iso import accuracy_groups, comparison_groups
-from compgen.report.html.limitations import limitations
+from compgen.accuracy.evaluate import axis_figures, diagonal_figures, groups_of_errors, statements_of, volume_fields
+from compgen.accuracy.field import Correction, error_source, volume_figures
+from compgen.accuracy.figure import Figure
+from compgen.data.error_table import ErrorTable
+from compgen.data.machine import Machine
+from compgen.data.messages import um_text
+from compgen.data.names import COVERAGE, error_named
+from compgen.errors import CompgenError
+from compgen.report.html.folder import ControlFolder, ResultFolder, read_back
+from compgen.report.html.pictures import describe_error
+from compgen.tables import program_version
+from compgen.tables.verification import coverage_of
+
+# Figures of ISO 230 in the report: those of the folder, else those of the identified errors.
+
+
+#: Reference line of straightness and squareness.
+LINE = "ls"
+GROUPS = {
+    "volume": "Volume (ISO 230-1)",
+    "orientation": "Orientation of the tool over the volume (ISO 230-1)",
+    "axes": "Positioning on the line through the reference point (ISO 230-2)",
+    "diagonals": "Body diagonals (ISO 230-6)",
+    "errors": "Single errors",
+    "straightness": "Straightness by three reference lines",
+    "reversal": "Reversal: both directions (ISO 230-2, ISO 230-6)",
+    "squareness indication": "Squareness, an indication from the diagonals",
+}
+
+#: Groups that every error of the machine has a part in: without all of them they would claim what was not measured.
+VOLUMETRIC = ("volume", "orientation", "diagonals", "squareness indication")
+
+
+def accuracy_groups(source: ResultFolder) -> dict[str, Any]:
+    """Return the figures by group with rows ``key, value, U, unit, meaning``, and in words what they refer to.
+
+    Those of ``accuracy.json`` where it is there; else the machine as it was identified, and beside its positioning and
+    diagonals what they become with the tables of each control as they were read back.
+    """
+    if source.accuracy:
+        figures = source.accuracy.get("figures", {})
+        groups = [{"name": GROUPS.get(name, name), "rows": _rows(group)} for name, group in figures.items()]
+        return {"groups": groups, "statements": list(source.accuracy.get("statements", [])), "with_tables": []}
+    if source.machine is None or source.identified is None:
+        return {}
+    try:
+        return _of_errors(source, source.machine, source.identified)
+    except (CompgenError, ValueError, LookupError):  # errors that do not fit the machine file of the folder
+        return {}
+
+
+def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> dict[str, Any]:
+    given = error_source(machine, errors)
+    ((full, pairs),) = volume_fields(machine, (given,), "axes")
+    found: dict[str, Mapping[str, Figure]] = {"volume": volume_figures(full, pairs), **groups_of_errors(given, LINE)}
+    found.pop("errors")  # they are shown with their curves
+    coverage = coverage_of(machine, errors)
+    for name in VOLUMETRIC if coverage.missing else ():
+        found.pop(name, None)
+    partial = f"{coverage.text}: no figures of the volume and its diagonals, since the other errors are not known"
+    groups = [
+        {"name": GROUPS[name], "rows": _rows({key: item.summary() for key, item in group.items()})}
+        for name, group in found.items()
+    ]
+    independent = "uncertainties from those of the single values, taken as independent"
+    return {
+        "groups": groups,
+        "statements": [
+            *statements_of(machine, full, LINE),
+            independent,
+            "the machine as identified, without tables",
+            *([partial] if coverage.missing else []),
+        ],
+        "with_tables": _with_tables(source, machine, errors),
+    }
+
+
+def _with_tables(source: ResultFolder, machine: Machine, errors: ErrorTable) -> list[dict[str, Any]]:
+    """Positioning and diagonals of the machine with the tables of each control, um, by the name of the control."""
+    found = []
+    for control in source.controls:
+        correction: Correction | None = read_back(machine, control)
+        if correction is not None:
+            moved = error_source(machine, errors, None, correction)
+            figures = {**axis_figures(moved), **diagonal_figures(moved)}
+            found.append({"name": control.name, "figures": {key: item.value for key, item in figures.items()}})
+    return found
+
+
+def _rows(group: Mapping[str, Any]) -> list[dict[str, Any]]:
+    rows = []
+    for key, item in group.items():
+        if isinstance(item, Mapping):
+            row = {name: item.get(name) for name in ("value", "unit", "meaning")}
+            rows.append({"key": str(key), **row, "U": item.get("U_k2")})
+    return rows
+
+
+def comparison_groups(source: ResultFolder) -> dict[str, Any]:
+    """Return ``compare.json`` in the order of the page: verdict, statements, groups of figures before and after."""
+    data = source.compare
+    if not data:
+        return {}
+    return {
+        "kind": str(data.get("kind", "")),
+        "verdict": str(data.get("verdict", "")),
+        "improved": bool(data.get("improved")),
+        "decided_by": [str(item) for item in data.get("decided_by", [])],
+        "statements": [str(item) for item in data.get("statements", [])],
+        "groups": [_compared(name, group) for name, group in dict(data.get("figures", {})).items()],
+        "prediction": data.get("prediction"),
+    }
+
+
+def _compared(name: str, group: Any) -> dict[str, Any]:
+    rows = []
+    for key, item in group.items() if isinstance(group, Mapping) else ():
+        before, after = item.get("before") or {}, item.get("after") or {}
+        row = {"key": str(key), "unit": before.get("unit", ""), "meaning": before.get("meaning", "")}
+        row |= {"before": before.get("value"), "before_U": before.get("U_k2")}
+        row |= {"after": after.get("value"), "after_U": after.get("U_k2")}
+        rows.append({**row, **{name: item.get(name) for name in ("factor", "u_factor", "en", "verdict")}})
+    return {"name": GROUPS.get(name, name), "rows": rows}
+
+
+# What the figures of a report do not say, in words, as far as it follows from what was done.
+
+
+ALWAYS = (
+    "Before and after are computed: the exact model of the machine moves with the identified errors, without and with "
+    "what the files make the emulated control add. A measurement after loading is still needed.",
+    "Quasi-static geometric errors of three linear axes only: no thermal drift, load, dynamics, spindle or rotary axes.",
+    "The figures follow published formulas of ISO 230-1 and ISO 230-2; the program is not certified against the "
+    "standards.",
+    "Uncertainties are expanded with k = 2. They hold the noise of the readings, and those systematic inputs that were "
+    "stated.",
+)
+
+
+def limitations(source: ResultFolder) -> list[str]:
+    """Return what the reader should not take from this report."""
+    found = list(ALWAYS) if source.controls else list(ALWAYS[1:])
+    identify = source.identify
+    if identify.get("unobservable"):
+        found.append(f"Not observable, and left at zero: {'; '.join(map(str, identify['unobservable']))}.")
+    if identify and not identify.get("systematic"):
+        found.append(
+            "No systematic input (wavelength, temperature, target, drift) was stated; none is in the uncertainties."
+        )
+    if identify.get("u_length", identify.get("u_deviation", {})).get("source") == "assumed":
+        found.append("The uncertainty of the readings was assumed, and scaled by the residuals.")
+    for item in source.controls:
+        found += [f"{item.name}: {text}" for text in item.manifest.get("unverified", [])]
+        if not item.manifest:
+            found.append(f"{item.name}: manifest.json is not in the folder, so settings and signs are not stated here.")
+        found += [
+            f"{item.name}: {f.name} is not the file that was verified (its SHA-256 differs); its verdict does not hold for it."
+            for f in item.files
+            if f.intact is False
+        ]
+    return found
+
+
+# The report as plain data: what ``report.json`` holds, and what page, dossier and terminal say.
+
 
 #: Figures of a residual field and what they are.
 FIGURES = (
@@ -36,7 +194,7 @@ VERDICTS = {
 
 
 def content(source: ResultFolder) -> dict[str, Any]:
-    """Return the numbers of the report; only plain values, every text as it stands in the files."""
+    """Return the numbers of the report; only plain values, every text as in the files."""
     controls = [_control(item) for item in source.controls]
     return {
         "format": "compgen report 1",
@@ -144,10 +302,7 @@ def um(value: Any) -> str:
     >>> um(2964.4), um(12.34), um(0.3959), um(None)
     ('2964', '12.3', '0.40', '–')
     """
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        return "–"
-    size = abs(value)
-    return f"{value:.{0 if size >= 99.95 else 1 if size >= 9.995 else 2}f}"
+    return um_text(value, whole_from=100.0)
 
 
 def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dict[str, str]:

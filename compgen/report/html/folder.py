@@ -1,10 +1,10 @@
-"""What stands in a folder that ``run``, ``identify``, ``verify`` or ``compare`` wrote, read back for the report."""
+"""What a folder of results contains, read back for the report, and the tables of each control in its own basis."""
 
 from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -12,12 +12,21 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.core.csvio import FloatArray, read_csv
-from compgen.core.error_table import ErrorTable, read_errors
-from compgen.core.files import read_bytes, read_text, sha256_of
-from compgen.core.machine import Machine, read_machine
-from compgen.core.text import one_line
-from compgen.errors import CompgenWarning, InputError
+from compgen.controls import CONTROLLERS
+from compgen.controls.shared.base import Term
+from compgen.data.csv_files import FloatArray, read_csv
+from compgen.data.error_table import ErrorTable, read_errors
+from compgen.data.files import read_bytes, read_text, sha256_of
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine, read_machine
+from compgen.data.messages import one_line
+from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
+from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.tables import ReadTables, read_tables
+from compgen.tables.synthesis import projector
+
+# The contents of a folder that ``run``, ``identify``, ``verify`` or ``compare`` wrote, read back for the report.
+
 
 Kind = Literal["run", "identify", "verify", "compare", "accuracy"]
 
@@ -25,7 +34,7 @@ Kind = Literal["run", "identify", "verify", "compare", "accuracy"]
 MARKS = ("result.json", "identify.json", "compare.json", "accuracy.json")
 #: Lines and characters of a controller file that the report shows.
 PREVIEW_LINES, PREVIEW_CHARACTERS = 40, 4000
-#: A JSON file beyond this is no result of compgen.
+#: A larger JSON file is not a result of compgen.
 MOST_JSON = 50_000_000
 
 
@@ -39,8 +48,8 @@ class Volume:
 
 
 @dataclass(frozen=True)
-class TableFile:
-    """One file for the control as it stands in the folder.
+class ListedFile:
+    """One file for the control as it is in the folder.
 
     ``preview`` is its beginning; ``intact`` is None where no hash of it is known.
     """
@@ -57,14 +66,14 @@ class TableFile:
 
 @dataclass(frozen=True)
 class ControlFolder:
-    """What stands there for one control: ``result.json``, ``manifest.json``, ``preflight.md``, files and the volume."""
+    """What the folder contains for one control: ``result.json``, ``manifest.json``, ``preflight.md``, files and the volume."""
 
     name: str
     folder: Path
     result: Mapping[str, Any]
     manifest: Mapping[str, Any]
     preflight: str
-    files: tuple[TableFile, ...]
+    files: tuple[ListedFile, ...]
     volume: Volume | None
 
 
@@ -107,10 +116,16 @@ def read_folder(folder: str | Path) -> ResultFolder:
     base = Path(folder)
     if not base.is_dir():
         raise InputError("no such folder; the report needs one that run, identify, verify or compare wrote", file=base)
-    control_folders = [base] if (base / "result.json").is_file() else _below(base)
+    # Folders of single controls that a run for several of them made.
+    control_folders = (
+        [base]
+        if (base / "result.json").is_file()
+        else sorted(path.parent for path in base.glob("*/result.json") if (path.parent / "manifest.json").is_file())
+    )
     kind = _kind(base, control_folders)
     notes: list[str] = []
     machine = _machine(base, notes)
+    # Accepted tables first, partial ones after those, rejected ones last.
     return ResultFolder(
         base,
         kind,
@@ -120,21 +135,16 @@ def read_folder(folder: str | Path) -> ResultFolder:
         fit=_json(base / "fit.json"),
         machine=machine,
         residuals=_residuals(base / "residuals.csv"),
-        controls=_in_order(_control(path) for path in control_folders),
+        controls=tuple(
+            sorted(
+                (_control(path) for path in control_folders),
+                key=lambda c: (not c.result.get("accepted"), bool(c.result.get("partial")), c.name),
+            )
+        ),
         accuracy=_json(base / "accuracy.json"),
         compare=_json(base / "compare.json"),
         notes=tuple(notes),
     )
-
-
-def _in_order(controls: Iterable[ControlFolder]) -> tuple[ControlFolder, ...]:
-    """Accepted tables first, partial ones after those, rejected ones last."""
-    return tuple(sorted(controls, key=lambda c: (not c.result.get("accepted"), bool(c.result.get("partial")), c.name)))
-
-
-def _below(base: Path) -> list[Path]:
-    """Folders of single controls that a run for several of them made."""
-    return sorted(path.parent for path in base.glob("*/result.json") if (path.parent / "manifest.json").is_file())
 
 
 def _kind(base: Path, controls: list[Path]) -> Kind:
@@ -150,7 +160,7 @@ def _kind(base: Path, controls: list[Path]) -> Kind:
     if (base / "accuracy.json").is_file():
         return "accuracy"
     raise InputError(
-        f"holds none of {', '.join(MARKS)}; give a folder that run, identify, verify or compare wrote", file=base
+        f"contains none of {', '.join(MARKS)}; give a folder that run, identify, verify or compare wrote", file=base
     )
 
 
@@ -160,13 +170,15 @@ def _json(path: Path) -> dict[str, Any]:
         return {}
     content = read_bytes(path, MOST_JSON + 1)
     if len(content) > MOST_JSON:
-        raise InputError(f"is larger than {MOST_JSON // 1_000_000} MB; compgen writes no such file", file=path)
+        raise InputError(
+            f"is larger than {MOST_JSON // 1_000_000} MB; compgen does not write files of that size", file=path
+        )
     try:
         data = json.loads(content.decode("utf-8-sig"))
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise InputError(f"is no JSON: {one_line(error)}", file=path) from error
+        raise InputError(f"is not JSON: {one_line(error)}", file=path) from error
     if not isinstance(data, dict):
-        raise InputError("holds no JSON object", file=path)
+        raise InputError("does not contain a JSON object", file=path)
     return data
 
 
@@ -216,8 +228,8 @@ def _control(folder: Path) -> ControlFolder:
     return ControlFolder(name, folder, result, manifest, text, files, _volume(folder / "volume.csv"))
 
 
-def _files(folder: Path, result: Mapping[str, Any]) -> list[TableFile]:
-    """The control's files that ``result.json`` names and that stand beside it; never a path out of the folder."""
+def _files(folder: Path, result: Mapping[str, Any]) -> list[ListedFile]:
+    """The control's files that ``result.json`` names and that are in its folder; never a path out of the folder."""
     found = []
     for item in result.get("files", []):
         name = str(item.get("name", "")) if isinstance(item, dict) else ""
@@ -234,5 +246,89 @@ def _files(folder: Path, result: Mapping[str, Any]) -> list[TableFile]:
         if intact is False:
             message = f"{path} is not the file that was verified: its SHA-256 differs from the one in result.json"
             warnings.warn(message, CompgenWarning, stacklevel=2)
-        found.append(TableFile(name, path, len(content), digest, len(lines), preview, cut, intact))
+        found.append(ListedFile(name, path, len(content), digest, len(lines), preview, cut, intact))
     return found
+
+
+# What the tables of a control hold, in its own basis, from the files of the folder.
+
+
+#: What is raised where machine file, errors and tables of a folder do not fit each other any more. The figures are in
+#: result.json; only what needs the tables themselves is left out then.
+UNFIT = (CompgenError, ValueError, ArithmeticError, LookupError, OSError)
+
+
+@dataclass(frozen=True)
+class TableCurve:
+    """Values of one table of a control over its axis, ``unit`` um or urad.
+
+    ``error`` is True where the table holds one of the 21 errors by its name, else it holds a correction. A constant has
+    no axis and one value.
+    """
+
+    name: str
+    axis: str | None
+    position_mm: FloatArray
+    value: FloatArray
+    unit: str
+    error: bool
+
+
+def table_curves(machine: Machine | None, errors: ErrorTable | None, control: ControlFolder) -> tuple[TableCurve, ...]:
+    """Return the tables of a control as they act: its emulation, written in the basis of its tables.
+
+    The values are those that reproduce the emulated correction over the volume best, which is all there is to tell
+    where a control lets one table stand for another. Empty where machine, errors or files are missing, or where the
+    control cannot read them.
+    """
+    if machine is None or errors is None or not control.files or control.name not in CONTROLLERS:
+        return ()
+    try:
+        parsed = _parsed(machine, control)
+        return _curves(_as_exported(machine, control), errors, parsed)
+    except UNFIT:
+        return ()
+
+
+def read_back(machine: Machine, control: ControlFolder) -> Callable[[Points], FloatArray] | None:
+    """Return what the files of a control add at points, (n, 3), mm; None where they cannot be read with this machine."""
+    try:
+        parsed = _parsed(machine, control)
+    except UNFIT:
+        return None
+    if control.name not in CONTROLLERS or not control.files:
+        return None
+    moved = _as_exported(machine, control)
+    return lambda points: parsed.mean_correction(moved, points.position_mm)
+
+
+def _as_exported(machine: Machine, control: ControlFolder) -> Machine:
+    """The machine with the settings that the manifest states; options of the run may differ from the machine file."""
+    settings = control.manifest.get("settings")
+    for key, value in (settings if isinstance(settings, dict) else {}).items():
+        machine = machine.with_setting(control.name, key, value)
+    return machine
+
+
+def _parsed(machine: Machine, control: ControlFolder) -> ReadTables:
+    return read_tables(_as_exported(machine, control), [item.path for item in control.files], control.name)
+
+
+def _curves(machine: Machine, errors: ErrorTable, parsed: ReadTables) -> tuple[TableCurve, ...]:
+    basis = parsed.controller.basis_of(errors, parsed.tables)
+    solver = projector(machine, basis, anchored=parsed.controller.anchored)
+    start = np.concatenate([term.start for term in basis])
+    held = parsed.mean_correction(machine, solver.position_mm)
+    values = solver.by_name(solver.project(held, start))
+    return tuple(_curve(term, values[term.name]) for term in basis)
+
+
+def _curve(term: Term, values: FloatArray) -> TableCurve:
+    axis = None if term.axis is None else AXES[term.axis]
+    named = term.name in CURVE_NAMES or term.name in SQUARENESS_NAMES
+    if named:
+        unit, scale = error_named(term.name).unit, 1.0 / error_named(term.name).si_per_unit
+    else:
+        angular = any(part.lever is not None for part in term.carrier)
+        unit, scale = ("urad", 1e6) if angular else ("um", 1e3)
+    return TableCurve(term.name, axis, np.asarray(term.nodes_mm), np.asarray(values) * scale, unit, named)

@@ -1,26 +1,396 @@
-"""The report of a folder, from its files alone."""
+"""The report of a folder as files: HTML page, dossier, calibration record, and the lines for the terminal."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import json
-import math
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from compgen.core.files import OutputFolder
-from compgen.export import REPORT_FILES
-from compgen.report.html.certificate import calibration_record
-from compgen.report.html.content import content
-from compgen.report.html.curves import Picture, draw_curves, draw_squareness, draw_tables
-from compgen.report.html.dossier import dossier_data, dossier_text
-from compgen.report.html.folder import ResultFolder, read_folder
-from compgen.report.html.measurement import draw_residuals, draw_stations
-from compgen.report.html.page import render_page
-from compgen.report.html.svg import drawing
-from compgen.report.html.tables import TableCurve, table_curves
-from compgen.report.html.volume import draw_slices, draw_space, grid_of
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from rich.console import Group
+from rich.text import Text
+
+from compgen.data.files import OutputFolder, json_text, json_values
+from compgen.data.messages import number_text, one_line
+from compgen.data.names import COVERAGE
+from compgen.report.html.content import FIGURES, content, um
+from compgen.report.html.folder import ResultFolder, TableCurve, read_folder, table_curves
+from compgen.report.html.pictures import (
+    LABEL,
+    Picture,
+    draw_curves,
+    draw_residuals,
+    draw_slices,
+    draw_space,
+    draw_squareness,
+    draw_stations,
+    draw_tables,
+    drawing,
+    grid_of,
+)
+from compgen.resources import data_folder
+from compgen.tables import REPORT_FILES
+
+# The HTML page: Jinja2 with every text escaped, one style sheet, one script, and a policy that forbids the network.
+
+
+#: Markdown that the preflight lists are made of; no raw HTML, links or pictures.
+_OFF = ("html_block", "html_inline", "link", "image", "autolink", "reference")
+
+
+def render_page(
+    source: ResultFolder,
+    data: Mapping[str, Any],
+    pictures: Mapping[str, Sequence[Picture]],
+    seconds: float | None = None,
+) -> str:
+    """Return the text of ``report.html``.
+
+    Parameters
+    ----------
+    source : the folder, for the beginnings of the files and the preflight lists.
+    data : from :func:`compgen.report.html.content.content`.
+    pictures : by group: ``curves``, ``squareness``, ``measurement``, and ``space-K``, ``slices-K``, ``tables-K`` for
+        control K.
+    seconds : how long the drawing took; None leaves it out.
+    """
+    environment = _environment()
+    script = _file(environment, "script.js")
+    drawn = [picture for group in pictures.values() for picture in group]
+    policy = f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{_hash(script)}'"
+    policy += "; base-uri 'none'; form-action 'none'"
+    return environment.get_template("page.html.j2").render(
+        data=data,
+        controls=list(zip(data["controls"], source.controls, strict=True)),
+        pictures=pictures,
+        figures=FIGURES,
+        policy=policy,
+        style=Markup(_file(environment, "style.css")),
+        script=Markup(script),
+        payload=script_data({picture.key: dict(picture.data) for picture in drawn if picture.data}),
+        seconds=seconds,
+    )
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(data_folder("templates") / "_report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "um": um,
+        "number": number_text,
+        "known": lambda value: number_text(value, missing="not known"),
+        "markdown": markdown,
+        "unit": lambda name: LABEL.get(name, name),
+    }
+    return environment
+
+
+def _file(environment: Environment, name: str) -> str:
+    assert environment.loader is not None
+    return environment.loader.get_source(environment, name)[0]
+
+
+def _hash(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def script_data(value: Any) -> Markup:
+    r"""Return data as JSON that stays data inside a script element, whatever texts it holds.
+
+    >>> print(script_data({"a": "</script><!--"}))
+    {"a":"\u003c/script\u003e\u003c!--"}
+    """
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)  # ASCII, so U+2028 and U+2029 are escaped
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
+
+
+def markdown(text: str) -> Markup:
+    """Return the HTML of Markdown without raw HTML, links and pictures; the check boxes of lists become marks."""
+    from markdown_it import MarkdownIt
+
+    html = MarkdownIt("commonmark", {"html": False}).enable("table").disable(list(_OFF)).render(text)
+    html = re.sub(r"<(/?)h([1-3])>", lambda found: f"<{found.group(1)}h{int(found.group(2)) + 3}>", html)
+    return Markup(html.replace("<li>[ ] ", "<li class='check'>"))
+
+
+# The documentation of a compensation in the spirit of ISO/TR 16907, clause 12: what was done, with what, and its limits.
+#
+# The clauses of the report were not at hand; the sections follow its published contents (kinematic representation,
+# geometric errors, determination, compensation, validation, documentation).
+
+
+#: Characters that mean something in Markdown or HTML.
+_SPECIAL = "\\`*_{}[]<>()#+!|&~"
+
+
+def dossier_data(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the sections of the dossier from the numbers of the report (:func:`compgen.report.html.content.content`)."""
+    return {
+        "format": "compgen dossier 1",
+        "machine": data["machine"] or {"name": data["title"]},
+        "measured": {"inputs": data["provenance"]["inputs"], "date": data["provenance"]["date"]},
+        "model": {
+            "kinematic_chain": data["machine"].get("chain"),
+            "errors": [item["error"] for item in data["errors"]],
+            "convention": "names and signs of ISO 230-1: actual minus commanded, tool relative to workpiece",
+        },
+        "identification": data["measurement"],
+        "identified_errors": data["errors"],
+        "tables": [
+            {
+                key: item[key]
+                for key in ("name", "format", "evidence", "settings", "sign_statement", "parameters", "files")
+            }
+            for item in data["controls"]
+        ],
+        "verification": [
+            {
+                key: item[key]
+                for key in (
+                    "name",
+                    "state",
+                    "headline",
+                    "measured",
+                    "objections",
+                    "points",
+                    "before",
+                    "after",
+                    "before_rigid",
+                    "after_rigid",
+                    "unrepresentable_um",
+                    "uncorrected",
+                    "reasons",
+                    "notes",
+                )
+            }
+            for item in data["controls"]
+        ],
+        "accuracy": data["accuracy"],
+        "comparison": data["compare"],
+        "limits": data["limitations"],
+        "provenance": data["provenance"],
+    }
+
+
+def plain_markdown(value: Any) -> str:
+    r"""Return a value as one line of Markdown that says just that, whatever it contains.
+
+    >>> plain_markdown("a|b <img>")
+    'a\\|b \\<img\\>'
+    """
+    text = " ".join(str(value).split())
+    return "".join(f"\\{char}" if char in _SPECIAL else char for char in text)
+
+
+def dossier_text(dossier: Mapping[str, Any]) -> str:
+    """Return ``dossier.md`` from :func:`dossier_data`."""
+    machine = dossier["machine"]
+    lines = [f"# Documentation of the compensation of {plain_markdown(machine.get('name', ''))}", ""]
+    lines += ["Lengths in mm, errors in um and urad. Expanded uncertainties with k = 2.", ""]
+    lines += _section("1. Machine and model", [*_pairs(machine), *_pairs(dossier["model"])])
+    inputs = [[item["name"], f"`{one_line(item['sha256'])}`"] for item in dossier["measured"]["inputs"]]
+    lines += _section("2. What was measured", _table(["file", "SHA-256"], inputs, raw=1))
+    lines += _section("3. Identification", [*_pairs(dossier["identification"]), "", *_errors_section(dossier)])
+    lines += _section("4. Tables", [line for item in dossier["tables"] for line in _control_tables(item)])
+    lines += _section("5. Verification", [line for item in dossier["verification"] for line in _verified(item)])
+    lines += _section(
+        "6. Accuracy figures and comparison", [*_accuracy(dossier["accuracy"]), *_compared(dossier["comparison"])]
+    )
+    lines += _section("7. Limits", [f"- {plain_markdown(text)}" for text in dossier["limits"]])
+    lines += _section("8. Provenance", _pairs(dossier["provenance"]))
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _section(title: str, lines: list[str]) -> list[str]:
+    return [f"## {title}", "", *(lines if any(lines) else ["The folder contains nothing about this."]), ""]
+
+
+def _pairs(data: Mapping[str, Any]) -> list[str]:
+    """Values as a list; longer parts (stations, rejected readings) are counted, their numbers are in the JSON files."""
+    lines = []
+    for key, value in data.items():
+        if value in (None, "", [], {}):
+            continue
+        many = isinstance(value, list) and value and isinstance(value[0], dict)
+        text = f"{len(value)}, see dossier.json" if many else _value(value)
+        lines.append(f"- {plain_markdown(str(key).replace('_', ' '))}: {plain_markdown(text)}")
+    return lines
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_value(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_value(item) for item in value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _table(head: list[str], rows: list[list[Any]], raw: int | None = None) -> list[str]:
+    """A Markdown table; column ``raw`` is Markdown already."""
+    if not rows:
+        return []
+    lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+    for row in rows:
+        cells = [str(value) if k == raw else plain_markdown(_value(value)) for k, value in enumerate(row)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def _errors_section(dossier: Mapping[str, Any]) -> list[str]:
+    rows = []
+    for item in dossier["identified_errors"]:
+        at = "" if item["at_mm"] is None else f"{item['at_mm']:g}"
+        rows.append(
+            [item["error"], item["meaning"], f"{item['largest']:+.3f}", at, number_text(item["U"]), item["unit"]]
+        )
+    return _table(["error", "meaning", "largest", "at (mm)", "U (k = 2)", "unit"], rows)
+
+
+def _figure(value: Any, u: Any) -> str:
+    return number_text(value, 2) + ("" if value is None or u is None else f" ± {u:.2f}")
+
+
+def _accuracy(accuracy: Mapping[str, Any]) -> list[str]:
+    rows = [
+        [row["key"], _figure(row["value"], row["U"]), row["unit"], row["meaning"]]
+        for group in accuracy.get("groups", [])
+        for row in group["rows"]
+    ]
+    return [*_table(["figure", "value", "unit", "meaning"], rows), *_statements(accuracy)]
+
+
+def _compared(compare: Mapping[str, Any]) -> list[str]:
+    rows = [
+        [
+            row["key"],
+            _figure(row["before"], row["before_U"]),
+            _figure(row["after"], row["after_U"]),
+            row["unit"],
+            row["verdict"] or "",
+        ]
+        for group in compare.get("groups", [])
+        for row in group["rows"]
+    ]
+    return [*_table(["figure", "before", "after", "unit", "verdict"], rows), *_statements(compare)]
+
+
+def _statements(data: Mapping[str, Any]) -> list[str]:
+    return [*(f"- {plain_markdown(text)}" for text in data.get("statements", [])), ""]
+
+
+def _control_tables(item: Mapping[str, Any]) -> list[str]:
+    lines = [f"### {plain_markdown(item['name'])}", ""]
+    lines += _pairs({key: item[key] for key in ("format", "evidence", "settings", "sign_statement")})
+    rows = [[f["name"], f"`{one_line(f['sha256'])}`", f["bytes"], f["lines"]] for f in item["files"]]
+    return [*lines, "", *_table(["file", "SHA-256", "bytes", "lines"], rows, raw=1)]
+
+
+def _verified(item: Mapping[str, Any]) -> list[str]:
+    lines = [f"### {plain_markdown(item['name'])}: {item['state']}, {item['points']} points", ""]
+    parts = ("before", "after", "before_rigid", "after_rigid")
+    rows = [[text, *(um(item[part].get(key)) for part in parts)] for key, text in FIGURES]
+    lines += _table(["um", "before", "after", "before, rigid motion removed", "after, rigid motion removed"], rows)
+    lines += [f"- {plain_markdown(text)}" for text in (item["headline"], *item["objections"]) if text]
+    lines += [f"- Cannot be expressed by this control: {um(item['unrepresentable_um'])} um"]
+    lines += [f"- Stays: {item['error']} {um(item['um'])} um; {item['why']}" for item in item["uncorrected"]]
+    return [*lines, *(f"- {plain_markdown(text)}" for text in (*item["reasons"], *item["notes"])), ""]
+
+
+# ``calibration.json``: the results in the order of a Digital Calibration Certificate, as documented JSON.
+#
+# It is not a DCC: that is an XML document of PTB's schema (namespace ``https://ptb.de/dcc``), issued and signed by a
+# laboratory. Its parts and units are named alike, so that a laboratory can take the numbers over.
+
+
+#: Share of values within the expanded uncertainty, for k = 2 and a normal distribution.
+PROBABILITY = 0.9545
+#: Units in the notation of the D-SI metadata model.
+UNITS = {"um": "\\micro\\metre", "urad": "\\micro\\radian", "mm": "\\milli\\metre"}
+
+STATEMENT = (
+    "Documented JSON in the order of a Digital Calibration Certificate; not a DCC and not signed. Fields that only a "
+    "laboratory can fill are null."
+)
+
+
+def calibration_record(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the contents of ``calibration.json`` from the numbers of the report."""
+    return {
+        "format": "compgen calibration record 1",
+        "statement": STATEMENT,
+        "administrativeData": {
+            "software": [{"name": "compgen", "release": data["provenance"]["report_made_by"].removeprefix("compgen ")}],
+            "coreData": {
+                "uniqueIdentifier": None,
+                "beginPerformanceDate": data["provenance"]["date"] or None,
+                "endPerformanceDate": data["provenance"]["date"] or None,
+                "performanceLocation": None,
+            },
+            "items": [{"name": data["title"], "manufacturer": None, "serialNumber": None, "machine": data["machine"]}],
+            "calibrationLaboratory": None,
+            "respPersons": None,
+            "customer": None,
+        },
+        "measurementResults": [_record_of_errors(data), *(_verification(item) for item in data["controls"])],
+        "comment": data["limitations"],
+        "documents": data["provenance"]["inputs"],
+    }
+
+
+def _list(values: Sequence[Any], unit: str, standard: Sequence[Any] = ()) -> dict[str, Any]:
+    """A list of real quantities as D-SI has it: values, one unit, expanded uncertainties where all are known."""
+    found: dict[str, Any] = {"valueXMLList": list(values), "unitXMLList": [UNITS[unit]]}
+    if standard and None not in standard:
+        found["expandedUncXMLList"] = {
+            "uncertaintyXMLList": [COVERAGE * u for u in standard],
+            "coverageFactor": COVERAGE,
+            "coverageProbability": PROBABILITY,
+            "distribution": "normal",
+        }
+    return found
+
+
+def _record_of_errors(data: Mapping[str, Any]) -> dict[str, Any]:
+    results = []
+    for item in data["errors"]:
+        values = _list(item["value"], item["unit"], item["u"])
+        positions = _list(item["position_mm"], "mm")
+        results.append({"name": item["error"], "meaning": item["meaning"], "positions": positions, "values": values})
+    method = data["measurement"].get("method")
+    return {"name": "geometric errors (ISO 230-1)", "usedMethod": method, "results": results}
+
+
+def _verification(item: Mapping[str, Any]) -> dict[str, Any]:
+    results = [
+        {"name": text, "when": when, "value": item[when].get(key), "unit": UNITS["um"]}
+        for when in ("before", "after")
+        for key, text in FIGURES
+    ]
+    what = "error of the tool tip over the volume"
+    if not item["volumetric"]:
+        what = "effect of the measured errors alone on the tool tip"
+    return {
+        "name": f"{what}, tables of {item['name']}",
+        "usedMethod": "emulation of the files that were read back; computed, not measured",
+        "conformity": {"accepted": item["state"] != "rejected", "reasons": [*item["reasons"], *item["objections"]]},
+        "results": results,
+        "files": item["files"],
+    }
+
+
+# The report of a folder, from its files alone.
+
 
 #: The files of a report.
 FILES = REPORT_FILES
@@ -36,7 +406,7 @@ class Report:
 
 
 def build_report(folder: str | Path) -> Report:
-    """Read what stands in ``folder`` and make its report; nothing is written.
+    """Read the results in ``folder`` and make their report; nothing is written.
 
     Raises
     ------
@@ -44,17 +414,17 @@ def build_report(folder: str | Path) -> Report:
         where the folder holds no results, or one of its files cannot be read.
     """
     source = read_folder(folder)
-    data = plain(content(source))
+    data = json_values(content(source))
     page = render_page(source, data, draw(source, data))
     record = calibration_record(data)
     dossier = dossier_data(data)
     return Report(
         {
             "report.html": page,
-            "report.json": _json(data),
+            "report.json": json_text(data),
             "dossier.md": dossier_text(dossier),
-            "dossier.json": _json(dossier),
-            "calibration.json": _json(record),
+            "dossier.json": json_text(dossier),
+            "calibration.json": json_text(record),
         },
         data,
     )
@@ -78,7 +448,7 @@ def write_report(
 
 
 def draw(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, list[Picture]]:
-    """Return the pictures of a report by group, see :func:`compgen.report.html.page.render_page`."""
+    """Return the pictures of a report by group, see :func:`compgen.report.html.write.render_page`."""
     errors = source.fitted or source.identified
     tables: dict[str, tuple[TableCurve, ...]] = {
         item.name: table_curves(source.machine, errors, item) for item in source.controls
@@ -103,16 +473,27 @@ def _some(picture: Picture | None) -> list[Picture]:
     return [] if picture is None else [picture]
 
 
-def plain(value: Any) -> Any:
-    """Return data with None for every number that is not finite."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return value
+# The report in a few lines for the terminal.
 
 
-def _json(data: Any) -> str:
-    return json.dumps(data, indent=2, allow_nan=False) + "\n"
+STYLES = {"accepted": "bold green", "rejected": "bold red", "neutral": "bold"}
+
+
+def short_text(data: Mapping[str, Any]) -> Group:
+    """Return verdict, one line per control, the largest error that stays, and where to read on."""
+    verdict = data["verdict"]
+    lines = [Text(f"{data['title']}: {verdict['headline']}", STYLES.get(verdict["state"], "bold yellow"))]
+    if verdict["text"]:
+        lines.append(Text(verdict["text"]))
+    for item in data["controls"]:
+        before, after = item["before"], item["after"]
+        what = "" if item["volumetric"] else "measured errors alone "
+        figures = f"{what}{um(before.get('max_um'))} -> {um(after.get('max_um'))} um max, "
+        figures += f"{um(before.get('rms_um'))} -> {um(after.get('rms_um'))} um rms"
+        lines.append(Text(f"  {item['name']}: {item['verdict'].lower()}; {figures}"))
+        lines += [Text(f"    {text}", "yellow") for text in item["objections"] if text not in item["reasons"]]
+        if item["uncorrected"]:
+            largest = item["uncorrected"][0]
+            lines.append(Text(f"    stays: {largest['error']} {um(largest['um'])} um; {largest['why']}"))
+        lines += [Text(f"    {reason}", "red") for reason in item["reasons"][:3]]
+    return Group(*lines)

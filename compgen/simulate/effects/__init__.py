@@ -1,7 +1,14 @@
 """Effects: what acts on a simulated machine and its tracers besides the geometric errors, as forward formulas."""
 
-from compgen.simulate.effects.read import EFFECTS, SimulatedEffect, read_effects
-from compgen.simulate.effects.scene import Displacement, LengthEffect, RunEffect, Sights
+from compgen.simulate.effects.forward import (
+    EFFECTS,
+    Displacement,
+    LengthEffect,
+    RunEffect,
+    Sights,
+    SimulatedEffect,
+    read_effects,
+)
 
 #: An effect that moves the tip; plug-ins return one.
 Effect = Displacement

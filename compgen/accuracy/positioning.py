@@ -1,0 +1,439 @@
+"""Positioning tests of one axis: set-up budget (ISO/TR 230-9), statistics of runs, ISO 230-2 and VDI/DGQ 3441."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaln
+
+from compgen.accuracy.figure import Figure
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.csv_files import FloatArray
+from compgen.data.declared import option
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import InputError
+
+# What a positioning test's set-up adds to the uncertainty of its figures, in the manner of ISO/TR 230-9.
+#
+# The sources are those that ISO 230-2 (Annex A) and ISO/TR 230-9 name: device, misalignment, temperature, expansion
+# coefficient, drift of the environment (EVE). How they act on a figure follows from the figure itself (its derivative by
+# every mean); the printed shortcut formulas of these documents are not used.
+
+
+@dataclass(frozen=True)
+class SetupBudget:
+    """Standard uncertainties (k = 1) of what all readings of one axis share, and of single means.
+
+    Parameters
+    ----------
+    device_um : of the device for each mean of a target and direction by itself (resolution, stability), um.
+    device_ppm : of its length scale (wavelength, air), 1e-6.
+    misalignment_mrad : of the angle between beam and axis, in each of two directions, mrad; a cosine error.
+    temperature_k : of the axis' temperature, K; acts with ``expansion_um_per_m_k``.
+    expansion_um_per_m_k : coefficient of expansion of the axis.
+    u_expansion_um_per_m_k : its standard uncertainty; acts with ``from_20_k``.
+    from_20_k : how far the axis was from 20 degC, K.
+    drift_um : of each mean by the drift of the environment (EVE) during the test, um.
+    """
+
+    device_um: float = option(
+        0.0, "Axis runs: standard uncertainty of the device for each mean, um.", name="--u-device-um"
+    )
+    device_ppm: float = option(
+        0.0, "Axis runs: standard uncertainty of the device's length scale, 1e-6.", name="--u-device-ppm"
+    )
+    misalignment_mrad: float = option(
+        0.0,
+        "Axis runs: standard uncertainty of the angle between beam and axis, mrad.",
+        name="--u-misalignment-mrad",
+    )
+    temperature_k: float = option(
+        0.0,
+        "Axis runs: standard uncertainty of the axis' temperature, K (acts with expansion_um_per_m_k of the machine file, "
+        "else 11.5).",
+        name="--u-temperature-k",
+    )
+    expansion_um_per_m_k: float = 11.5
+    u_expansion_um_per_m_k: float = option(
+        0.0,
+        "Axis runs: standard uncertainty of the coefficient of expansion, um/(m K) (acts with --from-20-k).",
+        name="--u-expansion-um-per-m-k",
+    )
+    from_20_k: float = option(0.0, "How far the axis was from 20 degC, K.", name="--from-20-k")
+    drift_um: float = option(
+        0.0,
+        "Axis runs: standard uncertainty of each mean by drift of the environment (EVE), um.",
+        name="--u-drift-um",
+    )
+
+    def contributions(self, position_mm: FloatArray, weight: FloatArray) -> Iterator[tuple[str, float]]:
+        """Yield source and standard uncertainty (mm) of sum(weight * mean), which is how a figure follows the means.
+
+        Parameters
+        ----------
+        position_mm : targets, (m,).
+        weight : derivative of the figure by each mean, (directions, m).
+        """
+        length = abs(float(np.sum(weight * position_mm)))
+        single = math.sqrt(float(np.sum(weight**2)))
+        expansion = length * self.expansion_um_per_m_k * 1e-6 * self.temperature_k
+        coefficient = length * self.u_expansion_um_per_m_k * 1e-6 * abs(self.from_20_k)
+        found = {
+            "device": math.hypot(single * self.device_um * MM_PER_UM, length * self.device_ppm * 1e-6),
+            "misalignment": length * math.sqrt(2.0) * (self.misalignment_mrad * 1e-3) ** 2,  # rms of (a^2 + b^2) / 2
+            "temperature": expansion,
+            "expansion coefficient": coefficient,
+            "drift": single * self.drift_um * MM_PER_UM,
+        }
+        yield from ((name, value) for name, value in found.items() if value > 0.0)
+
+
+NO_BUDGET = SetupBudget()
+
+
+# Statistics of positioning runs at each target, and figures as combinations of them.
+
+
+#: Targets closer than this are the same one, mm.
+SAME_TARGET_MM = 1e-4
+#: Rows of the statistics: means of positive and negative approach, then the estimators of both.
+MEAN_UP, MEAN_DOWN, S_UP, S_DOWN = range(4)
+
+
+@dataclass(frozen=True)
+class RunStatistics:
+    """Means and standard deviations (n - 1) of the deviations at m targets, mm.
+
+    Parameters
+    ----------
+    position_mm : targets, ascending, (m,).
+    values : shape (4, m): mean of positive, of negative approach, estimator s of positive, of negative approach; nan for
+        a direction without readings, and for s of a single reading.
+    count : readings of positive and negative approach, (2, m).
+    """
+
+    position_mm: FloatArray
+    values: FloatArray
+    count: FloatArray
+
+    @property
+    def directions(self) -> tuple[int, ...]:
+        """Directions that were measured: rows 0 (positive), 1 (negative) of the means."""
+        return tuple(row for row in (MEAN_UP, MEAN_DOWN) if not np.isnan(self.values[row]).any())
+
+    @property
+    def bidirectional(self) -> bool:
+        """Whether both directions were measured."""
+        return len(self.directions) == 2
+
+    @property
+    def repeated(self) -> bool:
+        """Whether every target has at least two readings in each measured direction, so that s is known."""
+        return all(bool(np.all(self.count[row] > 1)) for row in self.directions)
+
+
+def run_statistics(position_mm: FloatArray, direction: FloatArray, deviation_mm: FloatArray) -> RunStatistics:
+    """Return the statistics of readings (n,) at targets (n,) that were reached in directions (n,), +1 or -1.
+
+    Raises
+    ------
+    InputError
+        if a direction was measured at some of the targets only, or there are fewer than two targets.
+    """
+    position, target = _numbered_targets(np.asarray(position_mm, dtype=np.float64))
+    values, count = np.full((4, len(position)), np.nan), np.zeros((2, len(position)))
+    for row, sign in enumerate((1, -1)):
+        for k in range(len(position)):
+            here = deviation_mm[(target == k) & (np.sign(direction) == sign)]
+            count[row, k] = len(here)
+            if len(here):
+                values[row, k] = here.mean()
+            if len(here) > 1:
+                values[2 + row, k] = here.std(ddof=1)
+        if 0 < np.count_nonzero(count[row]) < len(position):
+            missing = position[np.flatnonzero(count[row] == 0)[0]]
+            raise InputError(f"no reading at {missing:g} mm in direction {sign:+d}; every target needs both directions")
+    if len(position) < 2:
+        raise InputError("a positioning test needs at least two targets")
+    return RunStatistics(position, values, count)
+
+
+def _numbered_targets(position_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Targets (m,), and the number of the target of each reading (n,)."""
+    order = np.argsort(position_mm, kind="stable")
+    new = np.concatenate([[False], np.diff(position_mm[order]) > SAME_TARGET_MM])
+    number = np.empty(len(order))
+    number[order] = np.cumsum(new)
+    first = order[np.concatenate([[0], np.flatnonzero(new)])]
+    return position_mm[first], number
+
+
+def axis_statistics(runs: AxisRuns) -> dict[str, RunStatistics]:
+    """Return the statistics of every measured axis by its letter; InputError names the axis."""
+    found = {}
+    for axis in runs.axes:
+        own = runs.axis == axis
+        try:
+            found[AXES[axis]] = run_statistics(runs.position_mm[own], runs.direction[own], runs.deviation_mm[own])
+        except InputError as error:
+            file = runs.origin[int(np.flatnonzero(own)[0])][0] if runs.origin else None
+            raise InputError(f"{AXES[axis]}: {error.message}", file=file) from None
+    return found
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A figure as sum(weight * statistics.values): its value, and its derivative by every mean and s, shape (4, m)."""
+
+    value: float
+    weight: FloatArray
+
+
+def combine(statistics: RunStatistics, parts: Sequence[tuple[float, int, int]]) -> Combination:
+    """Return sum of factor * values[row, target] over ``parts`` of (factor, row, target)."""
+    weight = np.zeros(statistics.values.shape)
+    value = 0.0
+    for factor, row, target in parts:
+        if factor:
+            weight[row, target] += factor
+            value += factor * float(statistics.values[row, target])
+    return Combination(value, weight)
+
+
+def largest(candidates: Sequence[Combination]) -> Combination:
+    """Return the combination with the largest value."""
+    return max(candidates, key=lambda item: item.value)
+
+
+def minus(first: Combination, second: Combination) -> Combination:
+    """Return first - second."""
+    return Combination(first.value - second.value, first.weight - second.weight)
+
+
+def spread(candidates: Sequence[Combination], lower: Sequence[Combination] | None = None) -> Combination:
+    """Return the largest of the candidates minus the smallest of ``lower`` (default the same ones)."""
+    return minus(largest(candidates), min(lower or candidates, key=lambda item: item.value))
+
+
+def figure(statistics: RunStatistics, item: Combination, meaning: str, budget: SetupBudget = NO_BUDGET) -> Figure:
+    """Return a combination in um with its standard uncertainty.
+
+    The scatter gives s^2 / n for a mean and s^2 (1 - c4^2) for an estimator s (normal readings); the rest is the
+    budget's. A single reading has no scatter of its own: u is nan then.
+    """
+    counts, scatter = statistics.count, statistics.values[2:]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        variances = np.concatenate([scatter**2 / counts, scatter**2 * _estimator_variance(counts)])
+    used = item.weight != 0.0
+    repeatability = math.sqrt(float(np.sum(item.weight[used] ** 2 * variances[used])))
+    parts = {"repeatability": repeatability / MM_PER_UM}
+    for name, u_mm in budget.contributions(statistics.position_mm, item.weight[:2]):
+        parts[name] = u_mm / MM_PER_UM
+    u = math.sqrt(sum(value**2 for value in parts.values()))
+    return Figure(item.value / MM_PER_UM, u, "um", meaning, parts)
+
+
+def _estimator_variance(count: FloatArray) -> FloatArray:
+    """Variance of s over sigma^2 for n normal readings: 1 - c4(n)^2, c4^2 = 2 / (n - 1) (G(n/2) / G((n-1)/2))^2."""
+    n = np.maximum(count, 2.0)
+    c4_square = 2.0 / (n - 1.0) * np.exp(2.0 * (gammaln(0.5 * n) - gammaln(0.5 * (n - 1.0))))
+    return np.asarray(np.where(count > 1, 1.0 - c4_square, np.nan))
+
+
+# Positioning accuracy and repeatability of one axis after ISO 230-2.
+#
+# With x_ij(u), x_ij(d) the deviations of run j at target i in positive and negative approach, m(u), m(d) their means, s(u),
+# s(d) their estimators (n - 1), k the coverage factor of the edition:
+#
+#     B_i = m_i(u) - m_i(d),  B = max |B_i|,  mean reversal = mean of B_i,  M = max - min of (m_i(u) + m_i(d)) / 2
+#     R_i(u) = 2 k s_i(u),    R_i = max{ k s_i(u) + k s_i(d) + |B_i|; R_i(u); R_i(d) },  R = max R_i
+#     E(u) = max - min of m_i(u),  E = max - min of the means of both directions together
+#     A(u) = max [m_i(u) + k s_i(u)] - min [m_i(u) - k s_i(u)],  A = the same over both directions together
+#
+# k is 2 since the edition of 1997 and was 3 in that of 1988. The edition of 2014 says "error" where the earlier ones say
+# "deviation" or "value"; the formulas did not change. Two slips of public programs give other numbers: R as the larger of
+# R(u) and R(d), and E as the larger or smaller of E(u) and E(d).
+
+
+#: Coverage factor by edition.
+EDITIONS = {1988: 3.0, 1997: 2.0, 2006: 2.0, 2014: 2.0}
+LATEST = 2014
+_SIGNS = {MEAN_UP: "up", MEAN_DOWN: "down"}
+
+
+@dataclass(frozen=True)
+class PositioningTest:
+    """Figures of one axis (um) by key, and the values at each target.
+
+    Keys: ``B``, ``B_mean``, ``M``, ``R``, ``R_up``, ``R_down``, ``E``, ``E_up``, ``E_down``, ``A``, ``A_up``, ``A_down``
+    as far as the runs show them: both directions for those without an ending, at least two runs for R and A.
+    ``targets`` has the columns position_mm, mean_up_um, mean_down_um, s_up_um, s_down_um, B_um, mean_um, R_um, R_up_um,
+    R_down_um, and from the scatter the standard uncertainties u_mean_up_um, u_mean_down_um, u_B_um (shared sources left
+    out), each (m,), nan where unknown.
+    """
+
+    edition: int
+    statistics: RunStatistics
+    figures: dict[str, Figure]
+    targets: dict[str, FloatArray]
+
+
+def positioning_test(
+    statistics: RunStatistics, edition: int = LATEST, budget: SetupBudget = NO_BUDGET
+) -> PositioningTest:
+    """Return all figures of ISO 230-2 for one axis.
+
+    Parameters
+    ----------
+    statistics : means and estimators at the targets.
+    edition : 1988, 1997, 2006 or 2014.
+    budget : what the set-up adds to the uncertainties.
+    """
+    if edition not in EDITIONS:
+        raise InputError(f"edition {edition} of ISO 230-2 is not available; use {' or '.join(map(str, EDITIONS))}")
+    k = EDITIONS[edition]
+    found: dict[str, tuple[Combination, str]] = {}
+    if statistics.bidirectional:
+        found |= _reversal(statistics)
+    for way in statistics.directions:
+        found |= _one_way(statistics, way, k)
+    if statistics.bidirectional:
+        found |= _both_ways(statistics, k)
+    figures = {
+        key: figure(statistics, item, f"{meaning}, ISO 230-2:{edition}", budget)
+        for key, (item, meaning) in found.items()
+    }
+    _check_identities(figures)
+    return PositioningTest(edition, statistics, figures, _figures_at_targets(statistics, k))
+
+
+def _means(statistics: RunStatistics, ways: Sequence[int], k: float = 0.0) -> list[Combination]:
+    """Every mean + k s of the given directions."""
+    count = len(statistics.position_mm)
+    return [combine(statistics, [(1.0, way, i), (k, 2 + way, i)]) for way in ways for i in range(count)]
+
+
+def _reversal(statistics: RunStatistics) -> dict[str, tuple[Combination, str]]:
+    gaps = statistics.values[MEAN_UP] - statistics.values[MEAN_DOWN]
+    each = range(len(gaps))
+    signed = [[(float(np.sign(gaps[i])), MEAN_UP, i), (-float(np.sign(gaps[i])), MEAN_DOWN, i)] for i in each]
+    sizes = [combine(statistics, parts) for parts in signed]
+    share = 1.0 / len(gaps)
+    mean = combine(
+        statistics, [(sign * share, way, i) for way, sign in ((MEAN_UP, 1.0), (MEAN_DOWN, -1.0)) for i in each]
+    )
+    middles = [combine(statistics, [(0.5, MEAN_UP, i), (0.5, MEAN_DOWN, i)]) for i in each]
+    return {
+        "B": (largest(sizes), "reversal error, largest"),
+        "B_mean": (mean, "mean reversal error"),
+        "M": (spread(middles), "mean bidirectional positioning error"),
+    }
+
+
+def _one_way(statistics: RunStatistics, way: int, k: float) -> dict[str, tuple[Combination, str]]:
+    end, text = _SIGNS[way], f"unidirectional, {'positive' if way == MEAN_UP else 'negative'} approach"
+    found = {f"E_{end}": (spread(_means(statistics, [way])), f"systematic positioning error, {text}")}
+    if statistics.repeated:
+        count = len(statistics.position_mm)
+        widths = [combine(statistics, [(2.0 * k, 2 + way, i)]) for i in range(count)]
+        accuracy = spread(_means(statistics, [way], k), _means(statistics, [way], -k))
+        found[f"R_{end}"] = (largest(widths), f"positioning repeatability, {text}")
+        found[f"A_{end}"] = (accuracy, f"positioning accuracy, {text}")
+    return found
+
+
+def _both_ways(statistics: RunStatistics, k: float) -> dict[str, tuple[Combination, str]]:
+    ways = (MEAN_UP, MEAN_DOWN)
+    found = {"E": (spread(_means(statistics, ways)), "systematic positioning error, bidirectional")}
+    if statistics.repeated:
+        count = len(statistics.position_mm)
+        accuracy = spread(_means(statistics, ways, k), _means(statistics, ways, -k))
+        repeatability = largest([_repeatability_at(statistics, i, k) for i in range(count)])
+        found["R"] = (repeatability, "positioning repeatability, bidirectional")
+        found["A"] = (accuracy, "positioning accuracy, bidirectional")
+    return found
+
+
+def _repeatability_at(statistics: RunStatistics, target: int, k: float) -> Combination:
+    """R_i as the largest of its three candidates."""
+    sign = float(np.sign(statistics.values[MEAN_UP, target] - statistics.values[MEAN_DOWN, target]))
+    both = [(k, 2, target), (k, 3, target), (sign, MEAN_UP, target), (-sign, MEAN_DOWN, target)]
+    single = [[(2.0 * k, 2, target)], [(2.0 * k, 3, target)]]
+    return largest([combine(statistics, parts) for parts in (both, *single)])
+
+
+def _figures_at_targets(statistics: RunStatistics, k: float) -> dict[str, FloatArray]:
+    up, down, s_up, s_down = statistics.values / MM_PER_UM
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u_up, u_down = (s_up, s_down) / np.sqrt(statistics.count)
+    wide = np.maximum(np.maximum(2.0 * k * s_up, 2.0 * k * s_down), k * (s_up + s_down) + np.abs(up - down))
+    return {
+        "position_mm": statistics.position_mm,
+        "mean_up_um": up,
+        "mean_down_um": down,
+        "s_up_um": s_up,
+        "s_down_um": s_down,
+        "B_um": up - down,
+        "mean_um": 0.5 * (up + down),
+        "R_um": wide,
+        "R_up_um": 2.0 * k * s_up,
+        "R_down_um": 2.0 * k * s_down,
+        "u_mean_up_um": u_up,
+        "u_mean_down_um": u_down,
+        "u_B_um": np.hypot(u_up, u_down),
+    }
+
+
+def _check_identities(figures: dict[str, Figure]) -> None:
+    """What must hold between the figures whatever the readings are; a broken one is a bug, not bad input."""
+    above = [("A", "E"), ("A", "A_up"), ("A", "A_down"), ("E", "E_up"), ("E", "E_down"), ("E", "M")]
+    above += [("R", "R_up"), ("R", "R_down"), ("R", "B")]
+    for large, small in above:
+        if large in figures and small in figures:
+            assert figures[large].value >= figures[small].value - 1e-9, f"{large} is below {small}"
+    if "E" in figures:
+        assert figures["E"].value <= figures["M"].value + figures["B"].value + 1e-9
+
+
+# Statistical test of the positioning of one axis after VDI/DGQ 3441.
+#
+# With U_i = |m_i(u) - m_i(d)|, s_i the mean of both estimators, P_s,i = 6 s_i and m_i the mean of both directions:
+#
+#     P_a = max m_i - min m_i,   P = max [m_i + (U_i + P_s,i) / 2] - min [m_i - (U_i + P_s,i) / 2]
+
+
+def vdi_3441(statistics: RunStatistics, budget: SetupBudget = NO_BUDGET) -> dict[str, Figure]:
+    """Return ``P``, ``P_a``, ``P_s_max``, ``P_s_mean``, ``U_max``, ``U_mean`` in um.
+
+    Raises
+    ------
+    InputError
+        if a direction is missing or nothing was repeated: the guideline knows no such test.
+    """
+    if not (statistics.bidirectional and statistics.repeated):
+        raise InputError("VDI/DGQ 3441 needs both directions, each repeated at every target")
+    count = len(statistics.position_mm)
+    signs = np.sign(statistics.values[MEAN_UP] - statistics.values[MEAN_DOWN]).tolist()
+    middle = [[(0.5, MEAN_UP, i), (0.5, MEAN_DOWN, i)] for i in range(count)]
+    reversal = [[(signs[i], MEAN_UP, i), (-signs[i], MEAN_DOWN, i)] for i in range(count)]
+    scatter = [[(3.0, 2, i), (3.0, 3, i)] for i in range(count)]
+
+    def edge(side: float) -> list[Combination]:
+        half = [[(0.5 * side * f, row, k) for f, row, k in reversal[i] + scatter[i]] for i in range(count)]
+        return [combine(statistics, middle[i] + half[i]) for i in range(count)]
+
+    def mean(parts: list[list[tuple[float, int, int]]]) -> Combination:
+        return combine(statistics, [(factor / count, row, i) for part in parts for factor, row, i in part])
+
+    found = {
+        "P": (spread(edge(1.0), edge(-1.0)), "positional uncertainty"),
+        "P_a": (spread([combine(statistics, part) for part in middle]), "positional deviation"),
+        "P_s_max": (largest([combine(statistics, part) for part in scatter]), "largest positional scatter"),
+        "P_s_mean": (mean(scatter), "mean positional scatter"),
+        "U_max": (largest([combine(statistics, part) for part in reversal]), "largest reversal"),
+        "U_mean": (mean(reversal), "mean reversal"),
+    }
+    return {key: figure(statistics, item, f"{text}, VDI/DGQ 3441", budget) for key, (item, text) in found.items()}

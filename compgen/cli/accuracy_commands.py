@@ -1,0 +1,225 @@
+"""``volcomp accuracy`` and ``volcomp compare``."""
+
+from __future__ import annotations
+
+import functools
+import io
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console, RenderableType
+
+from compgen.accuracy.compare import CompareOptions, Comparison
+from compgen.accuracy.diagonals import accuracy_of_diagonals
+from compgen.accuracy.evaluate import accuracy_of_errors, accuracy_of_runs
+from compgen.accuracy.positioning import SetupBudget
+from compgen.accuracy.sides import Reader, compare_prediction, compare_sides, read_side, with_prediction
+from compgen.cli.common import NUMBER, PATH, Command, json_option, out_option
+from compgen.cli.shared_options import instrument_option, machine_argument, options_of
+from compgen.cli.terminal import answer, progress
+from compgen.data.files import OutputFolder, json_text
+from compgen.data.machine import Machine
+from compgen.data.names import AXES
+from compgen.errors import InputError
+from compgen.foreign import native_format, open_measurement
+from compgen.pipeline import provenance_of, write_all
+from compgen.report.terminal import accuracy_table, comparison_table
+from compgen.tables import read_tables
+
+
+def evaluation_options(*without: str) -> Callable[[Command], Command]:
+    """Add how the figures are evaluated; the command receives ``options``, ``budget`` and how to read files."""
+
+    def decorate(command: Command) -> Command:
+        decorated: Any = options_of(SetupBudget, "budget", build=_budget)(command)
+        text = "Axis of an instrument's file that does not say it."
+        decorated = click.option("--axis", type=click.Choice(AXES, case_sensitive=False), help=text)(decorated)
+        text = "Standard uncertainty of measured deviations, um."
+        decorated = click.option("--u-deviation-um", type=NUMBER, help=text)(decorated)
+        decorated = instrument_option(decorated)
+        text = "Take the best-fit rigid motion out of the volume (default: stays)."
+        decorated = click.option("--remove-rigid-motion", is_flag=True, help=text)(decorated)
+        return options_of(CompareOptions, "options", without=without, read={"edition": int})(decorated)  # type: ignore[no-any-return]
+
+    return decorate
+
+
+def _budget(**values: float) -> SetupBudget:
+    for name, value in values.items():
+        if name != "from_20_k" and not (math.isfinite(value) and value >= 0.0):
+            option = f"--u-{name.removeprefix('u_').replace('_', '-')}"
+            raise InputError(f"{value:g} is not a standard uncertainty; expected 0 or above", field=option)
+    return SetupBudget(**values)
+
+
+def _completed(options: CompareOptions, machine: Machine, budget: SetupBudget, *, rigid: bool) -> CompareOptions:
+    """The options with the budget of each axis, by its own expansion, and the alignment that --remove-rigid-motion means."""
+    if rigid and options.alignment is not None:
+        given = f"--alignment {options.alignment} and --remove-rigid-motion"
+        raise InputError(f"{given} cannot be combined; give one of them")
+    budgets = {}
+    for axis, item in zip(AXES, machine.axes, strict=True):
+        known = item.expansion_um_per_m_k
+        budgets[axis] = budget if known is None else replace(budget, expansion_um_per_m_k=known)
+    return replace(options, budgets=budgets, alignment="best-fit" if rigid else options.alignment)
+
+
+def _reader(axis: str | None, *paths: Path) -> Reader:
+    """Reader of measurements; InputError if --axis is given for a file that states its axis."""
+    for path in paths if axis is not None else ():
+        if path.is_dir() or native_format(path) is not None:
+            raise InputError(
+                "already states its axis; --axis is only for files of instruments", file=path, field="--axis"
+            )
+    return functools.partial(open_measurement, axis=axis)
+
+
+@click.command("accuracy")
+@machine_argument
+@click.argument("file", type=PATH)
+@evaluation_options("align")
+@out_option
+@json_option
+def accuracy_command(
+    machine: Machine,
+    file: Path,
+    options: CompareOptions,
+    remove_rigid_motion: bool,
+    instrument: Path | None,
+    u_deviation_um: float | None,
+    axis: str | None,
+    budget: SetupBudget,
+    out: Path,
+    as_json: bool,
+) -> int:
+    """Evaluate one measurement or error file by the standards, each figure with its uncertainty.
+
+    FILE: *.axis.csv gives ISO 230-2 and VDI/DGQ 3441, *.diagonals.csv ISO 230-6; errors (reversal from NAME.reversal.csv
+    beside them, or a folder that identify or run wrote), tracer lengths, measured positions and six-DOF readings
+    (identified first) give ISO 230-1 volumetric ranges, ISO 230-6 diagonals, straightness, squareness. Values in um and
+    urad. Writes accuracy.json and accuracy.txt to DIR.
+
+    \b
+    Example:
+      volcomp accuracy zha-gantry identified/identified.errors.csv --out accuracy/
+    """
+    OutputFolder(out)
+    options = _completed(options, machine, budget, rigid=remove_rigid_motion)
+    with progress(quiet=as_json) as show:
+        show("reading and evaluating")
+        side = read_side(machine, file, instrument, u_deviation_um, _reader(axis, file))
+        if side.runs is not None:
+            found = accuracy_of_runs(side.runs, options.edition, options.budgets)
+        elif side.diagonals is not None:
+            found = accuracy_of_diagonals(machine, side.diagonals, options.edition, options.budgets)
+        else:
+            known = side.errors()
+            assert known.source is not None
+            found = accuracy_of_errors(known.source, options.alignment or "axes", options.line, known.reversal)
+    data = {**found.summary(), "inputs": _inputs(machine, side.path)}
+    files = {"accuracy.json": json_text(data), "accuracy.txt": _plain(accuracy_table(found))}
+    write_all(out, files)
+    answer(as_json, data, accuracy_table(found))
+    return 0
+
+
+@click.command("compare")
+@machine_argument
+@click.argument("before", type=PATH)
+@click.argument("after", type=PATH)
+@click.option(
+    "--predicted", is_flag=True, help="BEFORE predicts what AFTER measures: errors, or the output of predict."
+)
+@click.option(
+    "--tables",
+    multiple=True,
+    metavar="FILE",
+    type=PATH,
+    help="Controller files active during AFTER: what they predict on the errors BEFORE is compared with AFTER as well.",
+)
+@click.option("--controller", metavar="NAME", help="Control that --tables belong to.")
+@click.option(
+    "--expect",
+    type=click.Choice(["better", "not-worse"]),
+    default="better",
+    help="What exit code 0 needs (default better).",
+)
+@evaluation_options()
+@out_option
+@json_option
+def compare_command(
+    machine: Machine,
+    before: Path,
+    after: Path,
+    predicted: bool,
+    tables: tuple[Path, ...],
+    controller: str | None,
+    expect: str,
+    options: CompareOptions,
+    remove_rigid_motion: bool,
+    instrument: Path | None,
+    u_deviation_um: float | None,
+    axis: str | None,
+    budget: SetupBudget,
+    out: Path,
+    as_json: bool,
+) -> int:
+    """Compare before and after: improvement factors with uncertainty, per volume, axis and error.
+
+    BEFORE and AFTER are two error files (*.errors.csv, um and urad), or two measurements of a kind: *.axis.csv,
+    *.diagonals.csv, *.deviations.csv, *.lengths.csv or *.sixdof.csv (the last two are identified first). Both need the
+    same points. A figure is "better" only where the bands value +/- U (k = 2) separate (then En > 1).
+
+    Exit code 0: better (or smaller, where no uncertainty is known), and a prediction agrees; else 1. Writes compare.json
+    and compare.txt to DIR.
+
+    \b
+    Example:
+      volcomp compare zha-gantry before.errors.csv after.errors.csv --out compared/
+    """
+    OutputFolder(out)
+    if bool(tables) != (controller is not None):
+        raise InputError("--tables and --controller belong together; give both or neither")
+    if predicted and tables:
+        raise InputError(
+            "--predicted cannot be combined with --tables: with --tables the emulator makes the prediction"
+        )
+    options = _completed(options, machine, budget, rigid=remove_rigid_motion)
+    with progress(quiet=as_json) as show:
+        show("reading BEFORE and AFTER")
+        reader = _reader(axis, before, after)
+        first, second = (read_side(machine, path, instrument, u_deviation_um, reader) for path in (before, after))
+        show("comparing")
+        found = compare_prediction(first, second, options) if predicted else compare_sides(first, second, options)
+        if controller is not None:
+            found = with_prediction(found, first, second, read_tables(machine, tables, controller), options)
+    accepted = _accepted(found, expect)
+    inputs = _inputs(machine, first.path, second.path, *tables)
+    data = {"accepted": accepted, **found.summary(), "machine": machine.name, "inputs": inputs}
+    text = comparison_table(found)
+    write_all(out, {"compare.json": json_text(data), "compare.txt": _plain(text)})
+    answer(as_json, data, text)
+    return 0 if accepted else 1
+
+
+def _accepted(found: Comparison, expect: str) -> bool:
+    if found.kind == "prediction":
+        return found.prediction is not None and found.prediction.verdict == "agrees"
+    if found.prediction is not None and found.prediction.verdict == "disagrees":
+        return False
+    return found.improved or (expect == "not-worse" and found.verdict not in ("worse", "larger"))
+
+
+def _inputs(machine: Machine, *paths: Path) -> list[dict[str, str]]:
+    known = provenance_of(machine.source, *paths)
+    return [{"name": name, "sha256": digest} for name, digest in known.inputs]
+
+
+def _plain(text: RenderableType) -> str:
+    stream = io.StringIO()
+    Console(file=stream, width=130, no_color=True, highlight=False, emoji=False, markup=False).print(text)
+    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"

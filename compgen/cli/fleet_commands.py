@@ -1,0 +1,923 @@
+"""``volcomp recal`` and ``serve``; what a command needs is imported when it runs."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import getpass
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich import box
+from rich.table import Table
+
+from compgen.cli.common import (
+    NUMBER,
+    PATH,
+    STOPPED,
+    Command,
+    fleet_options,
+    json_option,
+    print_json,
+    stopped_by_signals,
+)
+from compgen.cli.terminal import answer, complain, say, stdout
+from compgen.errors import InputError
+
+if TYPE_CHECKING:
+    from compgen.fleet.dashboard.settings import Users
+    from compgen.fleet.drift import Drift
+    from compgen.fleet.job import Job
+    from compgen.fleet.store import Store
+
+
+# ``volcomp recal``: run, watch, status, history; what a command needs is imported when it runs.
+
+
+JOB = "recal.toml"
+_PATH = click.Path(path_type=Path)
+#: Modules that only this command group needs, by the name of their distribution.
+NEEDED = {"sqlalchemy": "SQLAlchemy", "alembic": "alembic", "apscheduler": "APScheduler", "structlog": "structlog"}
+
+
+@click.group("recal")
+def recal_command() -> None:
+    """Scheduled recalibration: new measurements become proposed tables, a person approves, everything can be undone.
+
+    The job file (--job, default recal.toml) says which machines, from which inbox, when, by which rules. Limits are in
+    um, temperatures in degC, ages in days. Exit codes: 0 all is well (tables may wait for approval), 1 something is held
+    back or failed, 2 wrong usage, job file or store, 3 internal error.
+
+    \b
+    Example:
+      volcomp recal add mill-1 --machine mill-1.toml --inbox inbox/mill-1 --controller siemens-cec \\
+                    --out tables/mill-1 --measured-with active
+      volcomp recal run
+      volcomp recal approve mill-1 1
+    """
+
+
+def needed() -> None:
+    """Say what is not installed, if anything is not."""
+    import importlib.util
+
+    missing = [name for module, name in NEEDED.items() if importlib.util.find_spec(module) is None]
+    if missing:
+        raise InputError(f"volcomp recal needs {', '.join(missing)}; install compgen[recal]")
+
+
+def job_option(command: Command) -> Command:
+    """Add --job and --log; the command receives ``job``, read."""
+
+    @functools.wraps(command)
+    def wrapper(*args: Any, job_file: Path, log: str, **options: Any) -> Any:
+        needed()
+        from compgen.fleet import logs
+        from compgen.fleet.job import read_job
+
+        logs.configure(log)  # type: ignore[arg-type]
+        return command(*args, job=read_job(job_file), **options)
+
+    return _job_options(wrapper)  # type: ignore[no-any-return]
+
+
+def _job_options(command: Any) -> Any:
+    form = click.Choice(["auto", "json", "text"])
+    text = "Form of the logs on stderr; auto: words on a terminal, else one JSON object per line."
+    logged = click.option("--log", default="auto", show_default=True, type=form, help=text)(command)
+    file = click.option(
+        "--job", "job_file", default=JOB, show_default=True, type=PATH, metavar="FILE", help="Job file."
+    )
+    return file(logged)
+
+
+notify_option = click.option(
+    "--notify",
+    "command",
+    default=None,
+    metavar="COMMAND",
+    help="Command that gets one JSON object on stdin for every decision and failure; default: that of the job file.",
+)
+
+
+def opened(job: Job, use: Callable[[Store], Any]) -> Any:
+    """Do something with the store of a job and close it."""
+    from compgen.fleet.store import open_store
+
+    store = open_store(job.store)
+    try:
+        return use(store)
+    finally:
+        store.close()
+
+
+@recal_command.command("run")
+@click.argument("machines", nargs=-1)
+@job_option
+@fleet_options
+@notify_option
+@json_option
+def run_command(
+    machines: tuple[str, ...], job: Job, workers: int, cluster: str | None, command: str | None, as_json: bool
+) -> int:
+    """Read the inboxes of MACHINES (default: all) once, process new measurements, publish the tables.
+
+    The same inbox gives the same state, however often it is run. A machine that fails does not stop the others. On
+    SIGTERM or Ctrl-C the measurements that are being processed are finished; exit code 130.
+
+    \b
+    Example:
+      volcomp recal run --job /etc/compgen/recal.toml --json
+      volcomp recal run --workers 8
+    """
+    from compgen.fleet.runner import run_fleet
+
+    with stopped_by_signals() as stop:
+        chosen = job.with_notify(_words(command))
+        result = run_fleet(chosen, machines, workers=workers, cluster=cluster, stop=stop.is_set)
+        code = STOPPED if stop.is_set() else result.exit_code
+    if as_json:
+        print_json(result.summary())
+        return code
+    for item in result.outcomes:
+        if item.state == "stopped":
+            say(f"{item.machine}: {'; '.join(item.messages)}")
+            continue
+        active = "no tables active" if item.active is None else f"version {item.active} active"
+        done = f", processed {', '.join(item.processed)}" if item.processed else ""
+        waiting = f", waiting: {', '.join(map(str, item.waiting))}" if item.waiting else ""
+        say(f"{item.machine}: {item.state}, {active}{waiting}{done}")
+        for message in item.messages:
+            say(f"  {message}")
+    return code
+
+
+def _words(command: str | None) -> tuple[str, ...]:
+    from compgen.fleet.job import command_words
+
+    try:
+        return () if command is None else command_words(command)
+    except ValueError as error:
+        raise InputError(str(error), field="--notify") from error
+
+
+@recal_command.command("watch")
+@job_option
+@click.option(
+    "--poll-s", default=2.0, show_default=True, type=click.FloatRange(0.05, 3600), help="Look at the job file, s."
+)
+@click.option(
+    "--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus metrics on 127.0.0.1 at this port."
+)
+@fleet_options
+@notify_option
+def watch_command(
+    job: Job, poll_s: float, metrics_port: int | None, workers: int, cluster: str | None, command: str | None
+) -> int:
+    """Keep running: every machine by its schedule (without one every 5 minutes), until SIGTERM or Ctrl-C.
+
+    Changes of the job file are picked up; a faulty one is reported, and the previous one stays in force. On a signal
+    the measurements that are being processed are finished.
+
+    \b
+    Example:
+      volcomp recal watch --job /etc/compgen/recal.toml
+    """
+    from compgen.fleet.runner import open_fleet, work_of
+    from compgen.fleet.watch import Watch
+
+    with contextlib.ExitStack() as left:
+        fleet = open_fleet(job.store, workers, cluster)
+        left.callback(fleet.close)
+        options: dict[str, Any] = {"work": work_of(fleet), "threads": fleet.size}
+        if metrics_port is not None:
+            options["on_outcome"] = _counted(job, metrics_port, left)
+        Watch(job.path, poll_s=poll_s, notify=_words(command), **options).run()
+    return 0
+
+
+def _counted(job: Job, port: int, left: contextlib.ExitStack) -> Callable[[Any], None]:
+    """Show metrics until ``left`` is; return what counts an outcome."""
+    from compgen.fleet.dashboard.metrics import WatchMetrics, start_metrics
+    from compgen.fleet.store import open_store
+
+    store = open_store(job.store)
+    left.callback(store.close)
+    metrics = WatchMetrics(store)
+    left.callback(start_metrics(metrics.text, port)[1])
+    return metrics.count
+
+
+@recal_command.command("status")
+@click.argument("machines", nargs=-1)
+@job_option
+@json_option
+def status_command(machines: tuple[str, ...], job: Job, as_json: bool) -> int:
+    """Show the state of each of MACHINES (default: all): active version, versions that wait, last measurement, problems.
+
+    Exit code 1 if the newest tables of any are held back, or its last measurement failed.
+
+    \b
+    Example:
+      volcomp recal status --json
+    """
+    from compgen.fleet.status import status
+
+    found = opened(job, lambda store: status(store, job, machines))
+    bad = any(item.state in ("held", "failed") for item in found)
+    if as_json:
+        print_json({"accepted": not bad, "machines": [item.summary() for item in found]})
+        return int(bad)
+    rows = [
+        (
+            item.machine,
+            item.state,
+            "-" if item.active is None else str(item.active),
+            ", ".join(map(str, item.waiting)) or "-",
+            item.last_measured or "-",
+            item.schedule or "-",
+            item.message,
+        )
+        for item in found
+    ]
+    print_table(("machine", "state", "active", "waiting", "last measured", "schedule", ""), rows)
+    return int(bad)
+
+
+def print_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows of text below their headings."""
+    table = Table(box=box.SIMPLE, pad_edge=False, collapse_padding=True)
+    for heading in headings:
+        table.add_column(heading, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    stdout.print(table)
+
+
+@recal_command.command("history")
+@click.argument("machine", required=False)
+@job_option
+@click.option("--drift", is_flag=True, help="Show how MACHINE drifts instead: changes, trends, forecasts, steps.")
+@click.option("--report", default=None, metavar="FILE", type=PATH, help="Write the drift as a page, with pictures.")
+@json_option
+def history_command(machine: str | None, job: Job, drift: bool, report: Path | None, as_json: bool) -> int:
+    """Show everything that happened to MACHINE (default all): measurements, failures, decisions with who and why.
+
+    \b
+    Example:
+      volcomp recal history mill-1 --json
+      volcomp recal history mill-1 --drift --report mill-1.html
+    """
+    from compgen.fleet.status import history
+
+    if drift or report is not None:
+        return int(opened(job, lambda store: show_drift(store, job, machine, report, as_json=as_json)))
+
+    if machine is not None:
+        job.machine(machine)
+    entries = opened(job, lambda s: history(s, None if machine is None else s.machine(machine)))
+    if as_json:
+        print_json({"entries": [entry.summary() for entry in entries]})
+        return 0
+    rows = [
+        (
+            entry.at,
+            entry.machine,
+            entry.kind,
+            "-" if entry.version is None else str(entry.version),
+            entry.actor,
+            entry.text,
+        )
+        for entry in entries
+    ]
+    print_table(("at", "machine", "what", "version", "who", "why"), rows)
+    return 0
+
+
+# ``volcomp recal approve``, ``reject``, ``rollback`` and ``adopt``.
+
+
+def who_option(*, reason: bool) -> Callable[[Command], Command]:
+    """Add --actor and --reason."""
+
+    def decorate(command: Command) -> Command:
+        text = "Why; kept in the history." if reason else "Why; kept in the history; required with --override."
+        given = {"required": True} if reason else {"default": ""}  # a default of None would count as given
+        why = click.option("--reason", metavar="TEXT", help=text, **given)
+        who = click.option("--actor", default=None, metavar="NAME", help="Who decides; default: your login name.")
+        return who(why(command))
+
+    return decorate
+
+
+def actor_of(name: str | None) -> str:
+    """Return the name of who decides: the one given, else the login name."""
+    try:
+        return name or getpass.getuser()
+    except (KeyError, OSError) as error:
+        raise InputError("this account has no name; give --actor NAME") from error
+
+
+@recal_command.command("approve")
+@click.argument("machine")
+@click.argument("version", type=click.IntRange(1), required=False)
+@job_option
+@click.option("--override", is_flag=True, help="Also a version that the policy holds back; needs --reason.")
+@who_option(reason=False)
+@json_option
+def approve_command(
+    machine: str, version: int | None, job: Job, override: bool, actor: str | None, reason: str, as_json: bool
+) -> int:
+    """Make VERSION of MACHINE's tables active.
+
+    Without VERSION the only one that waits is shown and asked about, on a terminal; elsewhere name the VERSION that you
+    looked at, as another one may wait by now. Tables that the round trip did not accept can never be approved.
+
+    \b
+    Example:
+      volcomp recal approve mill-1 3 --reason "checked with the ball bar"
+    """
+    from compgen.fleet.actions import approve
+
+    seen = None
+    if version is None:
+        version, seen = opened(job, lambda store: _asked(store, job.machine(machine).name, may_ask=not as_json))
+    done = approve(job, machine, version, actor_of(actor), reason, override=override, seen=seen)
+    return _decided(job, machine, done, as_json)
+
+
+def _asked(store: Store, name: str, *, may_ask: bool) -> tuple[int, int]:
+    """Return the version that waits and the active one (0: none), after a person has seen both and said yes.
+
+    Raises
+    ------
+    InputError
+        where nobody can be asked: what waits now need not be what somebody looked at before.
+    """
+    from compgen.data.messages import visible
+    from compgen.fleet import decisions
+
+    machine = store.machine(name)
+    table = decisions.only_pending(store, machine)
+    measured = store.measurement_behind(table)
+    what = f"{name}: version {table.version} ({table.state}) from {visible(measured.name, flat=True)}, measured "
+    what += measured.measured_at.isoformat(timespec="minutes")
+    if not (may_ask and sys.stdin.isatty() and sys.stderr.isatty()):
+        raise InputError(
+            f"{what}, waits; without a terminal, name the version: volcomp recal approve {name} {table.version}",
+            field="VERSION",
+        )
+    active = decisions.active_table(store, machine)
+    complain(what, None)
+    complain("active now: " + ("no tables" if active is None else f"version {active.version}"), None)
+    for reason in table.reasons:
+        complain(f"  {visible(reason, flat=True)}", None)
+    click.confirm("Make it active?", abort=True, err=True)
+    return table.version, 0 if active is None else active.version
+
+
+@recal_command.command("reject")
+@click.argument("machine")
+@click.argument("version", type=click.IntRange(1), required=False)
+@job_option
+@who_option(reason=True)
+@json_option
+def reject_command(machine: str, version: int | None, job: Job, actor: str | None, reason: str, as_json: bool) -> int:
+    """Refuse VERSION of MACHINE's tables (default: the only one that waits).
+
+    \b
+    Example:
+      volcomp recal reject mill-1 3 --reason "a fixture was loose"
+    """
+    from compgen.fleet.actions import reject
+
+    return _decided(job, machine, reject(job, machine, version, actor_of(actor), reason), as_json)
+
+
+@recal_command.command("rollback")
+@click.argument("machine")
+@job_option
+@click.option(
+    "--to", type=click.IntRange(0), default=None, help="Version that was active; 0: no tables. Default: the one before."
+)
+@who_option(reason=True)
+@json_option
+def rollback_command(machine: str, job: Job, to: int | None, actor: str | None, reason: str, as_json: bool) -> int:
+    """Make an earlier version of MACHINE's tables active again, byte for byte.
+
+    \b
+    Example:
+      volcomp recal rollback mill-1 --reason "parts out of tolerance since Monday"
+    """
+    from compgen.fleet.actions import rollback
+
+    return _decided(job, machine, rollback(job, machine, actor_of(actor), reason, to=to), as_json)
+
+
+@recal_command.command("adopt")
+@click.argument("machine")
+@job_option
+@who_option(reason=True)
+@json_option
+def adopt_command(machine: str, job: Job, actor: str | None, reason: str, as_json: bool) -> int:
+    """Give the output folder of MACHINE to this store, after the store was lost, emptied or replaced by an older backup.
+
+    What the folder holds is moved to SET-ASIDE-1 (2, ...) inside it, and the store publishes its own versions. From then
+    on it does not know which tables are active: the next measurement must say so, or a version must be approved.
+
+    \b
+    Example:
+      volcomp recal adopt mill-1 --reason "store restored from the backup of Sunday"
+    """
+    from compgen.fleet.actions import adopt
+
+    moved = adopt(job, machine, actor_of(actor), reason)
+    if as_json:
+        print_json({"accepted": True, "machine": machine, "set_aside": None if moved is None else str(moved)})
+    else:
+        what = "there was nothing to set aside" if moved is None else f"its contents are now in {moved}"
+        say(f"{machine}: the folder belongs to this store now; {what}")
+    return 0
+
+
+def _decided(job: Job, machine: str, decision: Any, as_json: bool) -> int:
+    from compgen.fleet.status import status
+
+    now = opened(job, lambda store: status(store, job, (machine,)))[0]
+    if as_json:
+        facts = {
+            "kind": decision.kind,
+            "actor": decision.actor,
+            "reason": decision.reason,
+            "at": decision.at.isoformat(),
+        }
+        print_json({"accepted": True, "machine": machine, "active": now.active, "decision": facts})
+    else:
+        active = "no tables are active" if now.active is None else f"version {now.active} is active"
+        say(f"{machine}: {decision.kind} by {decision.actor}; {active}")
+    return 0
+
+
+# ``volcomp recal history MACHINE --drift``, ``volcomp recal recheck`` and ``volcomp recal exclude``.
+
+
+def show_drift(store: Store, job: Job, machine: str | None, report: Path | None, *, as_json: bool) -> int:
+    """Print the drift of one machine and write its page; the exit code is 0."""
+    from compgen.fleet.drift import DriftSettings, drift_of_store, moment_of
+
+    if machine is None:
+        raise InputError("--drift and --report need one machine; give its name")
+    found = drift_of_store(store, store.machine(machine), DriftSettings(job.machine(machine).tolerances))
+    paths = [] if report is None else [str(_write(report, found))]
+    if as_json:
+        print_json({"accepted": True, "paths": paths, "drift": found.summary()})
+        return 0
+    say(f"{machine}: {len(found.times)} calibrations, {moment_of(found.times[0])} to {moment_of(found.times[-1])}")
+    for title, change, errors in (
+        ("last", found.volume_since_last, found.since_last),
+        ("first", found.volume_since_first, found.since_first),
+    ):
+        if change is not None:
+            level = 1.0 - found.settings.confidence
+            named = ", ".join(item.error for item in errors if item.adjusted < level) or "no single error"
+            say(
+                f"since the {title}: {change.rms_um:.2f} um rms over the volume ({change.expected_rms_um:.2f} um by "
+                f"uncertainty alone), p = {change.p_value:.2g}; changed: {named}"
+            )
+    for text in found.sentences():
+        say(f"  {text}")
+    for path in paths:
+        say(path)
+    return 0
+
+
+def _write(path: Path, drift: Drift) -> Path:
+    from compgen.fleet.history_page import write_history_report
+
+    return write_history_report(path, drift)
+
+
+@recal_command.command("recheck")
+@click.argument("machine")
+@click.option("--stations", required=True, metavar="FILE", help="Stations file of volcomp plan or identify.")
+@click.option("--error", required=True, metavar="NAME", help="Error whose change is to be seen, e.g. EC0Y.")
+@click.option("--change", required=True, type=NUMBER, metavar="SIZE", help="Its size, um or urad.")
+@click.option("--power", default=0.9, show_default=True, type=NUMBER, help="Probability of seeing it.")
+@click.option("--confidence", default=0.95, show_default=True, type=NUMBER, help="1 - probability of a false alarm.")
+@click.option("--points", default=None, metavar="FILE", type=PATH, help="Write a points file.")
+@job_option
+@json_option
+def recheck_command(
+    machine: str,
+    stations: str,
+    error: str,
+    change: float,
+    power: float,
+    confidence: float,
+    points: Path | None,
+    job: Job,
+    as_json: bool,
+) -> int:
+    """Find the fewest points at which tracers would see a change of one error of MACHINE since its last calibration.
+
+    \b
+    Example:
+      volcomp recal recheck mill-1 --stations stations.csv --error EC0Y --change 10 --points recheck.points.csv
+    """
+    from compgen.data.messages import nearest
+    from compgen.data.names import ERROR_NAMES, error_named
+    from compgen.fleet.change import calibrations_of
+    from compgen.fleet.recheck import RequestedChange, shortest_recheck, write_recheck_points
+    from compgen.plan import read_stations
+
+    if error not in ERROR_NAMES:
+        raise InputError(f"{error!r} is not an error; {nearest(error, ERROR_NAMES)}", field="--error")
+    name = error_named(error)
+    request = RequestedChange(error, change * name.si_per_unit, power, confidence)
+    job.machine(machine)
+    history, _, model = opened(job, lambda store: calibrations_of(store, store.machine(machine)))
+    found = shortest_recheck(model, read_stations(stations), request, history[-1].covariance)
+    paths = [] if points is None else [str(write_recheck_points(points, found))]
+    if as_json:
+        print_json({"accepted": True, "paths": paths, **found.summary()})
+        return 0
+    u, smallest = found.u / name.si_per_unit, found.smallest / name.si_per_unit
+    say(
+        f"{len(found.position_mm)} points, {found.readings} readings: {error} to {u:.2f} {name.unit} (standard "
+        f"uncertainty); {change:g} {name.unit} is seen with power {found.power:.2f}, {smallest:.2f} {name.unit} with "
+        f"{power:g}"
+    )
+    for place in found.position_mm.tolist():
+        stdout.print("  " + ", ".join(f"{letter} {value:g} mm" for letter, value in zip("XYZ", place, strict=True)))
+    for path in paths:
+        say(path)
+    return 0
+
+
+@recal_command.command("exclude")
+@click.argument("machine")
+@click.argument("version", type=click.IntRange(1))
+@job_option
+@click.option("--undo", is_flag=True, help="Take an exclusion back.")
+@who_option(reason=True)
+@json_option
+def exclude_command(
+    machine: str, version: int, job: Job, undo: bool, actor: str | None, reason: str, as_json: bool
+) -> int:
+    """Leave the measurement behind VERSION of MACHINE's tables, which was wrong, out of the drift.
+
+    Nothing is deleted; the history records who, when and why. Roll an active version back first.
+
+    \b
+    Example:
+      volcomp recal exclude mill-1 5 --reason "the sign of the deviations was wrong"
+    """
+    from compgen.fleet.decisions import exclude
+
+    who = actor_of(actor)
+    exclude(job, machine, version, who, reason, undo=undo)
+    what = "counts again" if undo else "is left out of the drift"
+    answer(
+        as_json,
+        {"accepted": True, "machine": machine, "version": version, "excluded": not undo, "actor": who},
+        f"{machine}: the measurement behind version {version} {what}",
+    )
+    return 0
+
+
+# ``volcomp recal reprocess``: identify and export again from a stored measurement.
+
+
+@recal_command.command("reprocess")
+@click.argument("machine")
+@click.option(
+    "--measurement",
+    default=None,
+    metavar="ID",
+    help="Its number in `history --json`, or the beginning of its SHA-256; default: the newest.",
+)
+@click.option(
+    "--active-table",
+    default=None,
+    metavar="VERSION|none",
+    help="The tables that were active while the machine was measured, for a measurement that is held back because that is "
+    "not certain; default: what file, job and history say.",
+)
+@job_option
+@who_option(reason=True)
+@json_option
+def reprocess_command(
+    machine: str,
+    measurement: str | None,
+    active_table: str | None,
+    job: Job,
+    actor: str | None,
+    reason: str,
+    as_json: bool,
+) -> int:
+    """Identify and export again from a stored measurement of MACHINE, as job, machine and instrument files say now.
+
+    Earlier versions are kept: a new version is proposed and judged as any other. Exit code 1 if it is held back or refused.
+
+    \b
+    Example:
+      volcomp recal reprocess mill-1 --reason "pitch of X corrected in the machine file"
+      volcomp recal reprocess mill-1 --active-table v2 --reason "v2 was on, says the log of the control"
+    """
+    from compgen.fleet.actions import ReprocessRequest, reprocess
+
+    done = reprocess(job, machine, ReprocessRequest(measurement, actor_of(actor), reason, active_table))
+    table = done.table
+    if as_json:
+        facts = {"id": done.measurement.id, "name": done.measurement.name, "sha256": done.measurement.sha256}
+        made = {"version": table.version, "state": table.state, "reasons": list(table.reasons)}
+        accepted = done.exit_code == 0
+        print_json({"accepted": accepted, "machine": machine, "measurement": facts, "revision": done.revision, **made})
+        return done.exit_code
+    say(f"{machine}: version {table.version} from {done.measurement.name} is {table.state}")
+    for text in table.reasons:
+        say(f"  {text}")
+    return done.exit_code
+
+
+# ``volcomp recal add``, ``export-units``, ``backup`` and ``restore``: the job file, its units, the store as a whole.
+
+
+_STORE_PATH = click.Path(path_type=Path)
+
+
+@recal_command.command("export-units")
+@job_option
+@click.option("--out", required=True, metavar="DIR", type=PATH, help="Folder for the files.")
+@click.option("--program", default=None, metavar="PATH", help="The compgen command; default: the one that runs now.")
+@json_option
+def export_units_command(job: Job, out: Path, program: str | None, as_json: bool) -> int:
+    """Write systemd service and timer units and crontab lines that drive `volcomp recal run` by the job's schedules.
+
+    \b
+    Example:
+      volcomp recal export-units --out units/
+    """
+    from compgen.fleet.job import units
+    from compgen.pipeline import write_all
+
+    paths = write_all(out, units(job, program or str(Path(sys.argv[0]).absolute())))
+    if as_json:
+        print_json({"accepted": True, "paths": [str(path) for path in paths.values()]})
+    else:
+        for path in paths.values():
+            say(str(path))
+    return 0
+
+
+@recal_command.command("backup")
+@click.argument("file", type=PATH)
+@job_option
+@json_option
+def backup_command(file: Path, job: Job, as_json: bool) -> int:
+    """Write a copy of the whole store to FILE, as it is at one moment, while others may be working with it.
+
+    \b
+    Example:
+      volcomp recal backup backups/2026-06-01.sqlite
+    """
+    from compgen.fleet.store import backup
+
+    return _copied(backup(job.store, file), as_json)
+
+
+@recal_command.command("restore")
+@click.argument("file", type=PATH)
+@job_option
+@json_option
+def restore_command(file: Path, job: Job, as_json: bool) -> int:
+    """Fill the store of the job, which must be empty, from the backup FILE; the next run writes the tables again.
+
+    \b
+    Example:
+      volcomp recal restore backups/2026-06-01.sqlite --job recal.toml
+    """
+    from compgen.fleet.store import restore
+
+    return _copied(restore(file, job.store), as_json)
+
+
+def _copied(counts: dict[str, int], as_json: bool) -> int:
+    answer(
+        as_json,
+        {"accepted": True, "rows": counts},
+        ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items()),
+    )
+    return 0
+
+
+@recal_command.command("add")
+@click.argument("name")
+@click.option("--machine", required=True, metavar="MACHINE", help="Machine TOML, or the name of a machine.")
+@click.option("--inbox", required=True, metavar="DIR", help="Folder where measurements arrive.")
+@click.option(
+    "--controller", "controllers", required=True, multiple=True, metavar="NAME", help="May be given several times."
+)
+@click.option("--out", required=True, metavar="DIR", help="Folder for the tables of this machine.")
+@click.option(
+    "--measured-with",
+    required=True,
+    type=click.Choice(["active", "bare"]),
+    help="Whether the compensation stays on (active) or is switched off (bare) while the machine is measured.",
+)
+@click.option("--schedule", default=None, metavar="CRON", help="Cron expression of five fields, local time.")
+@click.option("--every-minutes", default=None, type=int, help="In place of --schedule: an interval in minutes.")
+@click.option("--approval", default=None, type=click.Choice(["manual", "auto"]), help="Default: manual.")
+@click.option("--instrument", default=None, metavar="FILE", help="Instrument TOML of six-DOF readings.")
+@click.option("--job", "job_file", default=JOB, show_default=True, type=PATH, metavar="FILE", help="Job file.")
+@json_option
+def add_command(name: str, job_file: Path, as_json: bool, controllers: tuple[str, ...], **keys: Any) -> int:
+    """Add the machine NAME to the job file, which is made if it does not exist; paths are relative to it.
+
+    \b
+    Example:
+      volcomp recal add mill-1 --machine mill-1.toml --inbox inbox --controller siemens-cec --out tables \\
+                    --measured-with bare --schedule "30 6 * * mon"
+    """
+    needed()
+    from compgen.fleet.job import add_machine
+
+    added = add_machine(job_file, name, {**keys, "controllers": list(controllers)})
+    if as_json:
+        print_json({"accepted": True, "job": str(job_file), "machine": added.name})
+    else:
+        stdout.print(f"{added.name}: added to {job_file}; `volcomp recal run --job {job_file}` reads {added.inbox}")
+    return 0
+
+
+# ``volcomp serve``: the dashboard, and who may log in.
+
+
+def _missing(error: ImportError) -> InputError:
+    return InputError(f"{error.name} is not installed; the dashboard needs: pip install 'compgen[serve]'")
+
+
+@click.group("serve", invoke_without_command=True)
+@click.option(
+    "--store", metavar="URL", help="sqlite:///FILE, a path, or postgresql://HOST/NAME; default: that of --job."
+)
+@click.option("--job", type=PATH, metavar="FILE", help="Job file whose folders follow decisions.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address on which it listens.")
+@click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535), help="Port; 0: any free one.")
+@click.option("--name", "names", multiple=True, metavar="HOST", help="Additional host name that browsers use.")
+@click.option("--decide", is_flag=True, help="Let users who are logged in approve, reject and roll back.")
+@click.option("--private", is_flag=True, help="Reading needs a login too.")
+@click.option("--behind-tls", is_flag=True, help="A proxy in front speaks HTTPS; cookies go over HTTPS only.")
+@click.option("--users", type=PATH, metavar="FILE", help="Users; default: next to the SQLite store.")
+@click.option(
+    "--metrics-token-file",
+    type=PATH,
+    metavar="FILE",
+    help="Holds the token without which /metrics is not shown.",
+)
+@click.option("--log", type=click.Choice(["auto", "json", "text"]), default="auto", help="Form of the logs on stderr.")
+@click.pass_context
+def serve_command(
+    context: click.Context,
+    store: str | None,
+    job: Path | None,
+    host: str,
+    port: int,
+    names: tuple[str, ...],
+    decide: bool,
+    private: bool,
+    behind_tls: bool,
+    users: Path | None,
+    metrics_token_file: Path | None,
+    log: str,
+) -> int:
+    """Show the fleet in a browser: history, drift, before and after of proposed tables.
+
+    It only reads, and only this computer reaches it, unless options say otherwise. Runs until SIGTERM or Ctrl-C.
+
+    \b
+    Example:
+      volcomp serve add-user meyer --users users.json
+      volcomp serve --job recal.toml --decide --users users.json
+    """
+    if context.invoked_subcommand is not None:
+        return 0
+    try:
+        from compgen.fleet import logs
+        from compgen.fleet.dashboard.server import run
+        from compgen.fleet.dashboard.settings import DashboardSettings, default_users
+    except ImportError as error:
+        raise _missing(error) from error
+    url = _store_url(store, job)
+    token = None if metrics_token_file is None else _token(metrics_token_file)
+    file = users if users is not None else default_users(url)
+    logs.configure(log)  # type: ignore[arg-type]  # one of the choices
+    run(DashboardSettings(url, host, port, names, decide, private, behind_tls, file, job, token))
+    return 0
+
+
+def _store_url(store: str | None, job: Path | None) -> str:
+    """Return the store that is meant; decisions and pages must speak of the same one."""
+    if job is None:
+        if store is None:
+            raise click.UsageError("give --store URL or --job FILE")
+        return store
+    from compgen.fleet.database import shown
+    from compgen.fleet.job import read_job
+
+    url = read_job(job).store
+    given = url if store is None else store if "://" in store else f"sqlite:///{Path(store).absolute()}"
+    if given != url:
+        raise InputError(
+            f"{shown(given)} is not the store of {job}, which is {shown(url)}; leave --store out", field="--store"
+        )
+    return url
+
+
+def _token(path: Path) -> str:
+    try:
+        token = path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", file=path) from error
+    if len(token) < 16 or not token.isascii():
+        raise InputError("expected a token of at least 16 ASCII characters", file=path)
+    return token
+
+
+def _users(users: Path | None, store: str | None) -> Users:
+    try:
+        from compgen.fleet.dashboard.settings import Users, default_users
+    except ImportError as error:
+        raise _missing(error) from error
+    file = users if users is not None else default_users(store) if store else None
+    if file is None:
+        raise click.UsageError("give --users FILE, or --store FILE of an SQLite store")
+    return Users(file)
+
+
+_users_option = click.option("--users", type=PATH, metavar="FILE", help="File of the users.")
+_store_option = click.option("--store", metavar="URL", help="SQLite store; the file of its users is next to it.")
+
+
+@serve_command.command("add-user")
+@click.argument("name")
+@_users_option
+@_store_option
+@click.option("--password-stdin", is_flag=True, help="Read the password from the first line of stdin.")
+@click.option("--reader", is_flag=True, help="The user reads what --private shows, and decides nothing.")
+def add_user(name: str, users: Path | None, store: str | None, password_stdin: bool, reader: bool) -> int:
+    """Add a user, or change password and rights, which ends the user's sessions.
+
+    The password is asked for twice and kept as an Argon2id hash only.
+
+    \b
+    Example:
+      volcomp serve add-user meyer --users users.json
+    """
+    file = _users(users, store)
+    from compgen.fleet.dashboard.settings import check_name
+
+    check_name(name)
+    if password_stdin:
+        password = sys.stdin.readline().rstrip("\r\n")
+    else:
+        password = click.prompt("Password", hide_input=True, confirmation_prompt=True, err=True)
+    new = file.add(name, password, reader=reader)
+    say(f"{name} {'is added' if new else 'has a new password'}: {file.path}")
+    return 0
+
+
+@serve_command.command("remove-user")
+@click.argument("name")
+@_users_option
+@_store_option
+def remove_user(name: str, users: Path | None, store: str | None) -> int:
+    """Remove a user; sessions of that name end at once.
+
+    \b
+    Example:
+      volcomp serve remove-user meyer --users users.json
+    """
+    file = _users(users, store)
+    file.remove(name)
+    say(f"{name} is removed: {file.path}")
+    return 0
+
+
+@serve_command.command("users")
+@_users_option
+@_store_option
+@json_option
+def list_users(users: Path | None, store: str | None, as_json: bool) -> int:
+    """List who may log in.
+
+    \b
+    Example:
+      volcomp serve users --users users.json
+    """
+    names = _users(users, store).names()
+    answer(as_json, {"users": names}, "\n".join(names) or "no users yet: nobody can log in")
+    return 0

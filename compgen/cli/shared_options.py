@@ -1,0 +1,436 @@
+"""Options that several commands share, and what they give to a command: a machine, tables, limits, workers."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import MISSING, Field, fields, is_dataclass, replace
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import click
+
+from compgen.cli.common import NUMBER, PATH, Command
+from compgen.controls import CONTROLLERS, controller_named
+from compgen.data.error_table import ErrorTable
+from compgen.data.files import read_bytes, sha256_of
+from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
+from compgen.data.messages import nearest
+from compgen.data.names import AXES
+from compgen.data.registry import why_missing
+from compgen.effects import active_effects
+from compgen.errors import CompgenWarning, InputError
+from compgen.fit import FitOptions
+from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
+from compgen.kinematics.parallel import Map, opened_workers, spread
+from compgen.plugins import with_plugins
+from compgen.tables.active import ActiveTables, keeping_others, read_active
+from compgen.tables.safety import SafetyLimits
+
+
+def path_option(name: str, text: str, *, metavar: str | None = "FILE", **how: Any) -> Callable[[Command], Command]:
+    """Add an option that takes a path."""
+    return click.option(name, metavar=metavar, type=PATH, help=text, **how)
+
+
+def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:
+    """Load a machine and check the settings of every control and the effects that its file names."""
+    machine = load_machine(name, tuple(machines))
+    for controller in machine.controllers:
+        if controller in CONTROLLERS:
+            CONTROLLERS[controller].read_settings(machine)
+        else:
+            message = f"is not a controller; {nearest(controller, CONTROLLERS)}"
+            message += why_missing("control", controller) or "; if it comes from a plug-in, add --plugin PATH"
+            raise InputError(message, file=machine.source, field=f"[controllers.{controller}]")
+    active_effects(machine)
+    return machine
+
+
+def machine_argument(command: Command) -> Command:
+    """Add MACHINE and --machines; the command receives ``machine`` as a loaded machine."""
+
+    @functools.wraps(command)
+    def wrapper(*args: Any, machine: str, machines: tuple[Path, ...], **options: Any) -> Any:
+        return command(*args, machine=open_machine(machine, machines), **options)
+
+    help_text = "Additional folder with machine files (may be given several times)."
+    option = click.option("--machines", multiple=True, type=click.Path(path_type=Path), help=help_text)
+    return click.argument("machine", metavar="MACHINE")(option(wrapper))  # type: ignore[return-value]
+
+
+def controller_option(*, multiple: bool = False) -> Callable[[Command], Command]:
+    """Add --controller NAME."""
+    text = "Name of the control; `volcomp controllers` lists them." + (
+        " May be given several times." if multiple else ""
+    )
+    return click.option("--controller", "controller", required=True, metavar="NAME", multiple=multiple, help=text)
+
+
+@contextmanager
+def mapper(workers: int, cluster: str | None) -> Iterator[Map]:
+    """Yield a ``map`` over so many processes of this machine, or over a cluster; ``map`` itself for one."""
+    found = opened_workers(workers, cluster)
+    if found is None:
+        yield map
+        return
+
+    def spread_out(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        return spread(found, with_plugins(function), items)
+
+    with closing(found):
+        yield spread_out
+
+
+# Options that are declared on the fields of a dataclass (compgen/data/declared.py).
+
+
+def options_of(
+    kind: type[Any],
+    argument: str,
+    *,
+    only: Sequence[str] = (),
+    without: Sequence[str] = (),
+    read: Mapping[str, Callable[[Any], Any]] | None = None,
+    build: Callable[..., Any] | None = None,
+) -> Callable[[Command], Command]:
+    """Add an option for each declared field of the dataclass ``kind``; the command receives ``argument``, one of it.
+
+    Parameters
+    ----------
+    only, without : the fields that become options (default: all), and those that do not.
+    read : by field, what makes the value from the text on the command line, where one is given.
+    build : makes the object from the values by field, in place of ``kind``.
+    """
+    hints = get_type_hints(kind)
+    chosen = [item for item in fields(kind) if item.name not in without and (not only or item.name in only)]
+    nested = [item.name for item in chosen if is_dataclass(hints[item.name])]
+    plain = {item.name: item for item in chosen if item.metadata and item.name not in nested}
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def wrapper(*args: Any, **options: Any) -> Any:
+            values = {name: options.pop(f"{argument}__{name}") for name in (*plain, *nested)}
+            values |= {name: not values[name] for name, item in plain.items() if item.default is True}
+            values |= {name: reader(values[name]) for name, reader in (read or {}).items() if values[name] is not None}
+            # an option that was not given leaves its field as it is by default, whatever that is
+            left = [name for name, item in plain.items() if values[name] is None and item.default is not MISSING]
+            values |= {name: plain[name].default for name in left}
+            return command(*args, **{argument: (build or kind)(**values)}, **options)
+
+        decorated: Any = wrapper
+        for name in nested:
+            decorated = options_of(hints[name], f"{argument}__{name}")(decorated)
+        for name, item in reversed(plain.items()):
+            decorated = click.option(option_name(item), f"{argument}__{name}", **_how(item, hints[name]))(decorated)
+        return decorated  # type: ignore[no-any-return]
+
+    return decorate
+
+
+def option_name(item: Field[Any]) -> str:
+    """Return the name of the option that a field of an options dataclass becomes."""
+    return item.metadata["name"] or f"--{item.name.replace('_', '-')}"
+
+
+def _how(item: Field[Any], hint: Any) -> dict[str, Any]:
+    """How click reads an option: the type of the field, its default and what was declared say it."""
+    declared, text = item.metadata, item.metadata["text"]
+    kind = (
+        next(part for part in get_args(hint) if part is not NoneType)
+        if get_origin(hint) in (Union, UnionType)
+        else hint
+    )
+    if kind is bool:  # a field that is True by default has an option that denies it
+        return {"is_flag": True, "help": text}
+    how: dict[str, Any] = {"metavar": declared["metavar"], "help": text}
+    if get_origin(kind) is Mapping:
+        number = get_args(kind)[1] is float
+        return {**how, "multiple": True, "callback": functools.partial(_pairs, number=number)}
+    choices = declared["choices"] or (get_args(kind) if get_origin(kind) is Literal else ())
+    if get_origin(kind) in (tuple, Sequence):
+        how["multiple"] = declared["metavar"] != "NAME,..."
+    elif choices:
+        how["type"] = click.Choice(choices, case_sensitive=choices != AXES)
+    elif kind in (float, int):
+        how["type"] = NUMBER if declared["within"] is None else click.IntRange(*declared["within"])
+    if item.default not in (None, (), MISSING):
+        shown = f"{item.default:g}" if isinstance(item.default, float) else str(item.default)
+        how |= {"default": shown, "help": f"{text} Default: {shown}."}
+    return how
+
+
+def _pairs(
+    context: click.Context, parameter: click.Parameter, given: Sequence[str], *, number: bool
+) -> dict[str, str] | dict[str, float]:
+    """Read NAME=VALUE, given any number of times; a VALUE alone, where the help allows one, belongs to "value"."""
+    option, form = parameter.opts[0], str(parameter.metavar)
+    found: dict[str, str] = {}
+    for text in given:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if form.startswith("[") and not equals:
+            name, value = "value", name
+        if not (name and value):
+            example = ", for example EXX=20" if number else ""
+            raise InputError(f"{text!r} is not of the form {form}{example}", field=option)
+        if name in found:
+            raise InputError(f"{name} is given twice; give it once", field=option)
+        found[name] = value
+    return {name: _number(option, name, value) for name, value in found.items()} if number else found
+
+
+def _number(option: str, name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{text!r} for {name} is not a number; give one above 0", field=option) from None
+
+
+def _positive(step_um: float) -> float:
+    if not step_um > 0.0:
+        raise InputError(f"--max-step-um is {step_um:g}; expected a number of um above zero")
+    return step_um
+
+
+#: The options of an identification: noise of the readings, inputs that they share, and the method.
+identify_options = options_of(
+    IdentifyOptions, "options", read={"stations": lambda given: given if given == "nominal" else read_stations(given)}
+)
+
+
+#: Smoothness, bounds and loss of the fit; the command receives ``fitting``.
+fitting_options = options_of(
+    FitOptions,
+    "fitting",
+    build=lambda robust, **bounds: FitOptions.from_file_units(*bounds.values(), robust=robust),
+)
+
+
+#: --max-step-um; the command receives ``limits``.
+limits_option = options_of(SafetyLimits, "limits", read={"max_step_um": _positive})
+
+
+# Where the fit and the verification find the covariance of an errors file.
+
+
+def covariance_options(command: Command) -> Command:
+    """Add --covariance and --independent."""
+    text = "Covariance of ERRORS (default: the file that it names, if that belongs to it)."
+    none = click.option("--independent", is_flag=True, help="Use no covariance: u_value, node by node.")
+    return path_option("--covariance", text)(none(command))
+
+
+def covariance_of(errors: Path, table: ErrorTable, given: Path | None, *, independent: bool) -> Covariance | None:
+    """Return the covariance of an errors file: the one given, else the one that it names, else None.
+
+    A file that belongs to other errors is not used, with a warning.
+    """
+    if independent:
+        if given is not None:
+            raise InputError("--covariance cannot be combined with --independent; give one of them")
+        return None
+    if given is not None:
+        return read_covariance(given, errors)
+    name = table.metadata.get("covariance")
+    beside = errors.parent / name if name else None
+    if beside is None or not beside.is_file():
+        return None
+    found = read_covariance(beside)
+    if found.errors_sha256 == sha256_of(read_bytes(errors)):
+        return found
+    warnings.warn(
+        f"{beside} belongs to another version of {errors.name}; u_value is used instead, independent from node to node",
+        CompgenWarning,
+        stacklevel=2,
+    )
+    return None
+
+
+# Options that say where tables have to be best: the work zone, and the tools.
+
+
+def emphasis_options(command: Command) -> Command:
+    """Add --zone, --zone-weight and --tools; they override the machine file. Below machine_argument."""
+
+    @functools.wraps(command)
+    def wrapper(
+        *args: Any,
+        machine: Machine,
+        zone: str | None,
+        zone_weight: float | None,
+        tools: tuple[str, ...],
+        **options: Any,
+    ) -> Any:
+        return command(*args, machine=emphasised(machine, zone, zone_weight, tools), **options)
+
+    zone_option = click.option(
+        "--zone",
+        metavar="RANGES",
+        help="Work zone (mm) that counts more, e.g. X=-400:0,Y=100:300; default: work_zone_mm of the machine file.",
+    )
+    weight_option = click.option(
+        "--zone-weight",
+        metavar="W",
+        type=click.FloatRange(1.0, MOST_ZONE_WEIGHT),
+        help=f"How much more a coordinate in it counts, default {ZONE_WEIGHT:g}; {MOST_ZONE_WEIGHT:g}: the zone all but alone.",
+    )
+    tools_option = click.option(
+        "--tools",
+        metavar="X,Y,Z",
+        multiple=True,
+        help="Tool offset (mm) that the tables have to suit; several times for several tools, which count alike.",
+    )
+    return zone_option(weight_option(tools_option(wrapper)))  # type: ignore[return-value]
+
+
+def emphasised(machine: Machine, zone: str | None, zone_weight: float | None, tools: tuple[str, ...]) -> Machine:
+    """Return the machine with the work zone and tools of the command line, where they are given."""
+    known = machine.emphasis
+    zone_mm = known.zone_mm if zone is None else zone_of(zone, [axis.range_mm for axis in machine.axes])
+    if zone_weight is not None and not any(zone_mm):
+        raise InputError("--zone-weight needs a work zone; add --zone, or work_zone_mm to the machine file")
+    weight = known.zone_weight if zone_weight is None else zone_weight
+    tools_mm = tuple(tool_offset("--tools", text) for text in tools) or known.tools_mm
+    return replace(machine, emphasis=Emphasis(zone_mm, weight, tools_mm))
+
+
+def tool_offset(option: str, text: str) -> Vector3:
+    """Read a tool offset X,Y,Z in mm."""
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = float("nan")
+    if not all(abs(part) < 1e6 for part in (x, y, z)):
+        message = f"{text[:40]!r} is not a tool offset; expected three numbers in mm, e.g. 0,0,-150"
+        raise InputError(message, field=option)
+    return x, y, z
+
+
+# Options about tables that were active while the machine was measured, and about steps of tables.
+
+
+def active_options(*names: str) -> Callable[[Command], Command]:
+    """Add --active and --active-controller (and ``names`` for it); the command receives ``active``, tables or None."""
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def wrapper(
+            *args: Any, machine: Machine, active: tuple[Path, ...], active_controller: str | None, **options: Any
+        ) -> Any:
+            target = options.get("controller")
+            tables = _active(machine, active, active_controller, target)
+            if tables is not None:
+                machine = keeping_others(machine, _names(target), tables)
+            return command(*args, machine=machine, active=tables, **options)
+
+        help_text = (
+            "Table file that was active while the machine was measured (may be given several times): its effect is "
+        )
+        help_text += "taken out, and the new table takes its place."
+        option = path_option("--active", help_text, multiple=True)(wrapper)
+        text = "Name of the control that the active tables belong to; default: the one that --controller names."
+        named = click.option("--active-controller", *names, "active_controller", metavar="NAME", help=text)
+        return named(option)  # type: ignore[return-value]
+
+    return decorate
+
+
+def _names(target: Any) -> list[str]:
+    """Names of the controls that are written."""
+    return [target] if isinstance(target, str) else list(dict.fromkeys(target or ()))
+
+
+def _active(machine: Machine, paths: tuple[Path, ...], name: str | None, target: Any) -> ActiveTables | None:
+    if not paths:
+        if name is not None:
+            raise InputError("--active-controller needs --active FILE")
+        return None
+    targets = _names(target)
+    if name is None and len(targets) != 1:
+        raise InputError("--active: which control do the tables belong to? Add --active-controller NAME")
+    return read_active(machine, paths, name or targets[0])
+
+
+# Options that name a file of the user's own control, whose style or empty tables the export follows.
+
+
+_SAMPLES = {
+    "style_from": "A file of your own control (may be given several times, e.g. parameters and pitch data): the export follows "
+    "its style, and keeps the points and parameters that it shows, those of other axes above all.",
+    "template_from": "An empty table saved on your own control; the export fills in its values.",
+}
+
+
+def sample_options(command: Command) -> Command:
+    """Add --style-from and --template-from, which override the machine file. Below machine_argument."""
+
+    @functools.wraps(command)
+    def wrapper(
+        *args: Any,
+        machine: Machine,
+        controller: str | tuple[str, ...],
+        style_from: tuple[Path, ...],
+        template_from: Path | None,
+        **options: Any,
+    ) -> Any:
+        names = (controller,) if isinstance(controller, str) else controller
+        changed = with_samples(machine, names, {"style_from": style_from, "template_from": template_from})
+        return command(*args, machine=changed, controller=controller, **options)
+
+    result: Any = wrapper
+    for key, text in _SAMPLES.items():
+        result = path_option("--" + key.replace("_", "-"), text, multiple=key == "style_from")(result)
+    return result  # type: ignore[no-any-return]
+
+
+def with_samples(
+    machine: Machine, controllers: Sequence[str], samples: Mapping[str, Path | Sequence[Path] | None]
+) -> Machine:
+    """Return the machine with the sample files in the settings of the chosen controls that take them.
+
+    Raises InputError for a file that does not exist, and for one that none of the controls takes.
+    """
+    for key, given in samples.items():
+        paths = [given] if isinstance(given, Path) else list(given or ())
+        if not paths:
+            continue
+        flag = "--" + key.replace("_", "-")
+        for path in paths:
+            if not path.is_file():
+                raise InputError(f"{flag}: no such file", file=path)
+        taking = [name for name in controllers if controller_named(name).sample_setting == key]
+        if not taking:
+            known = sorted(name for name, control in CONTROLLERS.items() if control.sample_setting == key)
+            raise InputError(f"{flag} is for {', '.join(known) or 'no control'}, not for {', '.join(controllers)}")
+        for name in taking:
+            names = [str(path.resolve()) for path in paths]
+            machine = machine.with_setting(name, key, names if len(names) > 1 else names[0])
+    return machine
+
+
+# Options of one meaning everywhere.
+
+
+instrument_option = path_option(
+    "--instrument", "Constants and set-up of a six-DOF laser instrument (TOML), for *.sixdof.csv files."
+)
+templates_option = path_option("--templates", "Folder of your own templates, searched first.", metavar="DIR")
+unverified_option = click.option(
+    "--allow-unverified", is_flag=True, help="Export formats that no public document fully describes."
+)
+reversal_option = path_option(
+    "--reversal",
+    "*.reversal.csv (um): what each axis does differently in its two directions; becomes tables of one direction "
+    "(default: backlash and lost motion of the machine file).",
+)
+points_option = path_option("--points", "*.points.csv (mm); default: a grid over the volume.")
+explain_option = click.option(
+    "--explain",
+    is_flag=True,
+    help="Write explain.md: what the table corrects, what stays and why, what the next option would buy, limits used.",
+)
+measurements_argument = click.argument("measurements", nargs=-1, required=True, type=PATH)
+errors_argument = click.argument("errors", type=PATH)

@@ -1,1 +1,0 @@
-"""HEIDENHAIN TNC: .COM/.CMA tables (heidenhain-com), KinematicsComp as a draft (heidenhain-kinematics)."""

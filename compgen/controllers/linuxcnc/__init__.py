@@ -1,1 +1,0 @@
-"""LinuxCNC: COMP_FILE per joint (linuxcnc-comp), kinematics component with a lattice (linuxcnc-volumetric)."""

@@ -1,1 +1,0 @@
-"""Mitsubishi: memory type relative position error (mitsubishi)."""

@@ -1,1 +1,0 @@
-"""Neutral samples of the correction as CSV and JSON (neutral)."""

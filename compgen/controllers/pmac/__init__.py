@@ -1,1 +1,0 @@
-"""Omron PMAC: compensation tables of one and two dimensions (pmac)."""

@@ -1,1 +1,0 @@
-"""Siemens SINUMERIK: spindle/encoder error (siemens-eec), cross errors (siemens-cec), both (siemens-cec-eec)."""

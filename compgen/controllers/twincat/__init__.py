@@ -1,1 +1,0 @@
-"""Beckhoff TwinCAT: position and cross compensation lists (twincat-lists)."""

@@ -1,0 +1,742 @@
+"""FANUC three-dimensional error compensation (``fanuc-3d``): a grid of vertices with trilinear interpolation."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from itertools import permutations
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.controls.fanuc_records import (
+    FanucStyle,
+    Punched,
+    Record,
+    frame_of,
+    punched_file,
+    read_records,
+    spacing_of,
+    type_word,
+    width_of,
+)
+from compgen.controls.shared.base import (
+    Controller,
+    SourceFile,
+    Term,
+    Usage,
+    coverage_violations,
+    nodes_by_axis,
+    plan_contradictions,
+)
+from compgen.controls.shared.grids import STEP_QUANTUM, EquidistantGrid, equidistant_grid, take_loss_mm, trilinear
+from compgen.controls.shared.terms import one_dimensional_terms, product_terms
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray, fixed
+from compgen.data.error_table import ErrorTable
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.messages import one_line
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import InputError
+from compgen.kinematics.first_order import tool_of
+
+# Records of three-dimensional compensation data as a file punched from the user's own control shows them.
+#
+# No public document describes that file. What can be told from a sample is taken over: how records look, and in which
+# number the first point stands. In which order the points come cannot be told; ``order`` in the machine file says it.
+
+
+#: Parameters of the function: axes, points per axis, number of the reference point, magnification, interval.
+PARAMETERS = range(10800, 10815)
+#: Words of a record behind its number and type word, and what such a file does with the three values of a point.
+FORMS = {"APAPAP": "axis words", "XYZ": "axis letters", "P": "a record per value"}
+
+
+@dataclass(frozen=True)
+class VolumeStyle:
+    """Style of the records, one of :data:`FORMS`, number of the first record, whether parameters stand beside them."""
+
+    style: FanucStyle
+    form: str
+    first: int
+    with_parameters: bool
+    notes: tuple[str, ...]
+
+    def records(self, axis_numbers: Sequence[int], values: Sequence[Sequence[int]]) -> list[str]:
+        """Return the records of points in their order, from (x, y, z) values in counts."""
+        found, number = [], self.first
+        for point in values:
+            texts = [self.style.whole(value) for value in point]
+            if self.form == "P":
+                rows = [[f"P{text}"] for text in texts]
+            elif self.form == "XYZ":
+                rows = [[f"{letter}{text}" for letter, text in zip(AXES, texts, strict=True)]]
+            else:
+                pairs = sorted(zip(axis_numbers, texts, strict=True))
+                rows = [[word for axis, text in pairs for word in (f"A{axis}", f"P{text}")]]
+            for row in rows:
+                found.append(self.style.record(number, row, 0, point=True))
+                number += 1
+        return found
+
+
+def read_volume_style(path: Path) -> VolumeStyle:
+    """Return the style of punched three-dimensional data; InputError with the line for what is not understood."""
+    return volume_style_of(punched_file(path))
+
+
+def volume_style_of(file: SourceFile) -> VolumeStyle:
+    """Return the style of punched data from their text; see :func:`read_volume_style`."""
+    records = list(read_records(file))
+    parameters, data = parted(records)
+    if not data:
+        raise file.fail("holds no compensation data; punch the table of three-dimensional compensation", 1)
+    form = form_of(data[0])
+    for before, record in zip(data, data[1:], strict=False):
+        if form_of(record) != form:
+            raise record.fail(f"its words differ from those of line {data[0].line}; the style is not clear")
+        if record.number != before.number + 1:
+            raise record.fail(f"does not follow N{before.number}; expected the records of one table, in their order")
+    style = spacing_of(frame_of(file, records, data), data)
+    texts = [text for record in data for letter, text in record.words() if letter in "PXYZ"]
+    padded = [text.lstrip("+-").rstrip(".") for text in texts]
+    style = replace(
+        style,
+        point_digits=width_of(data, 5),
+        digits=width_of(parameters, 5),
+        whole_point=all(text.endswith(".") for text in texts),
+        plus=any(text.startswith("+") for text in texts),
+        zeros=max((len(text) for text in padded if len(text) > 1 and text[0] == "0"), default=0),
+    )
+    notes = (
+        f"records of the form {FORMS[form]}, the first is N{data[0].number}, {len(data)} of them",
+        f"parameters {'stand' if parameters else 'do not stand'} in the same file",
+        "the order of the points cannot be told from the sample; `order` in the machine file says it",
+    )
+    return VolumeStyle(style, form, data[0].number, bool(parameters), notes)
+
+
+def parted(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
+    """Split records into parameters 10800 ... 10814 and data, whose numbers may run through those as well.
+
+    A record of type Q1 is a parameter, one of type Q0 is data. Without type words a number of that range is data if
+    the records of the numbers before and behind the range are there too.
+    """
+    numbers = {record.number for record in records}
+    through = {PARAMETERS[0] - 1, PARAMETERS[-1] + 1} <= numbers
+    found: tuple[list[Record], list[Record]] = ([], [])
+    for record in records:
+        kind, _ = type_word(record, record.words())
+        parameter = record.number in PARAMETERS and (kind == 1 or (kind is None and not through))
+        found[0 if parameter else 1].append(record)
+    return found
+
+
+def form_of(record: Record) -> str:
+    """Return which of :data:`FORMS` a record has; InputError for another one."""
+    _, words = type_word(record, record.words())
+    form = "".join(letter for letter, _ in words)
+    if form not in FORMS:
+        raise record.fail(f"words {form or 'none'} are not understood; expected A1P..A2P..A3P.., X..Y..Z.. or P..")
+    for letter, text in words:
+        record.whole(text, 1 if letter == "A" else -10_000_000, 10_000_000)
+    return form
+
+
+# Settings of ``[controllers.fanuc-3d]``: counts, the grid and its limits, the style of the user's own control.
+
+
+#: Smallest step of positions and intervals in the files.
+QUANTUM_MM = Decimal("0.0001")
+
+
+@dataclass(frozen=True)
+class VolumeSettings:
+    """Settings of three-dimensional error compensation.
+
+    Parameters
+    ----------
+    detection_unit_um, magnification : one count of the table of X, Y, Z is their product.
+    stores : whether the values are the correction (added to the command) or the error.
+    interval_mm : distance of the vertices of X, Y, Z, None: chosen.
+    loss_mm : loss by interpolation between vertices that is worth no further ones.
+    most_points, most_in_all : largest number of vertices of an axis, and altogether.
+    value_low, value_high : range of a value, counts.
+    order : axes in the order of the point numbers, the one that runs fastest first.
+    axis_numbers : controlled axis numbers of X, Y, Z.
+    sample : style of a file punched from the user's control, None: none was given.
+    """
+
+    detection_unit_um: float
+    magnification: tuple[int, int, int]
+    stores: Literal["correction", "error"]
+    interval_mm: tuple[float | None, float | None, float | None]
+    loss_mm: float
+    most_points: int
+    most_in_all: int
+    value_low: int
+    value_high: int
+    order: tuple[int, int, int]
+    axis_numbers: tuple[int, int, int]
+    sample: VolumeStyle | None
+
+    @property
+    def sign(self) -> int:
+        """+1 if the values are the correction, -1 if they are the error."""
+        return 1 if self.stores == "correction" else -1
+
+    def count_mm(self, axis: int) -> float:
+        """One count of the values of an axis, mm."""
+        return self.magnification[axis] * self.detection_unit_um * MM_PER_UM
+
+
+def read_volume_settings(machine: Machine) -> VolumeSettings:
+    """Read and check ``[controllers.fanuc-3d]``; every key has a default."""
+    section = machine.controller_settings("fanuc-3d")
+    sample = section.file("style_from")
+    stores = section.take("stores", toml_files.choice("correction", "error"), "correction")
+    settings = VolumeSettings(
+        detection_unit_um=section.take("detection_unit_um", toml_files.positive, 1.0),
+        magnification=_per_axis(section.section("magnification", required=False), toml_files.whole(1, 100), (1, 1, 1)),
+        stores="correction" if stores == "correction" else "error",
+        interval_mm=_per_axis(section.section("interval_mm", required=False), _interval, (None, None, None)),
+        loss_mm=take_loss_mm(section),
+        most_points=section.take("most_points", toml_files.whole(2, 1000), 25),
+        most_in_all=section.take("most_in_all", toml_files.whole(8, 50_000), 15625),
+        value_low=section.take("value_low", toml_files.whole(-32768, -1), -128),
+        value_high=section.take("value_high", toml_files.whole(1, 32767), 127),
+        order=section.take("order", _order, (0, 1, 2)),
+        axis_numbers=_per_axis(section.section("axis_numbers", required=False), toml_files.whole(1, 99), (1, 2, 3)),
+        sample=None if sample is None else read_volume_style(sample),
+    )
+    if len(set(settings.axis_numbers)) < 3:
+        raise section.fail("axis_numbers", f"{settings.axis_numbers} gives two axes the same number")
+    section.finish()
+    return settings
+
+
+def _per_axis(section: toml_files.Section, check: Callable[[Any], Any], default: tuple[Any, Any, Any]) -> Any:
+    values = tuple(section.take(axis, check, value) for axis, value in zip(AXES, default, strict=True))
+    section.finish()
+    return values
+
+
+def _interval(value: Any) -> float:
+    """A positive length that can be written."""
+    length = toml_files.positive(value)
+    if Decimal(repr(length)) % QUANTUM_MM:
+        raise ValueError(f"a multiple of {QUANTUM_MM} mm is expected")
+    return length
+
+
+def _order(value: Any) -> tuple[int, int, int]:
+    """One of the six orders of X, Y, Z."""
+    word = toml_files.choice(*("".join(order) for order in permutations(AXES)))(value)
+    x, y, z = (AXES.index(letter) for letter in word)
+    return x, y, z
+
+
+# Numbers of three-dimensional error compensation: a regular grid of vertices with three values each, and its files.
+#
+# Point numbers count from 1; the axis that ``order`` names first runs fastest.
+
+
+COLUMNS = "point,x_mm,y_mm,z_mm,x_counts,y_counts,z_counts"
+#: No table is as long as this, nor any value beyond this.
+MOST_CHARACTERS, MOST_ROWS, MOST_VALUE = 8_000_000, 50_000, 1_000_000
+_ROW = re.compile(
+    r"(\d{1,6}),(-?\d{1,6}(?:\.\d{1,6})?),(-?\d{1,6}(?:\.\d{1,6})?),(-?\d{1,6}(?:\.\d{1,6})?)((?:,-?\d{1,7}){3})"
+)
+_KEY = re.compile(r"#\s{0,9}([a-z_]{1,40})\s{0,9}=\s{0,9}([^\s].{0,300})")
+
+
+@dataclass(frozen=True)
+class VolumeTable:
+    """``counts`` (nx, ny, nz, 3) at the vertices of three grids in machine coordinates; one count per ``magnification``."""
+
+    grids: tuple[EquidistantGrid, EquidistantGrid, EquidistantGrid]
+    counts: NDArray[np.int64]
+    magnification: tuple[int, int, int]
+
+    def __eq__(self, other: object) -> bool:
+        """Compare numbers by value."""
+        if not isinstance(other, VolumeTable):
+            return NotImplemented
+        same = self.magnification == other.magnification and self.counts.shape == other.counts.shape
+        places = [(g.start, g.count, g.step if g.count > 1 else 0) for g in self.grids]
+        return (
+            same
+            and places == [(g.start, g.count, g.step if g.count > 1 else 0) for g in other.grids]
+            and bool(np.array_equal(self.counts, other.counts))
+        )
+
+    @property
+    def start_mm(self) -> FloatArray:
+        """Position of the first vertex, shape (3,)."""
+        return np.array([float(grid.start) for grid in self.grids])
+
+    @property
+    def step_mm(self) -> FloatArray:
+        """Distances of the vertices, shape (3,)."""
+        return np.array([float(grid.step) for grid in self.grids])
+
+    def numbered(self, order: Sequence[int]) -> Iterator[tuple[int, tuple[int, int, int]]]:
+        """Yield (point number, vertex index) in the order of the numbers."""
+        shape = tuple(self.counts.shape[axis] for axis in order)
+        for number in range(int(np.prod(shape))):
+            index, rest = [0, 0, 0], number
+            for axis, size in zip(order, shape, strict=True):
+                index[axis], rest = rest % size, rest // size
+            yield number + 1, (index[0], index[1], index[2])
+
+
+Row = tuple[int, tuple[Decimal, Decimal, Decimal], tuple[int, int, int], int]
+
+
+def _rows(file: SourceFile) -> tuple[dict[str, tuple[str, int]], list[Row]]:
+    """Return the ``# key = value`` comments and the rows of the file."""
+    keys: dict[str, tuple[str, int]] = {}
+    rows: list[Row] = []
+    header = False
+    for line, text in enumerate(file.text.splitlines(), start=1):
+        bare = text.strip(" \t\ufeff")
+        if bare.startswith("#"):
+            key = _KEY.fullmatch(bare)
+            if key is not None:
+                keys[key[1]] = key[2], line
+        elif not header and bare:
+            if bare != COLUMNS:
+                raise file.fail(f"expected the header {COLUMNS}, found {one_line(bare[:60])!r}", line)
+            header = True
+        elif bare:
+            rows.append(_row(file, bare, line))
+            if len(rows) > MOST_ROWS:
+                raise file.fail(f"holds more than {MOST_ROWS} rows; that is no table", line)
+    if not rows:
+        raise file.fail("holds no vertex", len(file.text.splitlines()) or 1)
+    declared = keys.get("rows", ("none", 1))
+    if declared[0] != str(len(rows)):
+        raise file.fail(f"declares {one_line(declared[0])} rows but holds {len(rows)}: is it truncated?", declared[1])
+    if not file.text.endswith(("\n", "\r")):
+        raise file.fail("the last line has no line end: the file is truncated", rows[-1][3])
+    return keys, rows
+
+
+def _row(file: SourceFile, text: str, line: int) -> Row:
+    found = _ROW.fullmatch(text) if len(text) < 200 else None
+    if found is None:
+        what = one_line(text[:60])
+        raise file.fail(f"{what!r} is not a row of point number, three positions and three whole counts", line)
+    x, y, z = (Decimal(found[k]) for k in (2, 3, 4))
+    p, q, r = (int(value) for value in found[5].split(",")[1:])
+    return int(found[1]), (x, y, z), (p, q, r), line
+
+
+def _grid_of_positions(file: SourceFile, axis: int, positions: list[Decimal]) -> EquidistantGrid:
+    if len(positions) < 2:
+        raise file.fail(f"has one position of {AXES[axis]}; expected at least two")
+    step = positions[1] - positions[0]
+    if any(after - before != step for before, after in zip(positions, positions[1:], strict=False)):
+        raise file.fail(f"the positions of {AXES[axis]} are not evenly spaced")
+    return EquidistantGrid(positions[0], step, len(positions))
+
+
+def _magnification(file: SourceFile, keys: dict[str, tuple[str, int]]) -> tuple[int, int, int]:
+    text, line = keys.get("magnification", ("", None))
+    if not re.fullmatch(r"\d{1,3} \d{1,3} \d{1,3}", text):
+        raise file.fail("the line '# magnification = 1 1 1' (of X, Y and Z) is missing or wrong", line)
+    x, y, z = map(int, text.split())
+    return x, y, z
+
+
+# What the templates of three-dimensional compensation show: vertices, plan, what to set, worked numbers.
+
+
+MEANINGS = ("axis", "vertices along", "number of the reference vertex of", "magnification of", "interval of, mm,")
+
+
+def _place(table: VolumeTable, index: tuple[int, int, int]) -> str:
+    return ",".join(f"{grid.start + k * grid.step:.4f}" for grid, k in zip(table.grids, index, strict=True))
+
+
+# FANUC three-dimensional error compensation: a grid of vertices over X, Y, Z with trilinear interpolation.
+#
+# The formula is documented, the file is not: the grid is written as a neutral CSV and as a JSON plan, and as records only
+# in the style of a file that was punched from the user's own control. See ``templates/fanuc-3d/format.toml``.
+
+
+class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
+    """Corrections of X, Y and Z at the vertices of a grid, zero at the vertex of the reference point."""
+
+    name = "fanuc-3d"
+    anchored = True
+    sample_setting = "style_from"
+
+    @classmethod
+    def read_settings(cls, machine: Machine) -> VolumeSettings:
+        """Check ``[controllers.fanuc-3d]``."""
+        return read_volume_settings(machine)
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return curves of one axis, alone and times the coordinate of another; a trilinear grid holds them exactly.
+
+        Their nodes are the vertices. All vanish at the reference point, one of the vertices.
+        """
+        machine = self.machine
+        nodes = [
+            equidistant_grid(
+                machine,
+                errors,
+                axis,
+                most=self.settings.most_points,
+                step_mm=self.settings.interval_mm[axis],
+                anchor=True,
+                loss_mm=self.settings.loss_mm,
+            ).nodes_mm
+            for axis in range(3)
+        ]
+        origin = machine.reference_point_mm
+        pairs = [(output, axis) for output in range(3) for axis in range(3)]
+        single = one_dimensional_terms(machine, errors, nodes, pairs, anchored=True, lever_origin_mm=origin)
+        return single + product_terms(machine, errors, nodes, origin)
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> VolumeTable:
+        """Round the field at every vertex.
+
+        Trilinear interpolation is a weighted mean of the corners of a box, so that no point is off by more than a
+        vertex: half a count. No other whole numbers stay within half a count at every vertex.
+        """
+        nodes = [next(term.nodes_mm for term in basis if term.axis == axis) for axis in range(3)]
+        position = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+        tool = tool_of(self.machine, None)
+        field = np.zeros_like(position)
+        for term in basis:
+            field += term.carrier_field(position, tool) * term.curve(values[term.name], position)[:, None]
+        count_mm = np.array([self.settings.count_mm(axis) for axis in range(3)])
+        counts = np.floor(self.settings.sign * field / count_mm + 0.5).astype(np.int64)
+        shape = (len(nodes[0]), len(nodes[1]), len(nodes[2]), 3)
+        grids = [self._grid_of_nodes(axis, nodes[axis]) for axis in range(3)]
+        return VolumeTable((grids[0], grids[1], grids[2]), counts.reshape(shape), self.settings.magnification)
+
+    def context(self, tables: VolumeTable) -> dict[str, Any]:
+        """Return the vertices, the plan point number -> values, what to set, and the statement of the sign."""
+        settings = self.settings
+        vertices = [(number, index, tables.counts[index].tolist()) for number, index in tables.numbered(settings.order)]
+        parameters = self._parameters(tables)
+        sample = settings.sample
+        return {
+            "sign_statement": self._sign_statement(tables),
+            "parameters": [
+                {
+                    "name": str(number),
+                    "value": text,
+                    "meaning": f"{MEANINGS[k // 3]} {AXES[k % 3]} (number unverified)",
+                }
+                for k, (number, text) in enumerate(parameters.items())
+            ],
+            "warnings": self._warnings(),
+            "overwrites": [
+                "Of other axes: nothing, if the numbers below are right. The table of three-dimensional compensation that the "
+                "control has for its axes is lost as a whole.",
+                f"Parameters {', '.join(map(str, parameters))}",
+                f"Points 1 to {len(vertices)}, three values each",
+            ],
+            "settings": settings,
+            "order": "".join(AXES[axis] for axis in settings.order),
+            "magnification": " ".join(map(str, tables.magnification)),
+            "columns": COLUMNS,
+            "vertices": [
+                {"number": number, "place": _place(tables, index), "values": ",".join(map(str, values))}
+                for number, index, values in vertices
+            ],
+            "grids": [
+                {
+                    "axis": AXES[axis],
+                    "count": grid.count,
+                    "first": fixed(float(grid.start), 4),
+                    "last": fixed(float(grid.last), 4),
+                    "step": fixed(float(grid.step), 4),
+                    "low": int(tables.counts[..., axis].min()),
+                    "high": int(tables.counts[..., axis].max()),
+                }
+                for axis, grid in enumerate(tables.grids)
+            ],
+            "plan": {
+                "parameters": parameters,
+                "points": {number: values for number, _, values in vertices},
+                "stores": settings.stores,
+                "detection_unit_um": settings.detection_unit_um,
+            },
+            "style_notes": list(sample.notes) if sample else [],
+            "has_sample": sample is not None,
+            "container": "records" if sample is not None else "grid",
+            "file": self._punched(parameters, [values for _, _, values in vertices]),
+            "check": self._check(tables),
+        }
+
+    def parse(self, files: Sequence[SourceFile]) -> VolumeTable:
+        """Read the neutral CSV; records beside it in the style of the control must hold the same; a plan is passed over."""
+        texts = [file for file in files if file.path.suffix.lower() == ".csv"]
+        punched = [file for file in files if file.path.suffix.lower() not in (".csv", ".json")]
+        if len(texts) > 1:
+            raise texts[1].fail("is a second table; give one")
+        table = self._read_csv(texts[0]) if texts else None
+        for file in punched:
+            read = self._read_records(file, table)
+            if table is not None and not np.array_equal(read.counts, table.counts):
+                place = tuple(int(k) for k in np.argwhere(np.any(read.counts != table.counts, axis=3))[0])
+                raise file.fail(
+                    f"vertex {place} has {read.counts[place].tolist()}, the CSV {table.counts[place].tolist()}"
+                )
+            table = read
+        if table is None:
+            raise InputError(
+                "no table is given; VOLUME.csv (or a punched file with parameters 10800 to 10814) is needed"
+            )
+        return table
+
+    def contradictions(self, tables: VolumeTable, files: Sequence[SourceFile]) -> list[str]:
+        """Say where a plan beside the text differs from it."""
+        return plan_contradictions(files, lambda: self.context(tables)["plan"])
+
+    def emulate(self, tables: VolumeTable, points: Points) -> FloatArray:
+        """Return sign * count * trilinear value, that of the grid's surface outside."""
+        count_mm = np.array(tables.magnification) * self.settings.count_mm(0) / self.settings.magnification[0]
+        value = trilinear(tables.counts.astype(np.float64), tables.start_mm, tables.step_mm, points.position_mm)
+        return np.asarray(self.settings.sign * count_mm * value)
+
+    def violations(self, tables: VolumeTable) -> list[str]:
+        """Return values out of range, too many vertices, and travel that the grid leaves out."""
+        settings = self.settings
+        messages = []
+        for axis, grid in enumerate(tables.grids):
+            low, high = int(tables.counts[..., axis].min()), int(tables.counts[..., axis].max())
+            if low < settings.value_low or high > settings.value_high:
+                needed = int(
+                    np.ceil(tables.magnification[axis] * max(low / settings.value_low, high / settings.value_high))
+                )
+                messages.append(
+                    f"the values of {AXES[axis]} go from {low} to {high}, the range is {settings.value_low} to "
+                    f"{settings.value_high}; set magnification.{AXES[axis]} = {needed} or more (coarser counts)"
+                )
+            if grid.count > settings.most_points:
+                messages.append(
+                    f"{grid.count} vertices along {AXES[axis]}, at most {settings.most_points} are possible"
+                )
+            first, last = float(grid.start), float(grid.last)
+            messages += coverage_violations(self.machine, axis, first, last, "the grid")
+        total = int(np.prod(tables.counts.shape[:3]))
+        if total > settings.most_in_all:
+            messages.append(f"{total} vertices, at most {settings.most_in_all} are possible")
+        return messages
+
+    def table_nodes_mm(self, tables: VolumeTable) -> tuple[FloatArray, ...]:
+        """Return the vertices along each axis."""
+        return nodes_by_axis((axis, grid.nodes_mm) for axis, grid in enumerate(tables.grids))
+
+    def usage(self, tables: VolumeTable) -> list[Usage]:
+        """Return values and vertices against their limits; none of these is stated by a public document."""
+        settings = self.settings
+        total = int(np.prod(tables.counts.shape[:3]))
+        found = [Usage("vertices", total, settings.most_in_all, "points", stated=False)]
+        for axis, grid in enumerate(tables.grids):
+            low, high = int(tables.counts[..., axis].min()), int(tables.counts[..., axis].max())
+            share = max(low / settings.value_low, high / settings.value_high, 0.0) * settings.value_high
+            found.append(Usage(f"value of {AXES[axis]}", share, settings.value_high, "counts", stated=False))
+            found.append(
+                Usage(f"vertices along {AXES[axis]}", grid.count, settings.most_points, "points", stated=False)
+            )
+        return found
+
+    def resolution_mm(self) -> float:
+        """Return half a count, see :meth:`build`."""
+        return 0.5 * max(self.settings.count_mm(axis) for axis in range(3))
+
+    def _read_csv(self, file: SourceFile) -> VolumeTable:
+        if len(file.text) > MOST_CHARACTERS:
+            raise file.fail(f"holds {len(file.text)} characters; that is no table (at most {MOST_CHARACTERS})")
+        keys, rows = _rows(file)
+        grids = tuple(_grid_of_positions(file, axis, sorted({row[1][axis] for row in rows})) for axis in range(3))
+        shape = tuple(grid.count for grid in grids)
+        if len(rows) != int(np.prod(shape)):
+            raise file.fail(
+                f"{len(rows)} vertices do not fill a grid of {' x '.join(map(str, shape))}: is it truncated?"
+            )
+        counts = np.zeros((*shape, 3), dtype=np.int64)
+        seen: dict[Any, int] = {}
+        for number, position, values, line in rows:
+            index = tuple(int((position[k] - grids[k].start) / grids[k].step) for k in range(3))
+            for what in (number, index):
+                if what in seen:
+                    raise file.fail(
+                        f"point {number} or its position is given a second time (first in line {seen[what]})", line
+                    )
+                seen[what] = line
+            counts[index] = values
+        table = VolumeTable((grids[0], grids[1], grids[2]), counts, _magnification(file, keys))
+        by_number = {row[0]: row for row in rows}
+        for number, place in table.numbered(self.settings.order):
+            due = tuple(grids[k].start + place[k] * grids[k].step for k in range(3))
+            if number not in by_number:
+                raise file.fail(f"point {number} is missing")
+            if by_number[number][1] != due:
+                order = "".join(AXES[k] for k in self.settings.order)
+                raise file.fail(f"point {number} does not stand where order = {order!r} has it", by_number[number][3])
+        return table
+
+    def _read_records(self, file: SourceFile, beside: VolumeTable | None) -> VolumeTable:
+        """Read records in the style of the control; the grid is that of parameters 10803 ... 10814, else of the CSV."""
+        own, data = parted(list(read_records(file)))
+        parameters: dict[int, tuple[str, Record]] = {}
+        for record in own:
+            _, words = type_word(record, record.words())
+            if len(words) != 1 or words[0][0] != "P":
+                raise record.fail("expected a single value word P, e.g. P11")
+            if record.number in parameters:
+                raise record.fail(f"is given a second time (first in line {parameters[record.number][1].line})")
+            parameters[record.number] = words[0][1], record
+        shape = self._frame(file, parameters) if parameters else beside
+        if shape is None:
+            raise file.fail("holds no parameters 10800 to 10814; give VOLUME.csv as well, which has the grid")
+        values = self._values(file, data)
+        size = int(np.prod(shape.counts.shape[:3]))
+        if len(values) != size:
+            raise file.fail(
+                f"holds {len(values)} points, the grid has {size}: is it truncated?", data[-1].line if data else 1
+            )
+        counts = np.zeros(shape.counts.shape, dtype=np.int64)
+        for number, index in shape.numbered(self.settings.order):
+            counts[index] = values[number - 1]
+        return VolumeTable(shape.grids, counts, shape.magnification)
+
+    def _frame(self, file: SourceFile, parameters: dict[int, tuple[str, Record]]) -> VolumeTable:
+        """Empty table of the grid that the parameters describe."""
+        missing = [str(number) for number in PARAMETERS if number not in parameters]
+        if missing:
+            raise file.fail(f"parameter {', '.join(missing)} is missing")
+
+        def whole(number: int, low: int, high: int) -> int:
+            text, record = parameters[number]
+            return record.whole(text, low, high)
+
+        grids, magnification = [], []
+        for axis in range(3):
+            count = whole(10803 + axis, 2, 1000)
+            reference = whole(10806 + axis, 1, count)
+            text, record = parameters[10812 + axis]
+            step = Decimal(text)
+            if not 0 < step < 100000:
+                raise record.fail(f"the interval {text} mm is not possible")
+            start = Decimal(repr(self.machine.reference_point_mm[axis])) - (reference - 1) * step
+            grids.append(EquidistantGrid(start, step, count))
+            magnification.append(whole(10809 + axis, 1, 100))
+        counts = np.zeros((*(grid.count for grid in grids), 3), dtype=np.int64)
+        return VolumeTable(
+            (grids[0], grids[1], grids[2]), counts, (magnification[0], magnification[1], magnification[2])
+        )
+
+    def _values(self, file: SourceFile, data: Sequence[Record]) -> list[list[int]]:
+        """Three values of each point, in the order of the records' numbers."""
+        settings = self.settings
+        found: list[list[int]] = []
+        before: Record | None = None
+        for record in sorted(data, key=lambda item: item.number):
+            if before is not None and record.number != before.number + 1:
+                same = record.number == before.number
+                raise record.fail(
+                    f"is given a second time (first in line {before.line})" if same else "a number before it is missing"
+                )
+            before, form = record, form_of(record)
+            _, words = type_word(record, record.words())
+            texts = [(letter, text) for letter, text in words]
+            if form == "APAPAP":
+                pairs = {int(Decimal(a[1])): p[1] for a, p in zip(texts[::2], texts[1::2], strict=True)}
+                if sorted(pairs) != sorted(settings.axis_numbers):
+                    raise record.fail(f"has the axes {sorted(pairs)}; expected {sorted(settings.axis_numbers)}")
+                texts = [("P", pairs[number]) for number in settings.axis_numbers]
+            numbers = [record.whole(text, -MOST_VALUE, MOST_VALUE) for _, text in texts]
+            if form == "P" and found and len(found[-1]) < 3:
+                found[-1] += numbers
+            else:
+                found.append(numbers)
+        if not found or len(found[-1]) != 3:
+            raise file.fail("holds no complete point: is it truncated?", data[-1].line if data else 1)
+        return found
+
+    def _parameters(self, table: VolumeTable) -> dict[int, str]:
+        """Parameters 10800 ... 10814 as text."""
+        reference = [
+            round((self.machine.reference_point_mm[axis] - float(grid.start)) / float(grid.step)) + 1
+            for axis, grid in enumerate(table.grids)
+        ]
+        texts = [
+            *map(str, self.settings.axis_numbers),
+            *(str(grid.count) for grid in table.grids),
+            *map(str, reference),
+            *map(str, table.magnification),
+            *(f"{grid.step:.4f}" for grid in table.grids),
+        ]
+        return dict(zip(PARAMETERS, texts, strict=True))
+
+    def _punched(self, parameters: dict[int, str], values: list[list[int]]) -> Punched | None:
+        """Text in the style of the sample, None without one."""
+        sample = self.settings.sample
+        if sample is None:
+            return None
+        records = [sample.style.record(number, [f"P{text}"], 1) for number, text in parameters.items()]
+        return Punched(
+            sample.style.file(
+                records if sample.with_parameters else [], sample.records(self.settings.axis_numbers, values)
+            )
+        )
+
+    def _sign_statement(self, table: VolumeTable) -> str:
+        settings = self.settings
+        stored = "the correction, which the control is taken to add" if settings.stores == "correction" else "the error"
+        place = tuple(int(k) for k in np.unravel_index(int(np.argmax(np.abs(table.counts))), table.counts.shape))
+        index, axis = (place[0], place[1], place[2]), place[3]
+        value = int(table.counts[place])
+        moved = settings.sign * value * table.magnification[axis] * settings.detection_unit_um
+        at = _place(table, index).replace(",", ", ")
+        return (
+            f"The values are {stored}; one count is magnification times {settings.detection_unit_um:g} um. At the vertex X, Y, Z "
+            f"= {at} mm the value {value:+d} of {AXES[axis]} moves {AXES[axis]} by {moved:+g} um. Between vertices trilinear, "
+            "outside the grid held (assumed)."
+        )
+
+    def _warnings(self) -> list[str]:
+        found = [
+            "Sign, order of the points, parameter numbers and what lies outside the grid are not settled by public documents: "
+            "check single vertices first (part 3), and read the applied compensation back (FOCAS cnc_rdvolccomp).",
+            "These files replace stored pitch error and straightness compensation: X, Y and Z must not be corrected twice.",
+        ]
+        if self.settings.sample is not None:
+            found.append("The style was taken from the sample: " + "; ".join(self.settings.sample.notes) + ".")
+        return found
+
+    def _check(self, table: VolumeTable) -> dict[str, Any]:
+        """A trial: one value at the farthest vertex of each axis from the reference vertex, what must be seen there."""
+        counts = 10
+        last = (table.counts.shape[0] - 1, 0, 0)
+        numbers = {index: number for number, index in table.numbered(self.settings.order)}
+        return {
+            "number": numbers[last],
+            "place": _place(table, last).replace(",", ", "),
+            "counts": counts,
+            "change_um": self.settings.sign * counts * table.magnification[0] * self.settings.detection_unit_um,
+            "second": numbers[0, table.counts.shape[1] - 1, 0],
+            "second_place": _place(table, (0, table.counts.shape[1] - 1, 0)).replace(",", ", "),
+        }
+
+    def _grid_of_nodes(self, axis: int, nodes_mm: FloatArray) -> EquidistantGrid:
+        """Exact grid of nodes (n,), one of them at the reference point."""
+        length = Decimal(repr(round(float(nodes_mm[-1] - nodes_mm[0]), 9)))
+        step = (length / (len(nodes_mm) - 1)).quantize(STEP_QUANTUM)
+        reference = self.machine.reference_point_mm[axis]
+        below = int(np.argmin(np.abs(nodes_mm - reference)))
+        return EquidistantGrid(Decimal(repr(reference)) - below * step, step, len(nodes_mm))

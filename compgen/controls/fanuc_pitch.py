@@ -1,0 +1,741 @@
+"""FANUC stored pitch error compensation (``fanuc-pitch``): positioning in whole increments per section of travel."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from decimal import ROUND_CEILING, Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.controls.fanuc_pitch_tables import (
+    AT_REFERENCE,
+    INTERVAL,
+    MOST_MISSED,
+    NEGATIVE_FIRST,
+    PARAMETERS,
+    PitchBlock,
+    PitchSettings,
+    PitchShortfall,
+    PitchTables,
+    RequestedPitch,
+    parse_pitch,
+    pitch_usage,
+    pitch_violations,
+    read_pitch_settings,
+    shortfall_text,
+)
+from compgen.controls.fanuc_records import PointGrid, Punched, Sample, as_sample
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis, plan_contradictions
+from compgen.controls.shared.grids import (
+    EquidistantGrid,
+    common_step,
+    curve_nodes_mm,
+    equidistant_grid,
+    nearly_best,
+    worth_mm,
+)
+from compgen.controls.shared.integers import IntegerCurve, best_integers, lowest_free, section_weights
+from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
+from compgen.data.csv_files import FloatArray, fixed
+from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import CompgenWarning
+
+# Section length of pitch compensation: the widest one that loses nothing and keeps every increment small enough.
+
+
+#: The final curve may be steeper than the estimate by this factor: angular errors are spread over the volume.
+STEEPER = 1.1
+#: Loss by interpolation, in counts, that the rounding to whole counts hides.
+NEGLIGIBLE_COUNTS = 0.05
+
+
+def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, axis: int) -> EquidistantGrid:
+    """Return the section ends of an axis, the reference point among them.
+
+    Points that the sample of the control shows are kept: their section ends are taken as they are. The user's interval
+    is taken as it is. Otherwise the fewest sections are taken with which linear interpolation of the wanted correction
+    loses nothing that matters and every increment, with a margin, stays within the limit (one count with a staircase),
+    as far as the point numbers of this axis and the least interval permit.
+    """
+    kept = settings.kept[axis]
+    if kept is not None:
+        lowest = kept.first if settings.total else kept.first - 1
+        start = Decimal(repr(machine.reference_point_mm[axis])) + (lowest - kept.reference) * kept.interval_mm
+        return EquidistantGrid(start, kept.interval_mm, kept.last - lowest + 1)
+    most = max(3, (settings.last_number - settings.first_number + 1) // 3)
+    asked_mm = settings.interval_mm[axis]
+    if asked_mm is not None:
+        return equidistant_grid(machine, errors, axis, most=most, step_mm=asked_mm, anchor=True)
+    nodes_mm = curve_nodes_mm(machine, errors, axis, most)
+    wanted_mm = _wanted_mm(machine, errors, axis, nodes_mm)
+    loss_mm = max(worth_mm(errors, axis, settings.loss_mm), NEGLIGIBLE_COUNTS * settings.count_mm(axis))
+    flat: list[tuple[float, EquidistantGrid]] = []
+    grids = _grids(machine, settings, errors, axis, most)
+    for grid in grids:
+        at_ends_mm = _extended(grid.nodes_mm, nodes_mm, wanted_mm)
+        if _is_flat(settings, axis, at_ends_mm):
+            lost_mm = float(np.max(np.abs(np.interp(nodes_mm, grid.nodes_mm, at_ends_mm) - wanted_mm)))
+            flat.append((lost_mm, grid))
+            if lost_mm <= loss_mm:
+                return grid
+    return nearly_best(flat) or grids[-1]
+
+
+def _grids(
+    machine: Machine, settings: PitchSettings, errors: ErrorTable, axis: int, most: int
+) -> list[EquidistantGrid]:
+    """Possible section ends by their number; the widest sections alone if none keeps within ``most``."""
+    common = common_step(machine, errors, axis, anchor=True)
+    steps = {_step_mm(machine, settings, axis, intervals) for intervals in range(1, most)}
+    parts = [common / part for part in range(1, 11)]
+    steps |= {
+        float(step) for step in parts if step >= settings.least_interval_mm and step % settings.interval_quantum_mm == 0
+    }
+    count_most = machine.axes[axis].length_mm / most
+    grids = [
+        equidistant_grid(machine, errors, axis, most=most, step_mm=step, anchor=True)
+        for step in steps
+        if step > count_most
+    ]
+    grids = sorted(grids, key=lambda grid: (grid.count, grid.step))
+    return [grid for grid in grids if grid.count <= most] or grids[:1]
+
+
+def _wanted_mm(machine: Machine, errors: ErrorTable, axis: int, nodes_mm: FloatArray) -> FloatArray:
+    """Correction of the axis by its own positioning error and by angular errors mid-volume, at nodes (n,), mm."""
+    (term,) = one_dimensional_terms(machine, errors, [nodes_mm] * 3, [(axis, axis)])
+    return term.start
+
+
+def _step_mm(machine: Machine, settings: PitchSettings, axis: int, intervals: int) -> float:
+    """Travel over ``intervals``, rounded up to what can be written, not below the least interval."""
+    quantum = settings.interval_quantum_mm
+    length = max(machine.axes[axis].length_mm / intervals, settings.least_interval_mm)
+    steps = Decimal(repr(round(length, 9))) / quantum
+    return float(max(Decimal(1), steps.to_integral_value(rounding=ROUND_CEILING)) * quantum)
+
+
+def _is_flat(settings: PitchSettings, axis: int, at_ends_mm: FloatArray) -> bool:
+    """Whether the increments of a correction at the section ends (n,), with a margin, stay within the limit."""
+    largest = float(np.max(np.abs(np.diff(at_ends_mm)))) / settings.count_mm(axis)
+    if settings.interpolation == "staircase":
+        return largest <= 1.0
+    return STEEPER * largest + 1.0 <= settings.increment_limit
+
+
+def _extended(position_mm: FloatArray, nodes_mm: FloatArray, value: FloatArray) -> FloatArray:
+    """Interpolate linearly at positions (m,), the first and the last piece prolonged beyond the nodes (n,)."""
+    inner = np.interp(position_mm, nodes_mm, value)
+    below = np.minimum(position_mm - nodes_mm[0], 0.0) * (value[1] - value[0]) / (nodes_mm[1] - nodes_mm[0])
+    above = np.maximum(position_mm - nodes_mm[-1], 0.0) * (value[-1] - value[-2]) / (nodes_mm[-1] - nodes_mm[-2])
+    return np.asarray(inner + below + above, dtype=np.float64)
+
+
+# From wanted curves to the numbers of stored pitch error compensation: best whole numbers, and a place for each block.
+#
+# Bi-directional: with the reversal B (position reached in positive minus in negative direction) the tool stands at +B/2
+# after positive travel, so the correction is the mean one minus B/2 there, and plus B/2 after negative travel. The curve of
+# the direction of the reference return is zero at the reference point, the other one has parameter 3627 there.
+
+
+Span = tuple[int, int]
+
+
+def reference_node(machine: Machine, axis: int, nodes_mm: FloatArray) -> int:
+    """Return the index of the section end at the reference point."""
+    return int(np.argmin(np.abs(nodes_mm - machine.reference_point_mm[axis])))
+
+
+def _renumbered(shortfall: PitchShortfall, block: PitchBlock | None) -> PitchShortfall:
+    """Point numbers in place of the sections' counts, which begin with 0."""
+    assert block is not None
+    return replace(shortfall, sections=tuple(int(block.curve_numbers[k + 1]) for k in shortfall.sections))
+
+
+def _block(
+    machine: Machine, settings: PitchSettings, axis: int, wanted: RequestedPitch, reversal: ReversalCurves | None
+) -> tuple[PitchBlock, list[PitchShortfall]]:
+    """Table of one axis with numbers from 0, and what the limit of the steps costs it."""
+    nodes_mm = wanted.nodes_mm
+    below = reference_node(machine, axis, nodes_mm)
+    half = np.zeros(len(nodes_mm))
+    curve = None if reversal is None else reversal.curves.get((axis, axis))
+    if settings.bidirectional and curve is not None and np.max(np.abs(curve.value)) >= WORTH_MM:
+        half = 0.5 * settings.sign * curve.at(nodes_mm) / settings.count_mm(axis)
+    towards = settings.reference_return[axis]
+    both = {1: wanted.counts - half, -1: wanted.counts + half}
+    home = both[towards][below]
+    both = {way: part - home for way, part in both.items()}
+    at_reference = int(np.floor(both[-towards][below] + 0.5))
+    both[-towards] = both[-towards] - at_reference
+    ways = (1, -1) if settings.bidirectional else (1,)
+    best = {way: _best(machine, settings, axis, nodes_mm, both[way]) for way in ways}
+    limited = [PitchShortfall(axis, item.largest, item.full_sections) for item in best.values() if item.limited]
+    keep = settings.kept[axis] is not None
+    interval = Decimal(repr(round(float(nodes_mm[-1] - nodes_mm[0]), 9))) / (len(nodes_mm) - 1)
+    block = PitchBlock(
+        reference=below if settings.total else below - 1 if keep else max(below - 1, 0),
+        first=0,
+        values=_stored(settings, best[1], below, keep),
+        total=settings.total,
+        magnification=settings.magnifications[axis],
+        interval_mm=Decimal(f"{interval.quantize(settings.interval_quantum_mm).normalize():f}"),
+        negative=_stored(settings, best[-1], below, keep) if settings.bidirectional else (),
+        at_reference=at_reference if settings.bidirectional else 0,
+    )
+    return block, limited[:1]
+
+
+def _best(
+    machine: Machine, settings: PitchSettings, axis: int, nodes_mm: FloatArray, wanted: FloatArray
+) -> IntegerCurve:
+    emphasis = machine.emphasis
+    sections = section_weights(nodes_mm, machine.axes[axis].range_mm, emphasis.zone_mm[axis], emphasis.zone_weight)
+    return best_integers(wanted, sections, reference_node(machine, axis, nodes_mm), settings.increment_limit)
+
+
+def _stored(settings: PitchSettings, best: IntegerCurve, below: int, keep: bool) -> tuple[int, ...]:
+    """Numbers as stored; unless the sample has other points, the reference number is among them without travel below it."""
+    if settings.total:
+        return tuple(int(value) for value in best.counts)
+    steps = np.diff(best.counts, prepend=[0]) if below == 0 and not keep else np.diff(best.counts)
+    return tuple(int(value) for value in steps)
+
+
+def _placed(settings: PitchSettings, blocks: Sequence[PitchBlock | None]) -> list[PitchBlock | None]:
+    """Give every block its numbers: those of the sample, those that the user fixed, else the lowest that are free.
+
+    Numbers that the sample shows in use by another axis are never taken; InputError where fixed ones would be.
+    """
+    sample, kept = settings.sample, settings.kept
+    taken: list[Span] = [*settings.reserved, *(span for _, span in sample.others(0))]
+    firsts: dict[int, int] = {}
+    present = {axis: block for axis, block in enumerate(blocks) if block is not None}
+    for axis in sorted(present, key=lambda k: kept[k] is None and settings.first_numbers[k] is None):
+        count, grid, fixed = len(present[axis].values), kept[axis], settings.first_numbers[axis]
+        start = fixed if grid is None else grid.first
+        firsts[axis] = lowest_free(taken, settings.first_number, count) if start is None else start
+        sample.check_free(settings.axis_numbers[axis], AXES[axis], firsts[axis], firsts[axis] + count - 1)
+        taken.append((firsts[axis], firsts[axis] + count - 1))
+    placed: list[PitchBlock | None] = [None, None, None]
+    for axis, block in present.items():
+        first, negative = firsts[axis], 0
+        if block.negative:
+            own = sample.axes.get(settings.axis_numbers[axis])
+            shown = own.negative_first if own is not None and kept[axis] is not None else None
+            count = len(block.negative)
+            negative = lowest_free(taken, settings.negative_first_number, count) if shown is None else shown
+            sample.check_free(settings.axis_numbers[axis], AXES[axis], negative, negative + count - 1)
+            taken.append((negative, negative + count - 1))
+        placed[axis] = replace(block, reference=block.reference + first, first=first, negative_first=negative)
+    return placed
+
+
+def pitch_points(machine: Machine) -> tuple[PointGrid | None, ...]:
+    """Return the points that every fanuc-pitch export of this machine file gives X, Y and Z; None where errors decide.
+
+    Points are known whatever the errors are where a sample shows them, or interval and first number are stated; the first
+    number follows if the intervals of all axes are stated.
+    """
+    if "fanuc-pitch" not in machine.controllers:
+        return (None, None, None)
+    settings = read_pitch_settings(machine)
+    known = [settings.kept[axis] is not None or settings.interval_mm[axis] is not None for axis in range(3)]
+    blocks: list[PitchBlock | None] = []
+    for axis in range(3):
+        nodes_mm = pitch_grid(machine, settings, ErrorTable({}), axis).nodes_mm if known[axis] else np.zeros(0)
+        wanted = RequestedPitch(nodes_mm, np.zeros(len(nodes_mm)))
+        blocks.append(_block(machine, settings, axis, wanted, None)[0] if known[axis] else None)
+    fixed = [settings.kept[axis] is not None or settings.first_numbers[axis] is not None for axis in range(3)]
+    return tuple(
+        PointGrid(block.reference, block.first, block.last, block.interval_mm)
+        if block is not None and (all(known) or fixed[axis])
+        else None
+        for axis, block in enumerate(_placed(settings, blocks))
+    )
+
+
+# What the templates of stored pitch error compensation show: records, plan, parameters to set, worked numbers.
+
+
+MEANINGS = (
+    "point number at the reference point",
+    "farthest point number on the negative side",
+    "farthest point number on the positive side",
+    "magnification",
+    "interval",
+    "farthest point number on the negative side for travel in negative direction",
+    "value at the reference point when it is reached against the direction of the reference return",
+)
+
+
+def _change(sample: Sample, parameter: int, axis: int, text: str) -> str:
+    """A parameter with its value, and that of the sample if it is another one."""
+    old = sample.parameters.get((parameter, axis))
+    same = old is None or Decimal(old[0]) == Decimal(text)
+    return f"{parameter} = {text}" if same else f"{parameter} = {text} (sample: {old[0] if old else ''})"
+
+
+# FANUC stored pitch error compensation: positioning of X, Y and Z, whole-number increments per section of travel.
+#
+# What the control is taken to do, and how sure that is, stands in ``templates/fanuc-pitch/format.toml``.
+
+
+class FanucPitch(Controller[PitchSettings, PitchTables]):
+    """Tables X(x), Y(y), Z(z) as numbers of counts, zero at the reference point."""
+
+    name = "fanuc-pitch"
+    anchored = True
+    bidirectional = True
+    sample_setting = "style_from"
+
+    @classmethod
+    def read_settings(cls, machine: Machine) -> PitchSettings:
+        """Check ``[controllers.fanuc-pitch]``."""
+        return read_pitch_settings(machine)
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return one table per axis whose nodes are the section ends, the reference point one of them."""
+        nodes = [pitch_grid(self.machine, self.settings, errors, axis).nodes_mm for axis in range(3)]
+        return one_dimensional_terms(self.machine, errors, nodes, [(axis, axis) for axis in range(3)], anchored=True)
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> PitchTables:
+        """Find the best whole cumulative curves within the limit, and give the axes consecutive point numbers."""
+        return self._tables_of(self._wanted_curves(basis, values))
+
+    def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
+        """Return the reversal of each axis along itself if ``bidirectional`` is set, else none."""
+        along = {key: curve for key, curve in reversal.curves.items() if key[0] == key[1]}
+        return ReversalCurves(along if self.settings.bidirectional else {})
+
+    def with_reversal(self, tables: PitchTables, reversal: ReversalCurves) -> PitchTables:
+        """Return the tables of both directions, each the best whole numbers for its own curve."""
+        return self._tables_of(tables.wanted, reversal)
+
+    def context(self, tables: PitchTables) -> dict[str, Any]:
+        """Return the context beyond the common one; ``plan`` holds point number -> value for a binary transfer."""
+        settings = self.settings
+        present = [(axis, block) for axis, block in enumerate(tables.blocks) if block is not None]
+        records = self._records(present)
+        punched = self._punched(present)
+        points = {number: value for _, block in present for number, value in block.points()}
+        return {
+            "sign_statement": self._sign_statement(),
+            "parameters": self._preflight_parameters(present),
+            "warnings": [
+                *self._warnings(present),
+                *(shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts <= MOST_MISSED),
+            ],
+            "tables": [self._summary(axis, block) for axis, block in present],
+            "style": settings,
+            "records": records,
+            "file": punched,
+            "parameter_file": self._parameter_file(present),
+            "container": "separate" if settings.sample.points_style is not None else "one file",
+            "separate": settings.sample.points_style is not None,
+            "overwrites": self._overwrites(present),
+            "has_sample": settings.sample.shows_points,
+            "style_notes": list(settings.style_notes),
+            "bidirectional": settings.bidirectional,
+            "points": [{"number": settings.number_base + number, "value": value} for number, value in points.items()],
+            "plan": {
+                "parameters": {record["number"]: {a["axis"]: a["value"] for a in record["axes"]} for record in records},
+                "points": points,
+                "value_type": settings.value_type,
+                "bidirectional": settings.bidirectional,
+                "stores": settings.stores,
+                "detection_unit_um": settings.detection_unit_um,
+            },
+            "check": self._check(*present[0]) if present else None,
+        }
+
+    def parse(self, files: Sequence[SourceFile]) -> PitchTables:
+        """Read parameters 3620 ... 3624 and the points they name; a ``.json`` plan is passed over."""
+        return parse_pitch(self.settings, files)
+
+    def contradictions(self, tables: PitchTables, files: Sequence[SourceFile]) -> list[str]:
+        """Say where a plan beside the text differs from it."""
+        return plan_contradictions(files, lambda: self.context(tables)["plan"])
+
+    def remarks(self, tables: PitchTables, files: Sequence[SourceFile]) -> list[str]:
+        """Say which unit was assumed, which axes were kept apart, and how many records were passed over."""
+        return list(tables.remarks)
+
+    def emulate(self, tables: PitchTables, points: Points) -> FloatArray:
+        """Return sign * count * A at each point, A held beyond the first and the last section end."""
+        added = np.zeros((len(points), 3))
+        unknown = []
+        for axis, block in enumerate(tables.blocks):
+            if block is None:
+                continue
+            along = points.position_mm[:, axis] - self.machine.reference_point_mm[axis]
+            count_mm = block.magnification * self.settings.detection_unit_um * MM_PER_UM
+            up, down = (
+                self._output(block, curve, along) for curve in block.curves(self.settings.reference_return[axis])
+            )
+            travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, axis])
+            counts = np.where(travel > 0, up, np.where(travel < 0, down, 0.5 * (up + down)))
+            added[:, axis] = self.settings.sign * count_mm * counts
+            if np.any((travel == 0) & (up != down)):
+                unknown.append(AXES[axis])
+        if unknown:
+            message = (
+                f"the tables of {', '.join(unknown)} differ between the directions of travel, and some points do not say "
+                "from where they were approached: there the mean is taken; give approach_x, approach_y, approach_z"
+            )
+            warnings.warn(message, CompgenWarning, stacklevel=2)
+        return added
+
+    def violations(self, tables: PitchTables) -> list[str]:
+        """Return broken limits: change per section, 16 bits, point numbers, overlaps, interval, travel left out."""
+        return pitch_violations(self.machine, self.settings, tables)
+
+    def table_nodes_mm(self, tables: PitchTables) -> tuple[FloatArray, ...]:
+        """Return the section ends of each axis."""
+        blocks = ((axis, block) for axis, block in enumerate(tables.blocks) if block is not None)
+        return nodes_by_axis((axis, self.machine.reference_point_mm[axis] + block.curve_mm) for axis, block in blocks)
+
+    def backlash_parameters(self, reversal: ReversalCurves) -> list[dict[str, str]]:
+        """Return parameters 1851 and 1852 for the mean reversal of each axis along itself, in detection units.
+
+        Source: parameter manuals B-63090EN p. 97, B-64120EN p. 116: added in the direction of movement, -9999 to +9999;
+        an axis that stops short (reversal value below zero) gets a positive value.
+        """
+        settings = self.settings
+        meanings = {
+            1851: "backlash compensation in detection units: minus the mean reversal value; these tables act in both "
+            "directions alike. If a value was active while the machine was measured, add this one to it",
+            1852: "the same in rapid traverse, if the control keeps it apart (1800#4, RBK = 1)",
+        }
+        return [
+            {
+                "name": f"{number} ({AXES[axis]}, A{settings.axis_numbers[axis]})",
+                "value": str(round(-reversal.mean_mm(axis) / (settings.detection_unit_um * MM_PER_UM))),
+                "meaning": meaning,
+            }
+            for axis in range(3)
+            for number, meaning in meanings.items()
+            if abs(reversal.mean_mm(axis)) >= WORTH_MM
+        ]
+
+    def usage(self, tables: PitchTables) -> list[Usage]:
+        """Return change per section, point numbers and interval against their limits."""
+        return pitch_usage(self.settings, tables)
+
+    def keeping_others(self, tables: PitchTables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
+        """Return ``style_from`` with these files if they show points of other axes."""
+        return as_sample(self.machine, files, ("fanuc-pitch", "fanuc-straightness")) if tables.others else {}
+
+    def resolution_mm(self) -> float:
+        """Return half a count: the bound of :mod:`compgen.controls.shared.integers` where the limit does not bind."""
+        return 0.5 * max(self.settings.count_mm(axis) for axis in range(3))
+
+    def _wanted_curves(
+        self, basis: Sequence[Term], values: Mapping[str, FloatArray]
+    ) -> tuple[RequestedPitch | None, RequestedPitch | None, RequestedPitch | None]:
+        """Return for X, Y, Z the wanted cumulative curve at the section ends in counts, zero at the reference point."""
+        terms = {term.name: term for term in basis}
+        found: list[RequestedPitch | None] = [None, None, None]
+        for axis in range(3):
+            name = one_dimensional_name(axis, axis)
+            if name in terms:
+                nodes_mm = terms[name].nodes_mm
+                curve = np.asarray(values[name], dtype=np.float64)
+                below = reference_node(self.machine, axis, nodes_mm)
+                found[axis] = RequestedPitch(
+                    nodes_mm, self.settings.sign * (curve - curve[below]) / self.settings.count_mm(axis)
+                )
+        return found[0], found[1], found[2]
+
+    def _tables_of(
+        self,
+        wanted: tuple[RequestedPitch | None, RequestedPitch | None, RequestedPitch | None],
+        reversal: ReversalCurves | None = None,
+    ) -> PitchTables:
+        """Return the best whole tables for wanted curves, with the reversal of each axis along itself, and their numbers."""
+        blocks: list[PitchBlock | None] = [None, None, None]
+        shortfalls: list[PitchShortfall] = []
+        for axis, curve in enumerate(wanted):
+            if curve is not None:
+                blocks[axis], limited = _block(self.machine, self.settings, axis, curve, reversal)
+                shortfalls += limited
+        placed = _placed(self.settings, blocks)
+        numbered = [_renumbered(item, placed[item.axis]) for item in shortfalls]
+        return PitchTables((placed[0], placed[1], placed[2]), shortfalls=tuple(numbered), wanted=wanted)
+
+    def _interval_text(self, interval_mm: Decimal) -> str:
+        """Interval as it is written, e.g. ``50.0``, or a whole number of the machine file's unit."""
+        real = self.settings.style.real_point
+        return self.settings.style.length(interval_mm if real else interval_mm / self.settings.interval_quantum_mm)
+
+    def _parameter_values(self, block: PitchBlock) -> tuple[str, ...]:
+        whole = self.settings.style.whole
+        numbers = (block.reference, block.first, block.last, block.magnification)
+        found = (*map(whole, numbers), self._interval_text(block.interval_mm))
+        return (
+            (*found, whole(block.negative_first), whole(block.at_reference)) if self.settings.bidirectional else found
+        )
+
+    def _numbers(self) -> tuple[int, ...]:
+        return (*PARAMETERS, NEGATIVE_FIRST, AT_REFERENCE) if self.settings.bidirectional else PARAMETERS
+
+    def _parameter_records(self, present: list[tuple[int, PitchBlock]]) -> list[str]:
+        style, parameters = self.settings.style, []
+        columns = [(self.settings.axis_numbers[axis], self._parameter_values(block)) for axis, block in present]
+        for k, number in enumerate(self._numbers()):
+            letter = style.real_letter if number == INTERVAL else "P"
+            parameters += style.parameter(number, [(axis, values[k]) for axis, values in columns], letter)
+        return parameters if present else []
+
+    def _punched(self, present: list[tuple[int, PitchBlock]]) -> Punched:
+        """Text of the file in its style: parameters by number unless they have a file of their own, points by number."""
+        style, separate = self.settings.style, self.settings.sample.points_style
+        points = [
+            (separate or style).point(*pair) for pair in sorted(pair for _, block in present for pair in block.points())
+        ]
+        if separate is not None:
+            return Punched(separate.file([], points))
+        return Punched(style.file(self._parameter_records(present), points))
+
+    def _parameter_file(self, present: list[tuple[int, PitchBlock]]) -> Punched | None:
+        """Text of the file of the parameters, where the sample has parameters and points in files of their own."""
+        if self.settings.sample.points_style is None:
+            return None
+        return Punched(self.settings.style.file(self._parameter_records(present), []))
+
+    def _overwrites(self, present: list[tuple[int, PitchBlock]]) -> list[str]:
+        """Say what the files overwrite, other axes first."""
+        settings = self.settings
+        sample, written = settings.sample, [settings.axis_numbers[axis] for axis, _ in present]
+        others = [
+            f"A{number}: points {low} to {high}"
+            for number, axis in sample.axes.items()
+            if number not in written
+            for low, high in axis.spans
+        ]
+        if sample.shows_points:
+            told = (
+                f"The sample has {'; '.join(others)}; they stay."
+                if others
+                else "No other axis of the sample has points."
+            )
+            found = [f"Of other axes: nothing. {told}"]
+        else:
+            given = (
+                "the sample has no parameters 3620 to 3622"
+                if settings.style_notes
+                else "no file of this control was given"
+            )
+            found = [
+                f"Of other axes: NOT KNOWN, {given} (`--style-from`). An axis whose 3621 to 3622 meet the points below loses its "
+                "table."
+            ]
+        for axis, block in present:
+            number, name = settings.axis_numbers[axis], f"{AXES[axis]} (A{settings.axis_numbers[axis]})"
+            values = zip(self._numbers(), self._parameter_values(block), strict=True)
+            found.append(f"Parameters of {name}: " + ", ".join(_change(sample, p, number, text) for p, text in values))
+            spans = [(block.first, block.last)]
+            if block.negative:
+                spans.append((block.negative_first, block.negative_first + len(block.negative) - 1))
+            texts = [
+                f"{low} to {high} (N{settings.number_base + low} to N{settings.number_base + high})"
+                for low, high in spans
+            ]
+            old = {key: sample.values[key] for key, _ in block.points() if key in sample.values}
+            changed = sum(1 for key, value in block.points() if key in old and old[key] != value)
+            told = f"; {changed} of them differ from the sample" if old else ""
+            found.append(f"Points of {name}: {' and '.join(texts)}{told}")
+        return found
+
+    def _records(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, Any]]:
+        """Parameters 3620 ... in order, each with its axes in ascending axis number, values as text."""
+        columns = sorted((self.settings.axis_numbers[axis], self._parameter_values(block)) for axis, block in present)
+        return [
+            {"number": parameter, "axes": [{"axis": number, "value": values[k]} for number, values in columns]}
+            for k, parameter in enumerate(self._numbers())
+        ]
+
+    def _preflight_parameters(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:
+        settings = self.settings
+        rows = [
+            {"name": f"{number} ({AXES[axis]}, A{settings.axis_numbers[axis]})", "value": value, "meaning": meaning}
+            for axis, block in present
+            for number, value, meaning in zip(self._numbers(), self._parameter_values(block), MEANINGS, strict=False)
+        ]
+        linear = settings.interpolation == "linear"
+        rows += [
+            {
+                "name": "3605#0",
+                "value": str(int(settings.bidirectional)),
+                "meaning": f"bi-directional pitch compensation {'on' if settings.bidirectional else 'off'}, for X, Y and Z",
+            },
+            {
+                "name": "3602#0 (APE)",
+                "value": "total" if settings.total else "incremental",
+                "meaning": "type of the values; which bit value means which is to be read in the parameter manual",
+            },
+            {
+                "name": "3605, interpolated type",
+                "value": "on" if linear else "off",
+                "meaning": f"interpolated pitch compensation; the files were checked as {settings.interpolation}. "
+                "Bit 1 is set on a 30i that was seen, bit 2 (IPP) is remembered: read the parameter manual, and leave the bits "
+                "as the backup has them" + self._bits_of_sample(present),
+            },
+        ]
+        return rows + (self._directional_rows(present) if settings.bidirectional else [])
+
+    def _bits_of_sample(self, present: list[tuple[int, PitchBlock]]) -> str:
+        """3605 of the axes in the sample, in words."""
+        numbers = [(AXES[axis], self.settings.axis_numbers[axis]) for axis, _ in present]
+        found = [
+            f"{name} {bits}"
+            for name, number in numbers
+            if (bits := self.settings.sample.bits(3605, number)) is not None
+        ]
+        return f"; the sample has {', '.join(found)} (bit 7 first)" if found else ""
+
+    def _directional_rows(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:
+        """Reference return as the tables take it, and backlash, which the tables of both directions hold already."""
+        settings = self.settings
+        rows = []
+        for axis, _ in present:
+            name, towards = f"({AXES[axis]}, A{settings.axis_numbers[axis]})", settings.reference_return[axis] > 0
+            rows += [
+                {
+                    "name": f"1006#5 (ZMI) {name}",
+                    "value": "0" if towards else "1",
+                    "meaning": f"reference return in {'positive' if towards else 'negative'} direction, as the tables take it; "
+                    "if the control has another value, set reference_return in the machine file: the reversal would double",
+                },
+                *(
+                    {
+                        "name": f"{number} {name}",
+                        "value": "0",
+                        "meaning": "the tables of both directions hold the backlash",
+                    }
+                    for number in (1851, 1852)
+                ),
+            ]
+        return rows
+
+    def _sign_statement(self) -> str:
+        settings = self.settings
+        stored = "the correction, which the control adds" if settings.stores == "correction" else "the error"
+        kind = (
+            "A value is the sum up to its point"
+            if settings.total
+            else "A value is the change over its section, seen in the positive direction"
+        )
+        count_um, other = settings.count_mm(0) / MM_PER_UM, ""
+        if len(set(settings.magnifications)) > 1:
+            other = " of X; " + ", ".join(f"{settings.count_mm(k) / MM_PER_UM:g} um of {AXES[k]}" for k in (1, 2))
+        return (
+            f"The numbers are {stored}; one count is {count_um:g} um{other} (magnification "
+            f"{', '.join(map(str, dict.fromkeys(settings.magnifications)))} times detection unit "
+            f"{settings.detection_unit_um:g} um). {kind}. An X axis that travels {2 * count_um:g} um too "
+            f"short over a section in the positive direction gets {2 * settings.sign:+d} there."
+            + (self._directional_statement() if settings.bidirectional else "")
+        )
+
+    def _directional_statement(self) -> str:
+        settings = self.settings
+        return (
+            " Points from 3621 to 3622 act in travel in positive direction, as many from 3626 on in negative direction, their "
+            "values seen in the positive direction as well. With a reference return in positive direction an axis that stops "
+            f"{settings.count_mm(0) / MM_PER_UM:g} um farther after positive than after negative travel gets "
+            f"{settings.sign:+d} in 3627."
+        )
+
+    def _warnings(self, present: list[tuple[int, PitchBlock]]) -> list[str]:
+        settings = self.settings
+        found = ["The sign of the values is not settled by public documents: check it at one section first (part 3)."]
+        for axis, block in present:
+            if settings.kept[axis] is not None:
+                found.append(
+                    f"The points {block.first} to {block.last} of {AXES[axis]}, their interval {block.interval_mm:f} mm and the "
+                    f"magnification {block.magnification} are those of the sample; interval_mm or first_numbers in the machine "
+                    "file lay them out anew."
+                )
+        if settings.style_notes:
+            found.append("The style was taken from the sample: " + "; ".join(settings.style_notes) + ".")
+        if settings.bidirectional:
+            found.append(
+                "Bi-directional: 3627 (value at the reference point reached against the reference return) and the numbers of "
+                "the points for negative travel are not settled by public documents; check both directions at the machine."
+            )
+        if settings.interpolation == "staircase":
+            worst_mm = max(
+                (int(np.max(np.abs(np.diff(b.curve)))) * settings.count_mm(k) for k, b in present), default=0.0
+            )
+            found.append(
+                f"Where inside a section the plain type puts its pulses out is not documented: between section ends the "
+                f"correction may be off by up to {fixed(worst_mm / MM_PER_UM, 1)} um."
+            )
+        if settings.max_feed_mm_min is None and present:
+            shortest = min(float(block.interval_mm) for _, block in present)
+            found.append(
+                f"max_feed_mm_min is not in the machine file. By the rule interval >= feed / 7500 the shortest interval of "
+                f"{shortest:g} mm allows {7500 * shortest:.0f} mm/min."
+            )
+        return found
+
+    def _summary(self, axis: int, block: PitchBlock) -> dict[str, Any]:
+        """One axis in numbers, for preflight: where its table lies and how large its values are."""
+        curves = block.curves(self.settings.reference_return[axis])
+        ends_mm = self.machine.reference_point_mm[axis] + block.curve_mm
+        return {
+            "axis": AXES[axis],
+            "reference": block.reference,
+            "first": block.first,
+            "last": block.last,
+            "interval_mm": float(block.interval_mm),
+            "first_mm": float(ends_mm[0]),
+            "last_mm": float(ends_mm[-1]),
+            "largest_step": max(int(np.max(np.abs(np.diff(curve)), initial=0)) for curve in curves),
+            "largest_sum": max(int(np.max(np.abs(curve))) for curve in curves),
+            "negative_first": block.negative_first,
+            "negative_last": block.negative_first + len(block.negative) - 1,
+            "at_reference": block.at_reference,
+        }
+
+    def _check(self, axis: int, block: PitchBlock) -> dict[str, Any]:
+        """A trial of one section next to the reference point: which number to set, and what a laser must then read."""
+        settings = self.settings
+        upper = block.last > block.reference
+        start_mm = self.machine.reference_point_mm[axis] - (0.0 if upper else float(block.interval_mm))
+        counts = min(5, settings.increment_limit)
+        # Below the reference point an increment belongs to the section's upper end, a total value to its lower end.
+        number = block.reference + (1 if upper else -1 if block.total else 0)
+        return {
+            "axis": AXES[axis],
+            "record": settings.number_base + number,
+            "number": number,
+            "from_mm": start_mm,
+            "to_mm": start_mm + float(block.interval_mm),
+            "counts": -counts if block.total and not upper else counts,
+            "change_um": settings.sign * counts * block.magnification * settings.detection_unit_um,
+            "interval_mm": float(block.interval_mm),
+            "short_mm": float(block.interval_mm) - 2 * settings.count_mm(axis),
+            "short_counts": 2 * settings.sign,
+        }
+
+    def _output(self, block: PitchBlock, curve: NDArray[np.int64], along_mm: FloatArray) -> FloatArray:
+        """Counts of a cumulative curve (m,) at positions (n,) from the reference point, shape (n,)."""
+        if self.settings.interpolation == "linear":
+            return np.interp(along_mm, block.curve_mm, curve)
+        return _staircase(block, curve, along_mm).astype(np.float64)
+
+
+def _staircase(block: PitchBlock, curve: NDArray[np.int64], along_mm: FloatArray) -> NDArray[np.int64]:
+    """Curve where a section's value is put out at its beginning: A[n] for ((n-1-ref) d, (n-ref) d], shape (n,)."""
+    section = np.ceil(along_mm / float(block.interval_mm) - 1e-9) + block.reference
+    inside = np.clip(section, block.curve_numbers[0], block.last).astype(np.int64)
+    return np.asarray(curve[inside - block.curve_numbers[0]], dtype=np.int64)

@@ -1,0 +1,684 @@
+"""FANUC stored pitch error compensation: settings, the tables as numbers and as text, and their limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from decimal import Decimal
+from itertools import combinations
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.controls.fanuc_records import (
+    AXIS_PARAMETERS,
+    MOST_NUMBER,
+    TOTAL_PARAMETER,
+    UNIT_PARAMETER,
+    FanucStyle,
+    Parameters,
+    PointGrid,
+    PunchedRecords,
+    Record,
+    Sample,
+    check_increments,
+    length_of,
+    read_records,
+    take_sample,
+    type_word,
+)
+from compgen.controls.shared.base import SourceFile, Usage, coverage_violations
+from compgen.controls.shared.grids import take_loss_mm
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import InputError
+
+# Settings of ``[controllers.fanuc-pitch]``: what the control counts in, how its files look, which numbers are free.
+
+
+#: Smallest step of the interval (parameter 3624) when it is written with a decimal point.
+INTERVAL_QUANTUM_MM = Decimal("0.001")
+
+
+@dataclass(frozen=True)
+class PitchSettings:
+    """Settings of stored pitch error compensation.
+
+    Parameters
+    ----------
+    detection_unit_um, magnifications : one count of the table of X, Y, Z is their product (parameter 3623 is the second,
+        that of the sample if the machine file does not state it).
+    stores : whether the control's numbers are the correction (added to the command) or the error.
+    value_type : ``incremental`` (a value is the change over its section) or ``total`` (the sum up to its point).
+    interpolation : what the control does inside a section; ``staircase`` puts the whole value out at its beginning.
+    interval_mm : section length per axis, None: chosen.
+    max_feed_mm_min : fastest feed; the section must be at least feed / 7500 long. None: not checked.
+    loss_mm : loss by interpolation between section ends that is worth no shorter sections.
+    increment_limit : largest magnitude of the change over a section, in counts.
+    first_number, last_number : compensation point numbers that may be used. Number 0 is left out by default: axes
+        without a table have 3620 ... 3622 = 0 and would take part in its value.
+    first_numbers : first number of the block of each axis, None: assigned.
+    reserved : blocks (first, last) of other axes, which are left free.
+    bidirectional : a table for each direction of travel (3605#0 = 1).
+    negative_first_number, negative_last_number : point numbers of the tables for travel in negative direction.
+    reference_return : direction of the reference return of X, Y, Z, +1 or -1.
+    axis_numbers : controlled axis numbers of X, Y, Z.
+    kept : compensation points of X, Y, Z that the sample shows and that are kept; None: there are none, or the machine
+        file states others.
+    sample : what files of the user's control show.
+    """
+
+    detection_unit_um: float
+    magnifications: tuple[int, int, int]
+    stores: Literal["correction", "error"]
+    value_type: Literal["incremental", "total"]
+    interpolation: Literal["linear", "staircase"]
+    interval_mm: tuple[float | None, float | None, float | None]
+    max_feed_mm_min: float | None
+    loss_mm: float
+    increment_limit: int
+    first_number: int
+    last_number: int
+    first_numbers: tuple[int | None, int | None, int | None]
+    reserved: tuple[tuple[int, int], ...]
+    bidirectional: bool
+    negative_first_number: int
+    negative_last_number: int
+    reference_return: tuple[int, int, int]
+    axis_numbers: tuple[int, int, int]
+    kept: tuple[PointGrid | None, PointGrid | None, PointGrid | None] = (None, None, None)
+    sample: Sample = field(default_factory=Sample, compare=False)
+
+    @property
+    def style(self) -> FanucStyle:
+        """How the file is written."""
+        return self.sample.style
+
+    @property
+    def style_notes(self) -> tuple[str, ...]:
+        """What a sample of the user's control told of the style."""
+        return self.sample.notes
+
+    @property
+    def interval_unit_mm(self) -> float:
+        """Unit of 3624 without a decimal point."""
+        return self.sample.interval_unit_mm
+
+    @property
+    def number_base(self) -> int:
+        """Record number of compensation point 0."""
+        return self.style.number_base
+
+    @property
+    def sign(self) -> int:
+        """+1 if the numbers are the correction, -1 if they are the error."""
+        return 1 if self.stores == "correction" else -1
+
+    @property
+    def total(self) -> bool:
+        """Whether a value is the sum up to its point."""
+        return self.value_type == "total"
+
+    def count_mm(self, axis: int) -> float:
+        """One count of the table that is written for an axis 0..2, mm."""
+        return self.magnifications[axis] * self.detection_unit_um * MM_PER_UM
+
+    @property
+    def interval_quantum_mm(self) -> Decimal:
+        """Step of the interval as it is written, mm."""
+        if not self.style.real_point:
+            return Decimal(repr(self.interval_unit_mm))
+        return max(INTERVAL_QUANTUM_MM, Decimal(1).scaleb(-(self.style.decimals or 3)))
+
+    @property
+    def least_interval_mm(self) -> float:
+        """Shortest section at the fastest feed, mm (0 if the feed is not given)."""
+        return 0.0 if self.max_feed_mm_min is None else self.max_feed_mm_min / 7500.0
+
+
+def read_pitch_settings(machine: Machine) -> PitchSettings:
+    """Read and check ``[controllers.fanuc-pitch]``; every key has a default but ``interval_unit_mm`` (see there)."""
+    section = machine.controller_settings("fanuc-pitch")
+    sample = take_sample(section)
+    numbers = _per_axis(section.section("axis_numbers", required=False), toml_files.whole(1, 99), (1, 2, 3))
+    intervals = _per_axis(section.section("interval_mm", required=False), toml_files.positive, (None, None, None))
+    firsts = _per_axis(section.section("first_numbers", required=False), toml_files.whole(0, 9999), (None, None, None))
+    magnification = section.take("magnification", toml_files.whole(1, 100), None)
+    settings = PitchSettings(
+        detection_unit_um=section.take("detection_unit_um", toml_files.positive, 1.0),
+        magnifications=_magnifications(sample, numbers, magnification),
+        stores=_word(section, "stores", "correction", "error"),
+        value_type=_word(section, "value_type", "incremental", "total"),
+        interpolation=_word(section, "interpolation", "linear", "staircase"),
+        interval_mm=intervals,
+        max_feed_mm_min=section.take("max_feed_mm_min", toml_files.positive, None),
+        increment_limit=section.take("increment_limit", toml_files.whole(1, 127), 7),
+        loss_mm=take_loss_mm(section),
+        first_number=section.take("first_number", toml_files.whole(0, 9999), 1),
+        last_number=section.take("last_number", toml_files.whole(0, 9999), max(1023, _last_of(sample))),
+        first_numbers=firsts,
+        reserved=section.take("reserved_numbers", _spans, ()),
+        bidirectional=section.take("bidirectional", toml_files.flag, False),
+        negative_first_number=section.take("negative_first_number", toml_files.whole(0, 9999), 3000),
+        negative_last_number=section.take("negative_last_number", toml_files.whole(0, 9999), 4023),
+        reference_return=_per_axis(section.section("reference_return", required=False), _direction, (1, 1, 1)),
+        axis_numbers=numbers,
+        kept=_kept(sample, numbers, intervals, firsts),
+        sample=sample,
+    )
+    _check_together(section, settings)
+    section.finish()
+    return settings
+
+
+def _magnifications(sample: Sample, numbers: tuple[int, ...], stated: int | None) -> tuple[int, int, int]:
+    """Magnification of X, Y, Z: that of the machine file, else that of the sample where it has one, else 1."""
+    found = [sample.axes[n].magnification if n in sample.axes else 0 for n in numbers]
+    x, y, z = (stated or own or 1 for own in found)
+    return x, y, z
+
+
+def _last_of(sample: Sample) -> int:
+    """Last compensation point of a sample that holds all of them, from 0 on without a gap; else 0."""
+    return max(sample.values, default=0) if sorted(sample.values) == list(range(len(sample.values))) else 0
+
+
+def _kept(sample: Sample, numbers: tuple[int, ...], intervals: Any, firsts: Any) -> Any:
+    """Compensation points of X, Y, Z in the sample, where the machine file does not state another interval or number."""
+    found: list[PointGrid | None] = []
+    for number, interval_mm, first in zip(numbers, intervals, firsts, strict=True):
+        axis = sample.axes.get(number)
+        grid = None if axis is None or not axis.grid.interval_mm or axis.grid.first == axis.grid.last else axis.grid
+        if grid is not None and interval_mm is not None and Decimal(repr(interval_mm)) != grid.interval_mm:
+            grid = None
+        if grid is not None and first not in (None, grid.first):
+            grid = None
+        if grid is not None and axis is not None and not grid.first - 1 <= grid.reference <= grid.last:
+            raise axis.record.fail(
+                f"axis A{number} has the reference point {grid.reference} (3620) and the points {grid.first} to {grid.last}; "
+                "these points cannot be kept: state first_numbers and interval_mm in the machine file for new ones"
+            )
+        found.append(grid)
+    return tuple(found)
+
+
+def _word(section: toml_files.Section, key: str, default: str, other: str) -> Any:
+    return section.take(key, toml_files.choice(default, other), default)
+
+
+def _per_axis(section: toml_files.Section, check: Callable[[Any], Any], default: tuple[Any, Any, Any]) -> Any:
+    values = tuple(section.take(axis, check, value) for axis, value in zip(AXES, default, strict=True))
+    section.finish()
+    return values
+
+
+def _direction(value: Any) -> int:
+    """Direction of a reference return."""
+    return {"positive": 1, "negative": -1}[toml_files.choice("positive", "negative")(value)]
+
+
+def _spans(value: Any) -> tuple[tuple[int, int], ...]:
+    """A list of blocks of numbers."""
+    if not isinstance(value, list):
+        raise ValueError("a list of blocks of numbers [[first, last], ...] is expected")
+    whole, found = toml_files.whole(0, 9999), []
+    for item in value:
+        if not isinstance(item, list) or len(item) != 2 or whole(item[0]) > whole(item[1]):
+            raise ValueError("blocks of numbers [first, last], the lower one first, are expected")
+        found.append((item[0], item[1]))
+    return tuple(found)
+
+
+def _check_together(section: toml_files.Section, settings: PitchSettings) -> None:
+    if settings.last_number < settings.first_number:
+        raise section.fail("last_number", f"lies below first_number = {settings.first_number}")
+    _check_bidirectional(section, settings)
+    if not settings.total:
+        check_increments(settings.sample.common)
+    if settings.number_base < 10000 and not settings.style.q_word:
+        raise section.fail(
+            "number_base",
+            f"{settings.number_base} makes pitch data look like parameters; 10000 or more, or q_word = true, is needed",
+        )
+    if len(set(settings.axis_numbers)) < 3:
+        raise section.fail("axis_numbers", f"{settings.axis_numbers} gives two axes the same number")
+    for axis, interval_mm in zip(AXES, settings.interval_mm, strict=True):
+        if interval_mm is not None and Decimal(repr(interval_mm)) % settings.interval_quantum_mm:
+            message = (
+                f"{axis} = {interval_mm:g} mm cannot be written; multiples of {settings.interval_quantum_mm} mm can"
+            )
+            raise section.fail("interval_mm", message)
+
+
+def _check_bidirectional(section: toml_files.Section, settings: PitchSettings) -> None:
+    """Refuse what no public document settles: 3627 with total values, and with a magnification."""
+    if not settings.bidirectional:
+        for letter, number in zip(AXES, settings.axis_numbers, strict=True):
+            if (settings.sample.bits(3605, number) or "0").endswith("1"):
+                raise settings.sample.parameters[3605, number][1].fail(
+                    f"bit 0 is 1 for {letter} (A{number}): this control has a table for each direction of travel. Set "
+                    "bidirectional = true in [controllers.fanuc-pitch], or set the bit to 0 and punch the file again"
+                )
+        return
+    if settings.total:
+        raise section.fail("value_type", "how 3627 counts with total values is not documented; use 'incremental'")
+    if settings.magnifications != (1, 1, 1):
+        raise section.fail(
+            "magnification",
+            "whether 3627 is multiplied by it is not documented; with bidirectional = true it must be 1 (a larger "
+            "increment_limit or shorter sections hold steep curves)",
+        )
+    if settings.negative_last_number < settings.negative_first_number:
+        raise section.fail("negative_last_number", f"lies below {settings.negative_first_number}")
+
+
+# Numbers of stored pitch error compensation: reading them from text, the curve they mean, the limits they must keep.
+#
+# Section n is ((n - 1 - ref) d, (n - ref) d] from the reference point, d the interval (parameter 3624), ref the number
+# of the reference point (3620). With incremental values v the cumulative curve A is zero at the reference point and
+# A[n] = A[n-1] + v[n]; with total values A[n] is stored. One count is magnification (3623) times detection unit.
+
+
+REFERENCE, FARTHEST_NEGATIVE, FARTHEST_POSITIVE, MAGNIFICATION, INTERVAL = PARAMETERS = (3620, 3621, 3622, 3623, 3624)
+#: Travel per revolution of a rotary axis; bi-directional: farthest negative number and value at the reference point.
+PER_TURN, NEGATIVE_FIRST, AT_REFERENCE = 3625, 3626, 3627
+#: Bit 0: a table for each direction of travel.
+DIRECTIONS = 3605
+#: Total values travel as 16-bit numbers.
+MOST_TOTAL = 32767
+
+
+@dataclass(frozen=True)
+class PitchBlock:
+    """The table of one axis.
+
+    ``values`` are the numbers as stored, for the point numbers ``first`` ... ``last``, shape (n,); ``total`` tells
+    how they count; ``reference`` is the number of the reference point.
+
+    Bi-directional: ``values`` act in travel in positive direction, ``negative`` (as many, from the number
+    ``negative_first``, parameter 3626) in negative direction; ``at_reference`` (3627) is what the curve of the direction
+    against the reference return has at the reference point, where the other one is zero.
+    """
+
+    reference: int
+    first: int
+    values: tuple[int, ...]
+    total: bool
+    magnification: int
+    interval_mm: Decimal
+    negative: tuple[int, ...] = ()
+    negative_first: int = 0
+    at_reference: int = 0
+
+    @property
+    def last(self) -> int:
+        """Farthest number on the positive side."""
+        return self.first + len(self.values) - 1
+
+    @property
+    def curve_numbers(self) -> NDArray[np.int64]:
+        """Point numbers of the cumulative curve, shape (m,); its positions are (number - reference) intervals."""
+        return np.arange(self.first if self.total else self.first - 1, self.last + 1)
+
+    @property
+    def curve(self) -> NDArray[np.int64]:
+        """Cumulative curve A in counts at ``curve_numbers``, zero at the reference number, shape (m,)."""
+        return self._sums(self.values)
+
+    def points(self) -> list[tuple[int, int]]:
+        """Return all (point number, value) of the axis, those for travel in negative direction behind the others."""
+        found = [(self.first + k, value) for k, value in enumerate(self.values)]
+        return found + [(self.negative_first + k, value) for k, value in enumerate(self.negative)]
+
+    def _sums(self, stored: tuple[int, ...]) -> NDArray[np.int64]:
+        values = np.array(stored, dtype=np.int64)
+        sums = values if self.total else np.concatenate([[0], np.cumsum(values)])
+        return np.asarray(sums - sums[self.reference - self.curve_numbers[0]], dtype=np.int64)
+
+    def curves(self, reference_return: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Curves after travel in positive and in negative direction, for a reference return in direction +1 or -1."""
+        if not self.negative:
+            return self.curve, self.curve
+        positive, negative = self.curve, self._sums(self.negative)
+        if reference_return > 0:
+            return positive, negative + self.at_reference
+        return positive + self.at_reference, negative
+
+    @property
+    def curve_mm(self) -> FloatArray:
+        """Positions of the cumulative curve from the reference point, shape (m,), mm."""
+        return np.array([float(number * self.interval_mm) for number in (self.curve_numbers - self.reference).tolist()])
+
+
+@dataclass(frozen=True)
+class PitchShortfall:
+    """What the limit of the change per section costs an axis: how far the best table misses, and where it is full."""
+
+    axis: int
+    missed_counts: float
+    sections: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class RequestedPitch:
+    """Wanted curve of one axis: ``counts`` (n,), real numbers, at section ends ``nodes_mm`` (n,) in machine coordinates."""
+
+    nodes_mm: FloatArray
+    counts: FloatArray
+
+
+@dataclass(frozen=True)
+class PitchTables:
+    """Tables of X, Y, Z (None: the axis has none); ``others`` holds (axis number, first, last) of further axes.
+
+    ``turns`` holds (axis number, sum of the values over a revolution) of rotary axes among these. ``shortfalls`` and
+    ``wanted`` are known of tables that were built; tables read from text do not say what was wanted, but what ``remarks``
+    there are on the reading.
+    """
+
+    blocks: tuple[PitchBlock | None, PitchBlock | None, PitchBlock | None]
+    others: tuple[tuple[int, int, int], ...] = ()
+    turns: tuple[tuple[int, int], ...] = field(default=(), compare=False)
+    shortfalls: tuple[PitchShortfall, ...] = field(default=(), compare=False)
+    wanted: tuple[RequestedPitch | None, RequestedPitch | None, RequestedPitch | None] = field(
+        default=(None, None, None), compare=False
+    )
+    remarks: tuple[str, ...] = field(default=(), compare=False)
+
+
+PointRecords = dict[int, list[Record]]
+
+
+def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTables:
+    """Read the tables from FANUC text; files that end in ``.json`` (the plan beside them) are left out.
+
+    Parameters that have nothing to do with compensation are passed over, the points of other axes are kept apart.
+    InputError, with file and line, for a missing or doubled parameter of an axis or point of its block, for a cut file,
+    for an inch machine, for a table of each direction that the machine file does not have, and for anything unreadable.
+    """
+    texts = [file for file in files if file.path.suffix.lower() != ".json"]
+    if not texts:
+        raise InputError("no FANUC text file is given; PITCH.TXT (or a file punched from the control) is needed")
+    found, points = PunchedRecords(settings.sample.style.path or 1), PointRecords()
+    for file in texts:
+        for record in read_records(file):
+            _sort_in(record, settings.number_base, found, points)
+    found.check_metric()
+    if not settings.total:
+        check_increments(found.common)
+    parameters = found.axes
+    _check_directions(settings, parameters)
+    blocks = [_block(settings, texts[0], axis, parameters, points) for axis in range(3)]
+    if not any(blocks):
+        numbers = ", ".join(f"A{number}" for number in settings.axis_numbers)
+        raise texts[0].fail(f"holds none of the parameters 3620 to 3624 for the axes {numbers}; punch them as well")
+    others = _others(settings, parameters)
+    turns = _turns(settings, others, parameters, points)
+    return PitchTables(
+        (blocks[0], blocks[1], blocks[2]), others, turns, remarks=_remarks(settings, found, others, points)
+    )
+
+
+def _sort_in(record: Record, base: int, found: PunchedRecords, points: PointRecords) -> None:
+    """Put a record where it belongs: among the points (a parameter of the same number is told later), or parameters."""
+    point, parameter = record.number - base, record.number in (*AXIS_PARAMETERS, UNIT_PARAMETER, TOTAL_PARAMETER)
+    kind = type_word(record, record.words())[0]
+    if 0 <= point <= MOST_NUMBER and kind != 1:
+        points.setdefault(point, []).append(record)
+    elif not parameter:
+        found.passed_over += 1
+    if parameter and not (base < 10000 and kind == 0):
+        found.take(record, is_point=False)
+
+
+def _check_directions(settings: PitchSettings, parameters: Parameters) -> None:
+    """Refuse a file whose 3605#0 says otherwise than ``bidirectional``: half of its tables would be read wrongly."""
+    for letter, number in zip(AXES, settings.axis_numbers, strict=True):
+        text, record = parameters.get((DIRECTIONS, number), ("", None))
+        if record is not None and text.endswith("1") != settings.bidirectional:
+            word = "true" if text.endswith("1") else "false"
+            raise record.fail(
+                f"bit 0 of {letter} (A{number}) is {text[-1:]}: set bidirectional = {word} in [controllers.fanuc-pitch] to "
+                f"read this file"
+            )
+
+
+def _remarks(
+    settings: PitchSettings, found: PunchedRecords, others: Sequence[tuple[int, int, int]], points: PointRecords
+) -> tuple[str, ...]:
+    """Say what was assumed of the unit, which axes are kept apart, and how many records were passed over."""
+    said = [found.unit_remark(settings.detection_unit_um)]
+    for axis, first, last in others:
+        said.append(
+            f"axis A{axis} (not X, Y or Z of the machine file) has the compensation points {first} to {last}: kept apart"
+        )
+    bits = sorted(
+        {
+            text
+            for (number, axis), (text, _) in found.axes.items()
+            if number == DIRECTIONS and axis in settings.axis_numbers
+        }
+    )
+    if bits:
+        said.append(
+            f"3605 of X, Y, Z is {', '.join(bits)} (bit 7 first); which bit makes the compensation interpolated is not settled, "
+            f"read as {settings.interpolation}"
+        )
+    if found.passed_over:
+        said.append(found.passed_over_remark("pitch"))
+    return tuple(said)
+
+
+def _point_values(settings: PitchSettings, records: Sequence[Record]) -> list[tuple[int, Record]]:
+    """Values of the records that are pitch data: of type Q0, or without type and axis word.
+
+    A parameter of the same number has the type word Q1 or axis words.
+    """
+    found = []
+    for record in records:
+        kind, words = type_word(record, record.words())
+        if kind == 0 or (kind is None and settings.number_base >= 10000 and not any(w[0] in "AS" for w in words)):
+            if len(words) != 1 or words[0][0] != "P":
+                raise record.fail("expected a single value word P for a compensation point, e.g. P-2")
+            found.append((record.whole(words[0][1], -10 * MOST_TOTAL, 10 * MOST_TOTAL), record))
+    return found
+
+
+def _block(
+    settings: PitchSettings, file: SourceFile, axis: int, parameters: Parameters, points: PointRecords
+) -> PitchBlock | None:
+    number = settings.axis_numbers[axis]
+    needed = (*PARAMETERS, NEGATIVE_FIRST, AT_REFERENCE) if settings.bidirectional else PARAMETERS
+    missing = [str(parameter) for parameter in needed if (parameter, number) not in parameters]
+    if set(map(str, PARAMETERS)) <= set(missing):
+        return None
+    if missing:
+        raise file.fail(f"parameter {', '.join(missing)} is missing for {AXES[axis]} (axis A{number})")
+
+    def whole(parameter: int, high: int, low: int = 0) -> int:
+        text, record = parameters[parameter, number]
+        return record.whole(text, low, high)
+
+    first, last = whole(FARTHEST_NEGATIVE, MOST_NUMBER), whole(FARTHEST_POSITIVE, MOST_NUMBER)
+    reference = whole(REFERENCE, MOST_NUMBER)
+    lowest = first if settings.total else first - 1
+    if last < first or not lowest <= reference <= last:
+        raise parameters[REFERENCE, number][1].fail(
+            f"{AXES[axis]} has the reference point {reference} and the points {first} to {last}; the reference point "
+            f"must be one of {lowest} to {last}"
+        )
+    block = PitchBlock(
+        reference=reference,
+        first=first,
+        values=_values(settings, (first, last), parameters[FARTHEST_POSITIVE, number][1], points),
+        total=settings.total,
+        magnification=whole(MAGNIFICATION, 100),
+        interval_mm=length_of(
+            parameters[INTERVAL, number][1], parameters[INTERVAL, number][0], settings.interval_unit_mm
+        ),
+    )
+    if not settings.bidirectional:
+        return block
+    negative_first = whole(NEGATIVE_FIRST, MOST_NUMBER)
+    span = (negative_first, negative_first + last - first)
+    negative = _values(settings, span, parameters[NEGATIVE_FIRST, number][1], points)
+    at_reference = whole(AT_REFERENCE, MOST_TOTAL, -MOST_TOTAL - 1)
+    return replace(block, negative=negative, negative_first=negative_first, at_reference=at_reference)
+
+
+def _values(settings: PitchSettings, span: tuple[int, int], who: Record, points: PointRecords) -> tuple[int, ...]:
+    """Values of the points from ``span[0]`` to ``span[1]``, each of which must be there once."""
+    values, absent = [], []
+    for number in range(span[0], span[1] + 1):
+        found = _point_values(settings, points.get(number, ()))
+        if len(found) > 1:
+            first = found[0][1]
+            raise found[1][1].fail(f"is given a second time (first in {first.file.path}:{first.line})")
+        values += [value for value, _ in found]
+        absent += [] if found else [number]
+    if absent:
+        some = ", ".join(map(str, absent[:5])) + (", ..." if len(absent) > 5 else "")
+        raise who.fail(f"gives points {span[0]} to {span[1]}, but {some} ({len(absent)} in all) are missing")
+    return tuple(values)
+
+
+def _others(settings: PitchSettings, parameters: Parameters) -> tuple[tuple[int, int, int], ...]:
+    """Blocks of axes other than X, Y, Z that are switched on (magnification above zero)."""
+    found = []
+    for axis in sorted({axis for _, axis in parameters} - set(settings.axis_numbers)):
+        entries = [parameters.get((number, axis)) for number in (FARTHEST_NEGATIVE, FARTHEST_POSITIVE, MAGNIFICATION)]
+        numbers = [record.whole(text, 0, MOST_NUMBER) for text, record in (entry for entry in entries if entry)]
+        if len(numbers) == 3 and numbers[2] > 0:
+            found.append((axis, numbers[0], numbers[1]))
+    return tuple(found)
+
+
+def _turns(
+    settings: PitchSettings, others: Sequence[tuple[int, int, int]], parameters: Parameters, points: PointRecords
+) -> tuple[tuple[int, int], ...]:
+    """Sum of the values over a revolution, of further axes whose numbers span their travel per revolution (3625).
+
+    Source: Series 0i-PB parameter manual B-63980EN/01, p. 100: the numbers go from the reference point's to it plus
+    travel per revolution over interval; the values behind the first must sum to zero.
+    """
+    found = []
+    for axis, first, last in others:
+        text, record = parameters.get((PER_TURN, axis), ("0", None))
+        interval = Decimal(parameters[INTERVAL, axis][0]) if (INTERVAL, axis) in parameters else Decimal(0)
+        there = all(number in points for number in range(first + 1, last + 1))
+        if there and record is not None and interval > 0 and Decimal(text) == (last - first) * interval:
+            found.append((axis, sum(_values(settings, (first + 1, last), record, points))))
+    return tuple(found)
+
+
+# Limits of stored pitch error compensation: what tables break, how much of each limit they use.
+
+
+#: A table that misses by more counts than this because its steps are limited is not acceptable.
+MOST_MISSED = 1.0
+
+
+def pitch_violations(machine: Machine, settings: PitchSettings, tables: PitchTables) -> list[str]:
+    """Return every limit that the tables break, and travel that they leave out, in words."""
+    messages = []
+    for axis, block in enumerate(tables.blocks):
+        if block is None:
+            messages.append(f"{AXES[axis]} has no pitch table: none of its travel is covered")
+        else:
+            messages += _block_violations(settings, AXES[axis], block)
+            first_mm, last_mm = machine.reference_point_mm[axis] + block.curve_mm[[0, -1]]
+            messages += coverage_violations(machine, axis, first_mm, last_mm, f"the pitch table of {AXES[axis]}")
+    messages += [shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts > MOST_MISSED]
+    for axis_number, total in tables.turns:
+        if total:
+            messages.append(
+                f"the values of the rotary axis A{axis_number} sum to {total} counts over a revolution; they must sum to 0, "
+                f"else every revolution adds to the error"
+            )
+    return messages + _overlaps(tables)
+
+
+def shortfall_text(settings: PitchSettings, shortfall: PitchShortfall) -> str:
+    """Say that the limit of the change per section keeps a table from what was wanted, and what helps."""
+    numbers = ", ".join(map(str, shortfall.sections[:5])) + (", ..." if len(shortfall.sections) > 5 else "")
+    return (
+        f"{AXES[shortfall.axis]}: the wanted curve is too steep, the limit is {settings.increment_limit} counts per "
+        f"section: {len(shortfall.sections)} sections are full (points {numbers}), and even the best table misses by up "
+        f"to {shortfall.missed_counts * settings.count_mm(shortfall.axis) / MM_PER_UM:.1f} um; a shorter interval or a larger "
+        f"magnification is needed"
+    )
+
+
+def _block_violations(settings: PitchSettings, name: str, block: PitchBlock) -> list[str]:
+    messages = _value_violations(settings, name, block)
+    if block.last > settings.last_number:
+        messages.append(
+            f"{name}: the points {block.first} to {block.last} go beyond the last number {settings.last_number}"
+        )
+    if block.negative and block.negative_first + len(block.negative) - 1 > settings.negative_last_number:
+        messages.append(
+            f"{name}: the points for travel in negative direction, from {block.negative_first} on, go beyond the last "
+            f"number {settings.negative_last_number}"
+        )
+    if block.negative and block.magnification != 1:
+        messages.append(f"{name}: whether 3627 counts with the magnification {block.magnification} is not documented")
+    if block.magnification == 0:
+        messages.append(f"{name}: the magnification is 0, which switches the table off")
+    if float(block.interval_mm) < settings.least_interval_mm - 1e-9:
+        messages.append(
+            f"{name}: the interval {block.interval_mm:f} mm is shorter than the {settings.least_interval_mm:g} mm that "
+            f"{settings.max_feed_mm_min:g} mm/min need"
+        )
+    return messages
+
+
+def _value_violations(settings: PitchSettings, name: str, block: PitchBlock) -> list[str]:
+    messages = []
+    for curve, way in zip(block.curves(1), ("", " in negative travel"), strict=True):
+        steps = np.abs(np.diff(curve))
+        if steps.size and steps.max() > settings.increment_limit and (block.negative or not way):
+            worst = int(np.argmax(steps))
+            messages.append(
+                f"{name}: the change over section {block.curve_numbers[worst + 1]}{way} is {steps[worst]} counts, the limit "
+                f"is {settings.increment_limit}; a shorter interval or a larger magnification is needed"
+            )
+    if block.total and max(map(abs, block.values)) > MOST_TOTAL:
+        most = max(map(abs, block.values))
+        messages.append(f"{name}: a total value of {most} counts does not fit 16 bits ({MOST_TOTAL})")
+    if block.total and block.values[block.reference - block.first] != 0:
+        messages.append(f"{name}: the total value at the reference point {block.reference} must be 0")
+    return messages
+
+
+def _overlaps(tables: PitchTables) -> list[str]:
+    spans = [(AXES[k], block.first, block.last) for k, block in enumerate(tables.blocks) if block is not None]
+    spans += [
+        (f"{AXES[k]} in negative travel", block.negative_first, block.negative_first + len(block.negative) - 1)
+        for k, block in enumerate(tables.blocks)
+        if block is not None and block.negative
+    ]
+    spans += [(f"axis A{number}", first, last) for number, first, last in tables.others]
+    return [
+        f"the compensation points of {a} ({a_first} to {a_last}) and {b} ({b_first} to {b_last}) overlap"
+        for (a, a_first, a_last), (b, b_first, b_last) in combinations(spans, 2)
+        if a_first <= b_last and b_first <= a_last
+    ]
+
+
+def pitch_usage(settings: PitchSettings, tables: PitchTables) -> list[Usage]:
+    """Return the largest change over a section, the point numbers and the interval against their limits."""
+    found, used = [], 0
+    for axis, block in enumerate(tables.blocks):
+        if block is None:
+            continue
+        used += len(block.values)
+        step = max(int(np.max(np.abs(np.diff(curve)), initial=0)) for curve in block.curves(1))
+        found.append(Usage(f"change over a section of {AXES[axis]}", step, settings.increment_limit, "counts"))
+        if settings.max_feed_mm_min is not None:
+            least, own = settings.least_interval_mm, float(block.interval_mm)
+            found.append(Usage(f"shortest section at the feed, {AXES[axis]}", least, own, "mm"))
+    numbers = settings.last_number - settings.first_number + 1
+    return [*found, Usage("compensation points", used, numbers, "points")]

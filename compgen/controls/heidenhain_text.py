@@ -1,0 +1,279 @@
+"""Tables of HEIDENHAIN controls as text: ``BEGIN name .COM MM``, a header of column names from ``NR`` on, ``[END]``.
+
+The start of a column's name in the header is where its field begins. The header row, blank-separated columns and the
+last line ``[END]`` are documented (iTNC 530 HSCI technical manual, p. 670, 671, 684); the first line is usual in all
+text tables of the maker; field widths are not documented, so a table saved on the control can be taken as it is.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+
+from compgen.controls.shared.base import SourceFile
+from compgen.data.files import read_bytes
+from compgen.data.messages import doubled, one_line
+from compgen.errors import InputError
+
+#: No table of a control is anywhere near this long, has lines of this length, or so much before its header.
+MOST_CHARACTERS, MOST_IN_LINE, MOST_BEFORE_HEADER = 2_000_000, 1000, 200
+BEGIN, END, NUMBER_COLUMN = "BEGIN", "[END]", "NR"
+UNITS = ("MM", "INCH", "IN")
+
+_WORD = re.compile(r"[^ \t]+")
+_NUMBER = re.compile(r"[+-]?\d{1,7}(?:\.\d{1,9})?", re.ASCII)
+_COLUMN = re.compile(r"[A-Za-z0-9_.+-]{1,32}", re.ASCII)
+
+
+@dataclass(frozen=True)
+class TableColumn:
+    """One column: its name and where its field starts; ``width`` is 0 for the last one, whose field has no end."""
+
+    name: str
+    start: int
+    width: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row: the cells by column name (blank ones are left out) and its line in the file."""
+
+    cells: dict[str, str]
+    line: int
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table as it was read.
+
+    ``words`` are those of the first line, ``before`` the lines up to the header and with it, ``after`` the lines from
+    ``[END]`` on, ``header_line`` the number of the header's line.
+    """
+
+    file: SourceFile
+    words: tuple[str, ...]
+    before: tuple[str, ...]
+    columns: tuple[TableColumn, ...]
+    rows: tuple[Row, ...]
+    after: tuple[str, ...]
+
+    @property
+    def header_line(self) -> int:
+        """Line of the header row, counting from 1."""
+        return len(self.before)
+
+    @property
+    def kind(self) -> str:
+        """Extension of the table's name in its first line, e.g. ``COM``; empty if there is none."""
+        unit = next(k for k in range(2, len(self.words)) if self.words[k].upper() in UNITS)
+        found = re.search(r"\.([A-Za-z]{1,4})$", self.words[unit - 1])
+        return found.group(1).upper() if found else ""
+
+    def number(self, row: Row, column: str) -> Decimal:
+        """Return a cell as a number; InputError for a blank one and for anything but a plain decimal number."""
+        text = row.cells.get(column)
+        if text is None:
+            raise self.file.fail(f"column {column} is blank here; a filled column has a number in every row", row.line)
+        if _NUMBER.fullmatch(text):
+            return Decimal(text)
+        raise self.file.fail(f"column {column}: {one_line(text)[:40]!r} {_fault(text)}", row.line)
+
+
+def _fault(text: str) -> str:
+    """Say what is wrong with a number."""
+    if "," in text:
+        return "has a comma; the decimal mark is a point"
+    if re.fullmatch(r"[+-]?[\d.]+[eE][+-]?\d+", text):
+        return "has an exponent; expected plain decimals"
+    return "is not a number; expected plain decimals such as -0.0123"
+
+
+def split_lines(file: SourceFile) -> list[str]:
+    """Return the lines without their ends; InputError for a text that cannot be a table by its size or characters."""
+    if len(file.text) > MOST_CHARACTERS:
+        message = f"the file holds {len(file.text)} characters; no table is longer than {MOST_CHARACTERS}"
+        raise file.fail(message, 1)
+    lines = file.text.removeprefix("\ufeff").split("\n")
+    for number, line in enumerate(lines, start=1):
+        bare = line.removesuffix("\r")
+        if len(bare) > MOST_IN_LINE:
+            raise file.fail(f"the line has {len(bare)} characters; at most {MOST_IN_LINE} are possible", number)
+        wrong = next((char for char in bare if not (" " <= char <= "~" or char == "\t")), None)
+        if wrong is not None:
+            raise file.fail(f"holds the character {ascii(wrong)}; tables are printable ASCII", number)
+        lines[number - 1] = bare
+    return lines
+
+
+def read_table(file: SourceFile) -> TextTable:
+    """Read one table; InputError with the line for whatever is malformed or cut."""
+    lines = split_lines(file)
+    words = tuple(lines[0].split())
+    if len(words) < 3 or words[0] != BEGIN:
+        raise file.fail(f"{one_line(lines[0])[:40]!r} is not a first line such as 'BEGIN AXIS_Y .COM MM'", 1)
+    unit = next((word.upper() for word in words[2:] if word.upper() in UNITS), "")
+    if unit in ("INCH", "IN"):
+        raise file.fail("the table is in inches; only tables in mm are read", 1)
+    if unit != "MM":
+        raise file.fail("the first line has no unit; expected MM after the name", 1)
+    header = _header_index(file, lines)
+    columns = _columns(file, lines[header], header + 1)
+    rows: list[Row] = []
+    for number, line in enumerate(lines[header + 1 :], start=header + 2):
+        text = line.strip()
+        if text == END:
+            _nothing_behind(file, lines, number)
+            before, after = tuple(lines[: header + 1]), tuple(lines[number - 1 :])
+            return TextTable(file, words, before, columns, tuple(rows), after)
+        if text and not text.startswith(";"):
+            rows.append(_row(file, columns, line, number, len(rows)))
+    raise file.fail(f"the last line {END} is missing: the file is truncated", len(lines))
+
+
+def _header_index(file: SourceFile, lines: Sequence[str]) -> int:
+    for index in range(1, min(len(lines), MOST_BEFORE_HEADER)):
+        words = lines[index].split(maxsplit=1)
+        if words and words[0] == NUMBER_COLUMN:
+            return index
+        if words and words[0] == END:
+            break
+    raise file.fail(f"no header row of column names that begins with {NUMBER_COLUMN}", min(len(lines), 2))
+
+
+def _columns(file: SourceFile, header: str, line: int) -> tuple[TableColumn, ...]:
+    found = list(_WORD.finditer(header))
+    names = [match.group() for match in found]
+    for name in names:
+        if not _COLUMN.fullmatch(name):
+            raise file.fail(f"{name[:40]!r} is not the name of a column", line)
+    twice = doubled(names)
+    if twice is not None:
+        raise file.fail(f"column {twice} is given twice", line)
+    starts = [match.start() for match in found]
+    ends = [*starts[1:], starts[-1]]
+    return tuple(TableColumn(name, start, end - start) for name, start, end in zip(names, starts, ends, strict=True))
+
+
+def _row(file: SourceFile, columns: Sequence[TableColumn], line: str, number: int, due: int) -> Row:
+    """Cells of one row: one word per column by their order, or, where some are blank, by the fields."""
+    found = list(_WORD.finditer(line))
+    if len(found) > len(columns):
+        raise file.fail(f"{len(found)} values stand in {len(columns)} columns", number)
+    if len(found) == len(columns):
+        cells = {column.name: match.group() for column, match in zip(columns, found, strict=True)}
+    else:
+        cells = _by_field(file, columns, found, number)
+    counted = cells.get(NUMBER_COLUMN, "")
+    if not re.fullmatch(r"\d{1,6}", counted, re.ASCII) or int(counted) != due:
+        message = (
+            f"{NUMBER_COLUMN} is {one_line(counted)[:20] or 'blank'}, expected {due}; rows are numbered 0, 1, 2 ..."
+        )
+        raise file.fail(message, number)
+    return Row(cells, number)
+
+
+def _by_field(
+    file: SourceFile, columns: Sequence[TableColumn], found: Sequence[re.Match[str]], number: int
+) -> dict[str, str]:
+    cells: dict[str, str] = {}
+    for match in found:
+        column = next((item for item in reversed(columns) if item.start <= match.start()), columns[0])
+        if column.name in cells or (column.width and match.end() > column.start + column.width):
+            what = one_line(match.group())[:40]
+            raise file.fail(
+                f"{what!r} does not stand in the field of one column (columns start as in the header)", number
+            )
+        cells[column.name] = match.group()
+    return cells
+
+
+def _nothing_behind(file: SourceFile, lines: Sequence[str], end: int) -> None:
+    for number, line in enumerate(lines[end:], start=end + 1):
+        if line.strip():
+            raise file.fail(f"{one_line(line)[:20]!r} stands behind {END}", number)
+
+
+# --- writing: layouts of our own, and those of a table saved on a control ----------------------------------------------
+
+
+@dataclass(frozen=True)
+class ComLayout:
+    """What stays of a table when its rows are filled in: lines before and after, fields of the columns, line ends."""
+
+    before: tuple[str, ...]
+    columns: tuple[TableColumn, ...]
+    after: tuple[str, ...] = (END, "")
+    crlf: bool = False
+    source: Path | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns."""
+        return tuple(column.name for column in self.columns)
+
+    def fail(self, message: str) -> InputError:
+        """Return the error that points at the header line."""
+        return InputError(message, file=self.source, line=len(self.before))
+
+    def check(self, row: Sequence[str]) -> None:
+        """Raise InputError if a cell does not fit its field with a blank behind it."""
+        for column, cell in zip(self.columns, row, strict=True):
+            if column.width and len(cell) >= column.width:
+                raise self.fail(
+                    f"column {column.name} has {column.width} characters, {cell!r} needs {len(cell) + 1}; save a table "
+                    "with wider columns, or write fewer decimals (decimals)"
+                )
+
+
+def own_layout(name: str, kind: str, columns: Sequence[tuple[str, int]]) -> ComLayout:
+    """Return a layout of our own: name, extension, and (column, width of its field) in order."""
+    header = "".join(f"{column:<{width}}" for column, width in columns).rstrip()
+    starts = [sum(width for _, width in columns[:k]) for k in range(len(columns))]
+    last = len(columns) - 1
+    fields = tuple(
+        TableColumn(column, starts[k], 0 if k == last else width) for k, (column, width) in enumerate(columns)
+    )
+    return ComLayout((f"{BEGIN} {name} .{kind} MM", header), fields)
+
+
+def template_layout(path: Path, kind: str) -> ComLayout:
+    """Return the layout of an empty table saved on a control; InputError with the line if it cannot be filled in.
+
+    Parameters
+    ----------
+    path : the saved table.
+    kind : extension that its first line must have, ``COM`` or ``CMA``.
+    """
+    content = read_bytes(path)
+    try:
+        text = content.decode("ascii")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise InputError("holds a byte that is not ASCII", file=path, line=line) from None
+    file = SourceFile(path, text)
+    table = read_table(file)
+    if table.kind != kind:
+        raise file.fail(f"is a table of type {table.kind or 'unknown'}; expected an empty .{kind} table", 1)
+    for row in table.rows:
+        filled = [cell for name, cell in row.cells.items() if name != NUMBER_COLUMN and cell.strip("-+0.")]
+        if filled:
+            message = f"holds {one_line(filled[0])[:20]!r}; expected a table without values as a template"
+            raise file.fail(message, row.line)
+    crlf = _crlf(file)
+    fields = tuple(
+        TableColumn(column.name, column.start, 0 if k == len(table.columns) - 1 else column.width)
+        for k, column in enumerate(table.columns)
+    )
+    return ComLayout(table.before, fields, table.after, crlf, path)
+
+
+def _crlf(file: SourceFile) -> bool:
+    """Whether the lines end with CR LF; InputError where both kinds of line end stand in one file."""
+    ends = [line.endswith("\r") for line in file.text.split("\n")[:-1]]
+    for number, end in enumerate(ends, start=1):
+        if end != ends[0]:
+            raise file.fail("ends otherwise than the first line (CR LF and LF are mixed)", number)
+    return bool(ends and ends[0])

@@ -1,0 +1,465 @@
+"""Volumetric compensation of the ISG kernel (Beckhoff TwinCAT CNC TF5280): what its two file formats share."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from compgen.controls.isg_parameters import (
+    CONTROL_NAMES,
+    LOGICAL_NAMES,
+    MOST_LINES,
+    TOOL_NAMES,
+    Direction,
+    ListFile,
+    ParameterFile,
+    ParameterGrid,
+    axis_letters,
+    base_name,
+    chain_of,
+    chain_text,
+    collect,
+    is_list_file,
+    parse_list,
+)
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
+from compgen.controls.shared.grids import take_loss_mm, uneven_nodes_mm
+from compgen.controls.shared.terms import error_terms
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray, fixed
+from compgen.data.error_table import ErrorTable
+from compgen.data.lengths import Points
+from compgen.data.machine import Chain, Machine
+from compgen.data.names import AXES, ERROR_NAMES, error_named
+from compgen.errors import InputError
+from compgen.kinematics.first_order import coefficients, factor
+
+# What the machine file says to the ISG kernel's volumetric compensation, and what the control has loaded.
+
+
+@dataclass(frozen=True)
+class IsgSettings:
+    """``[controllers.isg-csv]`` or ``[controllers.etalon-exchange]`` of a machine file.
+
+    Parameters
+    ----------
+    logical_axes : logical axis numbers of X, Y, Z in the control.
+    reversed_axes : axes where the sign check at the machine found that the control ADDS the error.
+    negate : axes that the list file negates; by default the reversed ones.
+    chain_direction : in which order the control reads ``chain``.
+    use_axis_offsets, max_records, path : as the control has them; ``path`` is the folder on the control.
+    write_tool_position : whether the CSV file gives the tool offset as P0X, P0Y, P0Z.
+    lever_mm : longest lever arm of an angle on this machine.
+    loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
+    """
+
+    logical_axes: tuple[int, int, int]
+    reversed_axes: str
+    negate: str
+    chain_direction: Direction
+    use_axis_offsets: int
+    max_records: int
+    path: str
+    write_tool_position: bool
+    lever_mm: float
+    loss_mm: float
+
+
+@dataclass(frozen=True)
+class IsgTables:
+    """What the control has loaded: errors by ISO name, other constants, and the list file if there is one.
+
+    ``records`` counts rows of numbers over ``files`` (names of the parameter files); ``remarks`` are findings about
+    the text that the control's documents do not cover.
+    """
+
+    fields: Mapping[str, ParameterGrid]
+    constants: Mapping[str, float]
+    records: int
+    files: tuple[str, ...]
+    listing: ListFile | None = None
+    remarks: tuple[str, ...] = ()
+
+
+def read_isg_settings(machine: Machine, name: str, tool_position: bool) -> IsgSettings:
+    """Check the settings of one of the two formats; ``tool_position``: the format may carry P0X, P0Y, P0Z."""
+    section = machine.controller_settings(name)
+    axes = section.section("logical_axes", required=False)
+    numbers = tuple(axes.take(letter, toml_files.whole(1, 65535), k + 1) for k, letter in enumerate(AXES))
+    axes.finish()
+    if len(set(numbers)) != 3:
+        raise section.fail("logical_axes", f"gives {numbers} for X, Y, Z; three different numbers are needed")
+    reversed_axes = section.take("reversed_axes", axis_letters, "")
+    directions = toml_files.choice("workpiece_to_tool", "tool_to_workpiece")
+    tool = np.abs(machine.tool_offset_mm)
+    settings = IsgSettings(
+        logical_axes=(numbers[0], numbers[1], numbers[2]),
+        reversed_axes=reversed_axes,
+        negate=section.take("negate", axis_letters, reversed_axes),
+        chain_direction=cast(Direction, section.take("chain_direction", directions, "workpiece_to_tool")),
+        use_axis_offsets=section.take("use_axis_offsets", toml_files.whole(0, 1), 0),
+        max_records=section.take("max_records", toml_files.whole(1, MOST_LINES), 2000),
+        path=section.take("path", _folder, ""),
+        write_tool_position=tool_position and section.take("write_tool_position", toml_files.flag, False),
+        lever_mm=float(np.max(np.maximum(np.abs(machine.lower_mm), np.abs(machine.upper_mm)) + tool)),
+        loss_mm=take_loss_mm(section),
+    )
+    section.finish()
+    return settings
+
+
+def _folder(value: object) -> str:
+    if not isinstance(value, str) or len(value) > 200 or any(not "!" <= char <= "~" or char == "#" for char in value):
+        raise ValueError("a folder on the control is expected: printable ASCII without blanks and '#'")
+    if not value or value[-1] in "\\/":
+        return value
+    return value + ("\\" if "\\" in value or ":" in value else "/")
+
+
+def disagreements(listing: ListFile, wanted: ListFile) -> list[str]:
+    """Return where a list file differs from the one that the machine file asks for, in words."""
+    pairs: list[tuple[str, object, object]] = [
+        ("chain", listing.chain, wanted.chain),
+        ("workpiece_axes", listing.workpiece_axes, wanted.workpiece_axes),
+        ("negate", listing.negate or "nothing", wanted.negate or "nothing"),
+        *zip(AXES, listing.logical_axes, wanted.logical_axes, strict=True),
+    ]
+    return [
+        f"list file: {key} is {given if given is not None else 'missing'}, the machine file makes it {due}"
+        for key, given, due in pairs
+        if given != due
+    ]
+
+
+# Words for the people at the machine: what the exported files of the ISG kernel say, and what must be set and checked.
+
+
+_DIRECTIONS = {
+    "workpiece_to_tool": "from the workpiece to the tool",
+    "tool_to_workpiece": "from the tool to the workpiece",
+}
+
+
+# Volumetric compensation of the ISG kernel (Beckhoff TwinCAT CNC TF5280): what its two file formats share.
+#
+# The control reads ISO 230 errors and evaluates E = C P itself; it then takes the error off the command. The list file
+# says which chain, which axes and which sign. What no public document settles is a setting here and stands in the files.
+
+
+LENGTH_DIGITS, ANGLE_DIGITS, POSITION_DIGITS = 9, 12, 6
+LIST_NAME = "volcomp0.lis"
+MOST_FILES = 10
+#: Entries of a list file that the template writes without ``negate``.
+LIST_ENTRIES = 9
+
+
+def rounded(name: str, values: FloatArray) -> FloatArray:
+    """Return values of an error (ISO name) rounded as they are written."""
+    digits = LENGTH_DIGITS if error_named(name).kind == "linear" else ANGLE_DIGITS
+    flat = [float(fixed(value, digits)) for value in np.ravel(values).tolist()]
+    return np.array(flat).reshape(np.shape(values))
+
+
+def term_field(term: Term, values: FloatArray) -> ParameterGrid:
+    """Return the control's table of one error: the term's values are the errors themselves."""
+    if term.axis is None:
+        return ParameterGrid((), (), rounded(term.name, np.asarray(values, dtype=np.float64)[0]))
+    nodes = np.array([float(fixed(node, POSITION_DIGITS)) for node in term.nodes_mm.tolist()])
+    return ParameterGrid((term.axis,), (nodes,), rounded(term.name, np.asarray(values, dtype=np.float64)))
+
+
+def error_of(
+    chain: Chain, fields: Mapping[str, ParameterGrid], position_mm: FloatArray, tool_mm: FloatArray
+) -> FloatArray:
+    """E = C P (squareness reference X) from parsed numbers, at positions (n, 3): shape (n, 3), mm."""
+    values = {name: item.at(position_mm) for name, item in fields.items()}
+    result = np.zeros((len(position_mm), 3))
+    for part in coefficients(chain, "X"):
+        if part.error in values:
+            result[:, part.output] += part.sign * factor(part.lever, position_mm, tool_mm) * values[part.error]
+    return result
+
+
+class VolumetricController(Controller[IsgSettings, IsgTables]):
+    """The kernel's volumetric compensation; a subclass knows one format of the parameter file.
+
+    ``file_format`` is the control's word for it, ``parameter_file`` the name of the exported file.
+    """
+
+    file_format: str
+    parameter_file: str
+    tool_position: bool = False
+
+    @abstractmethod
+    def parse_parameters(self, source: SourceFile) -> ParameterFile:
+        """Read one error-parameter file."""
+
+    @abstractmethod
+    def count_records(self, fields: Mapping[str, ParameterGrid], constants: Mapping[str, float]) -> int:
+        """Return how many rows of numbers the exported file has."""
+
+    @abstractmethod
+    def body(self, tables: IsgTables) -> dict[str, Any]:
+        """Return what the template of the parameter file needs."""
+
+    @classmethod
+    def read_settings(cls, machine: Machine) -> IsgSettings:
+        """Check the settings of the machine file."""
+        return read_isg_settings(machine, cls.name, cls.tool_position)
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return one term per error, with nodes where the curves need them; the control evaluates E = C P itself."""
+        nodes = [uneven_nodes_mm(self.machine, errors, axis, loss_mm=self.settings.loss_mm) for axis in range(3)]
+        return error_terms(self.machine, errors, nodes)
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> IsgTables:
+        """Round the errors as they are written; the list file comes with them."""
+        terms = {term.name: term for term in basis}
+        fields = {name: term_field(terms[name], values[name]) for name in ERROR_NAMES if name in terms}
+        tool = [float(fixed(value, POSITION_DIGITS)) for value in self.machine.tool_offset_mm]
+        constants = dict(zip(TOOL_NAMES, tool, strict=True)) if self.settings.write_tool_position and any(tool) else {}
+        return IsgTables(
+            fields=fields,
+            constants=constants,
+            records=self.count_records(fields, constants),
+            files=(self.parameter_file,),
+            listing=self._list_of(self.parameter_file, self.file_format),
+        )
+
+    def parse(self, files: Sequence[SourceFile]) -> IsgTables:
+        """Read parameter files, and the list file if it is among them, in any order."""
+        lists = [source for source in files if is_list_file(source)]
+        sources = [source for source in files if source not in lists]
+        if len(lists) > 1:
+            raise lists[1].fail(
+                f"is a second list file; the first is {lists[0].path.name}; give one compensation at a time"
+            )
+        listing = parse_list(lists[0]) if lists else None
+        if not sources:
+            raise InputError(
+                f"no error-parameter file was given; give {self.parameter_file}, with or without {LIST_NAME}"
+            )
+        parts = [self.parse_parameters(source) for source in sources]
+        fields, constants = collect([item for part in parts for item in part.parameters])
+        return IsgTables(
+            fields=fields,
+            constants=constants,
+            records=sum(part.records for part in parts),
+            files=tuple(source.path.name for source in sources),
+            listing=listing,
+            remarks=tuple(
+                f"{source.path.name}:{part.exponent_line} has a number with an exponent; no public document says that "
+                f"the control reads it: write plain decimals"
+                for source, part in zip(sources, parts, strict=True)
+                if part.exponent_line is not None
+            ),
+        )
+
+    def emulate(self, tables: IsgTables, points: Points) -> FloatArray:
+        """Return minus E = C P of the parsed numbers with the chain of the list file (of the machine without one).
+
+        The tool offset is the points', else P0X, P0Y, P0Z of the file, else the machine's. Sign: ``result_signs``.
+        """
+        listing = tables.listing
+        chain = self.machine.chain if listing is None else chain_of(listing, self.settings.chain_direction)
+        position = np.asarray(points.position_mm, dtype=np.float64)
+        tool = points.tool_mm if points.tool_mm is not None else self.tool_of(tables)
+        return error_of(chain, tables.fields, position, np.asarray(tool)) * self._result_signs(listing) + 0.0
+
+    def tool_of(self, tables: IsgTables) -> FloatArray:
+        """Tool offset that the control uses without a tool of its own, shape (3,), mm."""
+        if any(name in tables.constants for name in TOOL_NAMES):
+            return np.array([tables.constants.get(name, 0.0) for name in TOOL_NAMES])
+        return np.array(self.machine.tool_offset_mm)
+
+    def violations(self, tables: IsgTables) -> list[str]:
+        """Return limits that are broken, travel that is not covered, and where list and machine file disagree."""
+        settings = self.settings
+        found = list(tables.remarks)
+        if tables.records > settings.max_records:
+            found.append(
+                f"{tables.records} records, max_records is {settings.max_records}: the control refuses the file; raise "
+                f"vol_comp[0].max_records in the start-up list and max_records in the machine file"
+            )
+        found += self._coverage(tables.fields)
+        for k, name in enumerate(LOGICAL_NAMES):
+            if name in tables.constants and tables.constants[name] != settings.logical_axes[k]:
+                found.append(f"{name} = {tables.constants[name]:g}, the machine file says {settings.logical_axes[k]}")
+        return found + self._list_violations(tables)
+
+    def _list_violations(self, tables: IsgTables) -> list[str]:
+        if tables.listing is None:
+            return [f"{len(tables.files)} parameter files, the control takes {MOST_FILES}"] * (
+                len(tables.files) > MOST_FILES
+            )
+        listing, wanted = tables.listing, self._list_of(self.parameter_file, self.file_format)
+        found = disagreements(listing, wanted)
+        if len(listing.files) > MOST_FILES or max(listing.files) >= MOST_FILES:
+            found.append(f"list file: {len(listing.files)} files; the control takes {MOST_FILES}, file[0] ... file[9]")
+        if listing.use_axis_offsets:
+            found.append("list file: use_axis_offsets 1 shifts the positions in a way that is not documented in public")
+        named = {base_name(path).lower(): index for index, path in listing.files.items()}
+        given = {base_name(name).lower() for name in tables.files}
+        found += [f"list file: file[{named[name]}] is {name}, which was not given" for name in sorted({*named} - given)]
+        found += [f"{name} is not named in the list file: the control ignores it" for name in sorted(given - {*named})]
+        for name in sorted(given & {*named}):
+            declared = listing.formats.get(named[name], "ISG_CSV")
+            if declared != self.file_format:
+                found.append(f"list file: {name} is declared {declared}, it is {self.file_format}")
+        return found
+
+    def usage(self, tables: IsgTables) -> list[Usage]:
+        """Return the records of the parameter files against what the control takes."""
+        return [Usage("records (max_records)", tables.records, self.settings.max_records, "records")]
+
+    def resolution_mm(self) -> float:
+        """Half a digit of three lengths, and of six angles and two squareness errors at the longest lever."""
+        return 0.5 * (3 * 10.0**-LENGTH_DIGITS + 8 * 10.0**-ANGLE_DIGITS * self.settings.lever_mm)
+
+    def table_nodes_mm(self, tables: IsgTables) -> tuple[FloatArray, ...]:
+        """Return the arguments of all parameters, by axis."""
+        return nodes_by_axis(
+            pair for item in tables.fields.values() for pair in zip(item.axes, item.nodes_mm, strict=True)
+        )
+
+    def context(self, tables: IsgTables) -> dict[str, Any]:
+        """Return what the templates need: numbers, list entries, the sign in words, parameters and checks."""
+        listing = tables.listing or self._list_of(self.parameter_file, self.file_format)
+        return {
+            **self._notes(tables, listing),
+            **self.body(tables),
+            "tables": tables,
+            "records": tables.records,
+            "listing": listing,
+            "list_entries": LIST_ENTRIES + (1 if listing.negate else 0),
+            "axes": [
+                {"letter": letter, "number": number} for letter, number in zip(AXES, listing.logical_axes, strict=True)
+            ],
+            "absent": [CONTROL_NAMES[name] for name in ERROR_NAMES if name not in tables.fields],
+            "check": self._check_points(tables),
+        }
+
+    def _check_points(self, tables: IsgTables) -> list[dict[str, Any]]:
+        """For each axis the grid point of 3 x 3 x 3 with its largest correction."""
+        lines = [(axis.range_mm[0], 0.5 * sum(axis.range_mm), axis.range_mm[1]) for axis in self.machine.axes]
+        position = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+        added = self.emulate(tables, Points(position))
+        worst = np.argmax(np.abs(added), axis=0)
+        return [
+            {"axis": letter, "position": position[worst[k]].tolist(), "correction": float(added[worst[k], k])}
+            for k, letter in enumerate(AXES)
+        ]
+
+    def _list_of(self, parameter_file: str, file_format: str) -> ListFile:
+        """Return the list file that the export writes."""
+        settings = self.settings
+        return ListFile(
+            logical_axes=settings.logical_axes,
+            chain=chain_text(self.machine.chain, settings.chain_direction),
+            workpiece_axes=len(self.machine.chain.workpiece_side),
+            negate=settings.negate,
+            use_axis_offsets=settings.use_axis_offsets,
+            files={0: settings.path + parameter_file},
+            formats={0: file_format},
+        )
+
+    def _notes(self, tables: IsgTables, listing: ListFile) -> dict[str, Any]:
+        """Return the texts of the context: sign_statement, chain_statement, parameters, warnings."""
+        return {
+            "sign_statement": self._sign_statement(listing),
+            "chain_statement": self._chain_statement(listing),
+            "reference_statement": self._reference_statement(),
+            "parameters": self._parameters(tables, listing),
+            "warnings": self._warnings(listing),
+        }
+
+    def _sign_statement(self, listing: ListFile) -> str:
+        settings = self.settings
+        text = (
+            "Values are errors as ISO 230-1 defines them (actual minus commanded tool position relative to the workpiece), "
+            "in mm and rad; the control takes them off its command. EXX = 0.005 mm at X = 100 mm says that the tool stands "
+            "0.005 mm too far in +X there, and the control must then command X = 99.995 mm."
+        )
+        if settings.reversed_axes:
+            text += f" On {settings.reversed_axes} the check at the machine found the opposite."
+        return text + (f" The list file negates {listing.negate}." if listing.negate else "")
+
+    def _chain_statement(self, listing: ListFile) -> str:
+        settings = self.settings
+        return (
+            f"chain {listing.chain} is meant {_DIRECTIONS[settings.chain_direction]}, {listing.workpiece_axes} of these axes "
+            f"carry the workpiece"
+        )
+
+    def _reference_statement(self) -> str:
+        if self.machine.squareness_reference == "Y":
+            return "the machine file takes Y as the reference: its squareness of X and Y is a slope in EYX here, C0Y is zero"
+        return "the reference direction is X, as in the machine file"
+
+    def _parameters(self, tables: IsgTables, listing: ListFile) -> list[dict[str, object]]:
+        settings = self.settings
+        rows: list[tuple[str, object, str]] = [
+            ("vol_comp[0].file_name", f"{settings.path}volcomp0.lis", "start-up list: the list file"),
+            (
+                "vol_comp[0].max_records",
+                settings.max_records,
+                f"start-up list: at least the {tables.records} records here",
+            ),
+            *(
+                (letter, number or "", f"list file: logical axis number of {letter}")
+                for letter, number in zip("XYZ", listing.logical_axes, strict=True)
+            ),
+            ("chain", listing.chain, f"list file: order of the axes {_DIRECTIONS[settings.chain_direction]}"),
+            ("workpiece_axes", listing.workpiece_axes, "list file: how many axes of the chain carry the workpiece"),
+            ("negate", listing.negate or "not set", "list file: axes whose compensation is turned around"),
+            ("interpolation", listing.interpolation, "list file: linear between the positions of the grid"),
+            ("use_axis_offsets", listing.use_axis_offsets, "list file: 0, positions are machine coordinates"),
+        ]
+        return [{"name": name, "value": value, "meaning": meaning} for name, value, meaning in rows]
+
+    def _warnings(self, listing: ListFile) -> list[str]:
+        found = [
+            f"{self._chain_statement(listing)}. The documents do not say which end comes first; check it at the "
+            f"machine, and set chain_direction in the machine file if it is the other one."
+        ]
+        if any(self.machine.tool_offset_mm) and not self.settings.write_tool_position:
+            offset = ", ".join(f"{value:g}" for value in self.machine.tool_offset_mm)
+            found.append(
+                f"The lever arms hold the tool offset ({offset}) mm. The control must know it too, from its tool data or "
+                f"from P0X, P0Y, P0Z in a parameter file of format ISG_CSV; which of them acts is not documented in public."
+            )
+        turned = "".join(
+            letter for letter in "XYZ" if (letter in listing.negate) != (letter in self.settings.reversed_axes)
+        )
+        if turned:
+            found.append(
+                f"negate and reversed_axes in the machine file differ on {turned}: the control then moves WITH the error. "
+                f"Set reversed_axes to what the check at the machine showed and leave negate out."
+            )
+        if self.settings.use_axis_offsets:
+            found.append(
+                "use_axis_offsets 1: what the control then shifts is not documented in public and not emulated."
+            )
+        return found
+
+    def _result_signs(self, listing: ListFile | None) -> FloatArray:
+        """Sign, shape (3,), with which the error of each axis enters the command: -1, or +1, or 0 (set_to_zero)."""
+        negate = self.settings.negate if listing is None else listing.negate
+        blank = "" if listing is None else listing.set_to_zero
+        signs = np.array([1.0 if letter in self.settings.reversed_axes else -1.0 for letter in AXES])
+        signs[[letter in negate for letter in AXES]] *= -1.0
+        signs[[letter in blank for letter in AXES]] = 0.0
+        return signs
+
+    def _coverage(self, fields: Mapping[str, ParameterGrid]) -> list[str]:
+        """One message per axis and range, naming the errors that it holds for."""
+        names: dict[str, list[str]] = {}
+        for name, item in fields.items():
+            for axis, nodes in zip(item.axes, item.nodes_mm, strict=True):
+                for message in coverage_violations(self.machine, axis, float(nodes[0]), float(nodes[-1]), ""):
+                    names.setdefault(message, []).append(name)
+        return [f"{', '.join(listed)}:{message}" for message, listed in names.items()]

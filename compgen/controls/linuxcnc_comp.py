@@ -1,0 +1,571 @@
+"""LinuxCNC leadscrew compensation (``linuxcnc-comp``): one COMP_FILE per joint, positioning and reversal of X, Y, Z."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
+from compgen.controls.shared.grids import loss_setting, uneven_nodes_mm
+from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray, fixed
+from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
+from compgen.data.lengths import Points
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import axis_setting, choice, setting, whole
+from compgen.errors import InputError
+
+# Text that LinuxCNC reads: lines one by one, so that garbage of any size fails at its first wrong line; numbers; units.
+
+
+#: A number as C reads it with %lf, less hexadecimal digits, ``inf`` and ``nan``.
+_NUMBER = re.compile(r"[+-]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][+-]?\d{1,4})?")
+_BLANK = re.compile(r"[ \t\r\n]*+")
+#: What is quoted of a wrong word.
+SHOWN = 40
+#: Lengths of one unit of the machine, [TRAJ] LINEAR_UNITS: everything that LinuxCNC reads is in machine units.
+MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
+
+
+def units_setting(meaning: str) -> Any:
+    """Declare ``machine_units``: [TRAJ] LINEAR_UNITS of the machine, ``"mm"`` (the default) or ``"inch"``."""
+    return setting(choice(*MM_PER_UNIT), "mm", meaning=meaning)
+
+
+def check_size(source: SourceFile, most: int) -> None:
+    """Raise InputError for a text that is longer than any file of its kind."""
+    if len(source.text) > most:
+        raise source.fail(f"has {len(source.text)} characters; such a file has at most {most}: it is no table", 1)
+
+
+def lines_of(source: SourceFile) -> Iterator[tuple[int, str, bool]]:
+    """Yield number (from 1), text without its end, and whether the line has an end, of each line (LF or CRLF).
+
+    Of blank lines behind each other, however many, only the first is yielded.
+    """
+    text, start, number = source.text, 0, 1
+    while start < len(text):
+        blank = _BLANK.match(text, start)
+        after = text.rfind("\n", start, blank.end() if blank else start) + 1
+        if after > start:
+            yield number, "", True
+            start, number = after, number + text.count("\n", start, after)
+            continue
+        end = text.find("\n", start)
+        last = len(text) if end < 0 else end
+        yield number, text[start:last].removesuffix("\r"), end >= 0
+        start, number = last + 1, number + 1
+
+
+def number_in(source: SourceFile, line: int, word: str, what: str) -> float:
+    """Return a finite number; InputError with the line for a decimal comma, nan, inf or anything else."""
+    if _NUMBER.fullmatch(word) and math.isfinite(value := float(word)):
+        return value
+    hint = "; LinuxCNC reads '.' as decimal point" if "," in word else ""
+    raise source.fail(f"{word[:SHOWN]!r} is not a number; expected {what}{hint}", line)
+
+
+def whole_in(source: SourceFile, line: int, word: str, what: str, limits: tuple[int, int]) -> int:
+    """Return a whole number within ``limits`` (both included); else InputError with the line."""
+    if not re.fullmatch(r"\d{1,9}", word) or not limits[0] <= int(word) <= limits[1]:
+        raise source.fail(f"{word[:SHOWN]!r} is not {what}; expected {limits[0]} ... {limits[1]}", line)
+    return int(word)
+
+
+# LinuxCNC's COMP_FILE: strict reading, and the control's rule in its own arithmetic (float32 trims and slopes).
+#
+# The rule was read from running LinuxCNC 2.9: trims and their slopes are stored as float32, positions as double; the table
+# holds its end values outside; a position p with ``nominal[i] <= p < nominal[i+1]`` is corrected by
+# ``trim[i] + slope[i] * (p - nominal[i])``, forward while the joint moves up, reverse while it moves down. The correction is
+# ADDED to the motor command.
+
+
+#: Rows that LinuxCNC keeps, and characters of a line that it reads.
+MOST_ROWS, LONGEST_LINE = 256, 254
+_MOST_CHARACTERS = 1_000_000
+#: A step of the correction at standstill acts at once below the first share of a T^2, is ramped above the second, and
+#: never acts in between (a: joint acceleration, T: servo period).
+AT_ONCE, RAMPED = 0.25, 0.5
+#: Columns whose values grow by more than this share of the nominal position are positions and no trims.
+_LIKE_POSITIONS = 0.9
+_COLUMNS = ("the nominal position", "the forward value", "the reverse value")
+
+
+@dataclass(frozen=True)
+class CompTable:
+    """One COMP_FILE with the numbers of its text, in machine units of ``mm_per_unit``, in which the control rounds too.
+
+    ``nominal`` (n,) is strictly increasing; ``forward`` and ``reverse`` (n,) are trims, which are added.
+    """
+
+    nominal: FloatArray
+    forward: FloatArray
+    reverse: FloatArray
+    mm_per_unit: float = 1.0
+
+    @property
+    def nominal_mm(self) -> FloatArray:
+        """Positions of the rows, mm."""
+        return self.nominal * self.mm_per_unit
+
+    @property
+    def forward_mm(self) -> FloatArray:
+        """Trims while the joint moves up, mm."""
+        return self.forward * self.mm_per_unit
+
+    @property
+    def reverse_mm(self) -> FloatArray:
+        """Trims while the joint moves down, mm."""
+        return self.reverse * self.mm_per_unit
+
+    def at(self, position_mm: FloatArray, direction: int) -> FloatArray:
+        """Return the correction at joint positions (m,) in the direction +1 or -1, bit for bit as the control."""
+        trims = (self.forward if direction > 0 else self.reverse).astype(np.float32)
+        slopes = _slopes(self.nominal, trims)
+        position = np.asarray(position_mm, dtype=np.float64) / self.mm_per_unit
+        row = np.searchsorted(self.nominal, position, side="right") - 1
+        inside = np.clip(row, 0, len(trims) - 1)
+        found = trims[inside].astype(np.float64) + slopes[inside].astype(np.float64) * (position - self.nominal[inside])
+        return np.where(row < 0, np.float64(trims[0]), found) * self.mm_per_unit
+
+    @property
+    def step_mm(self) -> FloatArray:
+        """Size of the step between forward and reverse at each row, shape (n,), mm."""
+        return np.abs(self.forward_mm - self.reverse_mm)
+
+
+def _slopes(nominal: FloatArray, trims: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Slopes behind each row, float32 of the float32 differences; zero behind the last."""
+    differences = (trims[1:] - trims[:-1]).astype(np.float64)
+    return np.append((differences / np.diff(nominal)).astype(np.float32), np.float32(0.0))
+
+
+def standstill_outcome(step_mm: float, acceleration_mm_s2: float, period_s: float) -> str:
+    """Say what a step of the correction does from standstill: ``"at once"``, ``"never"`` or ``"ramped"``.
+
+    LinuxCNC ramps the correction with half of the joint's acceleration. A step of at most 0.25 a T^2 is applied at once,
+    above 0.5 a T^2 it is ramped; in between the filter keeps its velocity of zero (found by running LinuxCNC 2.9).
+
+    >>> [standstill_outcome(step, 5000.0, 1e-3) for step in (0.001, 0.002, 0.003)]
+    ['at once', 'never', 'ramped']
+    """
+    unit_mm = acceleration_mm_s2 * period_s**2
+    if abs(step_mm) <= AT_ONCE * unit_mm:
+        return "at once"
+    return "never" if abs(step_mm) <= RAMPED * unit_mm else "ramped"
+
+
+def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> CompTable:
+    """Read a COMP_FILE strictly.
+
+    Parameters
+    ----------
+    source : the text; CRLF, exponents and further columns are what the control takes too.
+    file_type : 0: nominal, actual forward, actual reverse (the trim is nominal minus actual); 1: the trims themselves.
+    mm_per_unit : unit of the machine, in which the file is written; the file itself does not say it.
+
+    Raises
+    ------
+    InputError
+        with the line, for what makes the control stop reading without a word (a comment, a blank line, text, a decimal
+        comma), for rows that it drops (more than 256, or not increasing), and for a file that was cut.
+    """
+    check_size(source, _MOST_CHARACTERS)
+    rows: list[tuple[float, ...]] = []
+    blank = 0
+    for line, text, ended in lines_of(source):
+        if not text.strip(" \t"):
+            blank = blank or line
+            continue
+        if blank:
+            raise source.fail("is blank, and LinuxCNC stops reading there without a word; take the line out", blank)
+        rows.append(_row(source, line, text, rows))
+        if not ended:
+            raise source.fail("the last line has no line end; was the file cut?", line)
+    if not rows:
+        raise source.fail("holds no row; is it the right file, or was it cut?", 1)
+    nominal, forward, reverse = np.array(rows).T
+    _check_type(source, file_type, nominal, forward)
+    if file_type == 0:
+        return CompTable(nominal, nominal - forward, nominal - reverse, mm_per_unit)
+    return CompTable(nominal, forward, reverse, mm_per_unit)
+
+
+def _check_type(source: SourceFile, file_type: int, nominal: FloatArray, forward: FloatArray) -> None:
+    """Refuse positions that would be read as trims, and trims that would be read as positions: mistakes of many mm."""
+    span = float(np.ptp(nominal))
+    slope = float(np.ptp(forward)) / span if span > 0.0 and len(nominal) > 2 else 0.5
+    if file_type == 1 and slope > _LIKE_POSITIONS:
+        message = "these are nominal and actual positions (file type 0), and comp_file_type is 1: the trims would be"
+    elif file_type == 0 and slope < 1.0 - _LIKE_POSITIONS:
+        message = "these are trims (file type 1), and comp_file_type is 0: the trims would be"
+    else:
+        return
+    largest = float(np.max(np.abs(forward if file_type == 1 else nominal - forward)))
+    raise source.fail(f"{message} up to {largest:g} machine units; set comp_file_type in the machine file", 1)
+
+
+def _row(source: SourceFile, line: int, text: str, above: list[tuple[float, ...]]) -> tuple[float, ...]:
+    if len(text) > LONGEST_LINE:
+        raise source.fail(f"has {len(text)} characters; LinuxCNC reads {LONGEST_LINE} of a line", line)
+    words = text.split()
+    if words[0][0] in "#;(%":
+        raise source.fail("is a comment; LinuxCNC stops reading there without a word, take the line out", line)
+    if len(words) < 3:
+        message = f"has {len(words)} columns; expected nominal, forward and reverse, got {text.strip()[:SHOWN]!r}"
+        raise source.fail(message, line)
+    row = tuple(number_in(source, line, word, what) for word, what in zip(words, _COLUMNS, strict=False))
+    if above and row[0] <= above[-1][0]:
+        message = f"{row[0]:g} does not lie above {above[-1][0]:g} of the row before; LinuxCNC drops such a row"
+        raise source.fail(message, line)
+    if len(above) == MOST_ROWS:
+        raise source.fail(f"is row {MOST_ROWS + 1}; LinuxCNC takes {MOST_ROWS} rows and drops the rest", line)
+    return row
+
+
+# What is said to the user of a COMP_FILE: sign, INI lines, and reversal steps that the control may not apply.
+
+
+_SECONDS_PER_US = 1e-6
+#: A step below this is none.
+_NO_STEP_MM = 1e-9
+
+
+def sign_statement(file_type: int, unit: str, tables: Mapping[int, CompTable]) -> str:
+    """Return the sign in words with a number from the file."""
+    axis, table = max(tables.items(), key=lambda item: float(np.max(np.abs(item[1].forward))))
+    row = int(np.argmax(np.abs(table.forward)))
+    position, trim = float(table.nominal[row]), float(table.forward[row])
+    places = 6 if unit == "mm" else 8
+    written = f"the trim {trim:+.{places}f}" if file_type == 1 else f"the actual position {position - trim:.{places}f}"
+    return (
+        f"COMP_FILE_TYPE {file_type}: the trim is ADDED to the motor command. The file of {AXES[axis]} has {written} at "
+        f"{position:.9g} {unit} (forward), so the motor is sent to {position + trim:.{places}f} {unit} there."
+    )
+
+
+def parameters(
+    file_type: int, unit: str, servo_period_us: float, tables: Mapping[int, CompTable], files: Sequence[str]
+) -> list[dict[str, str]]:
+    """Return the INI lines of each joint, and the accelerations at which a reversal step may be lost, in machine units."""
+    rows = [
+        {
+            "name": "[TRAJ] LINEAR_UNITS",
+            "value": unit,
+            "meaning": "unit of all numbers in the files; LinuxCNC takes them in its own unit, whatever they were meant in",
+        }
+    ]
+    for axis, table in sorted(tables.items()):
+        section = f"[JOINT_{axis}]"
+        rows.append({"name": f"{section} COMP_FILE", "value": files[axis], "meaning": f"the file of {AXES[axis]}"})
+        rows.append({"name": f"{section} COMP_FILE_TYPE", "value": str(file_type), "meaning": _type_meaning(file_type)})
+        rows.append(
+            {
+                "name": f"{section} BACKLASH",
+                "value": "0",
+                "meaning": "not used together with a COMP_FILE; put a former value into the file",
+            }
+        )
+        steps = table.step_mm[table.step_mm > _NO_STEP_MM]
+        if len(steps):
+            low, high = (
+                value / table.mm_per_unit
+                for value in _lost_between(float(steps.min()), float(steps.max()), servo_period_us)
+            )
+            rows.append(
+                {
+                    "name": f"{section} MAX_ACCELERATION",
+                    "value": f"not {low:.0f} ... {high:.0f} {unit}/s2",
+                    "meaning": f"with SERVO_PERIOD {servo_period_us:g} us; within, the reversal step of {AXES[axis]} may "
+                    "not be applied from standstill",
+                }
+            )
+    return rows
+
+
+def _type_meaning(file_type: int) -> str:
+    if file_type == 1:
+        return "nominal, forward trim, reverse trim"
+    return "nominal, actual forward, actual reverse"
+
+
+def _lost_between(least_mm: float, largest_mm: float, servo_period_us: float) -> tuple[float, float]:
+    """Accelerations between which some of the steps lie in the dead zone, mm/s^2."""
+    square = (servo_period_us * _SECONDS_PER_US) ** 2
+    return least_mm / (RAMPED * square), largest_mm / (AT_ONCE * square)
+
+
+def dead_zone_warnings(
+    servo_period_us: float, accelerations_mm_s2: Sequence[float] | None, tables: Mapping[int, CompTable]
+) -> list[str]:
+    """Return a warning for each joint whose reversal steps the control may not apply at the stated acceleration."""
+    if accelerations_mm_s2 is None:
+        return []
+    found = []
+    period_s = servo_period_us * _SECONDS_PER_US
+    for axis, table in sorted(tables.items()):
+        acceleration = accelerations_mm_s2[axis]
+        lost = [step for step in table.step_mm.tolist() if standstill_outcome(step, acceleration, period_s) == "never"]
+        if lost:
+            unit_um = acceleration * period_s**2 / MM_PER_UM
+            found.append(
+                f"the reversal step of {AXES[axis]} ({max(lost) / MM_PER_UM:.3f} um) lies between {AT_ONCE * unit_um:.3f} "
+                f"and {RAMPED * unit_um:.3f} um: LinuxCNC does not apply such a step from standstill at MAX_ACCELERATION "
+                f"{acceleration:g} mm/s2 and SERVO_PERIOD {servo_period_us:g} us. Up to {RAMPED * unit_um:.3f} um may stay; "
+                "change the acceleration or the period"
+            )
+    return found
+
+
+# LinuxCNC leadscrew compensation: one COMP_FILE per joint, positioning and reversal of X, Y and Z.
+#
+# Source: LinuxCNC 2.9 (Debian 12), manual "INI Configuration", section [JOINT_n], and runs of the control itself.
+
+
+#: Names of the files; joint 0, 1, 2 is X, Y, Z as in ``trivkins coordinates=XYZ``.
+FILES = ("joint0-x.comp", "joint1-y.comp", "joint2-z.comp")
+POSITION_DIGITS, VALUE_DIGITS = 9, 9
+#: Decimals, and float32: a trim of 1 mm is kept to 3e-8 mm, its slope likewise.
+_RESOLUTION_MM = 1e-7
+_AXIS_OF_NAME = re.compile(r"joint_?([012])(?!\d)|(?<![a-z])([xyz])(?![a-z])", re.IGNORECASE)
+
+
+#: The letter of an axis at the end of a name, behind small letters (screwcompX) or a mark (screw_x).
+_LAST_LETTER = re.compile(r"((?<=[a-z0-9])[XYZ]|(?<=[_.-])[xyzXYZ])$")
+
+
+def _positive3(value: Any) -> tuple[float, float, float]:
+    x, y, z = toml_files.vector3(value)
+    if min(x, y, z) <= 0:
+        raise ValueError("three numbers above zero, for X, Y and Z, are expected")
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class CompSettings:
+    """Settings ``[controllers.linuxcnc-comp]``."""
+
+    comp_file_type: int = setting(
+        whole(0, 1), 1, meaning="INI key of that name; 1: the file holds trims, 0: nominal and actual positions"
+    )
+    loss_mm: float = loss_setting()
+    servo_period_us: float = setting(
+        toml_files.positive,
+        1000.0,
+        meaning="[EMCMOT] SERVO_PERIOD, us, for the warning about small steps at a reversal",
+    )
+    max_acceleration_mm_s2: tuple[float, float, float] | None = setting(
+        _positive3, None, meaning="[JOINT_n] MAX_ACCELERATION of X, Y, Z, for the same warning"
+    )
+    machine_units: str = units_setting(
+        "[TRAJ] LINEAR_UNITS, mm or inch: LinuxCNC takes the numbers of a COMP_FILE in machine units"
+    )
+    comp_files: tuple[str | None, str | None, str | None] = axis_setting(
+        toml_files.text, meaning="names of the COMP_FILEs of X, Y, Z on the control, for reading them under any name"
+    )
+
+    @property
+    def mm_per_unit(self) -> float:
+        """Length of one machine unit, mm."""
+        return MM_PER_UNIT[self.machine_units]
+
+
+@dataclass(frozen=True)
+class CompTables:
+    """Tables by axis 0..2; an axis without one is not corrected."""
+
+    tables: Mapping[int, CompTable]
+
+
+class LinuxcncComp(Controller[CompSettings, CompTables]):
+    """``linuxcnc-comp``: positioning of each joint, with its reversal."""
+
+    name = "linuxcnc-comp"
+    settings_class = CompSettings
+    bidirectional = True
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return X(x), Y(y), Z(z) with rows where the curves need them."""
+        nodes = [
+            _written_mm(
+                uneven_nodes_mm(self.machine, errors, axis, loss_mm=self.settings.loss_mm, most=MOST_ROWS),
+                self.settings,
+            )
+            for axis in range(3)
+        ]
+        return one_dimensional_terms(self.machine, errors, nodes, [(axis, axis) for axis in range(3)])
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> CompTables:
+        """Return the trims, rounded as they are written; both directions alike."""
+        found = {}
+        for axis in range(3):
+            term = next(item for item in basis if item.name == one_dimensional_name(axis, axis))
+            trims = values[term.name]
+            found[axis] = self._as_written(term.nodes_mm, trims, trims)
+        return CompTables(found)
+
+    def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
+        """Return the reversal of each axis along itself; a displacement across has no place in a COMP_FILE."""
+        return replace(reversal, curves={key: part for key, part in reversal.curves.items() if key[0] == key[1]})
+
+    def with_reversal(self, tables: CompTables, reversal: ReversalCurves) -> CompTables:
+        """Return the tables with -B/2 in the forward and +B/2 in the reverse column (B: reversal value)."""
+        found = dict(tables.tables)
+        for (axis, _), curve in reversal.curves.items():
+            if np.max(np.abs(curve.value)) < WORTH_MM:
+                continue
+            table = found[axis]
+            low, high = self.machine.axes[axis].range_mm
+            inside = curve.position_mm[(curve.position_mm >= low) & (curve.position_mm <= high)]
+            nodes = np.union1d(table.nominal_mm, _written_mm(inside, self.settings))
+            nodes = table.nominal_mm if len(nodes) > MOST_ROWS else nodes
+            half = 0.5 * curve.at(nodes)
+            forward = np.interp(nodes, table.nominal_mm, table.forward_mm) - half
+            reverse = np.interp(nodes, table.nominal_mm, table.reverse_mm) + half
+            found[axis] = self._as_written(nodes, forward, reverse)
+        return CompTables(found)
+
+    def backlash_parameters(self, reversal: ReversalCurves) -> list[dict[str, str]]:
+        """Return none: a joint with a COMP_FILE ignores BACKLASH, and what is left lies across the axis."""
+        return []
+
+    def context(self, tables: CompTables) -> dict[str, Any]:
+        """Return rows by axis letter, INI lines, and what to know of small reversal steps."""
+        settings = self.settings
+        return {
+            "sign_statement": sign_statement(settings.comp_file_type, settings.machine_units, tables.tables),
+            "parameters": parameters(
+                settings.comp_file_type, settings.machine_units, settings.servo_period_us, tables.tables, FILES
+            ),
+            "warnings": dead_zone_warnings(settings.servo_period_us, settings.max_acceleration_mm_s2, tables.tables),
+            "comp_file_type": settings.comp_file_type,
+            "unit": settings.machine_units,
+            "tables": [
+                {"letter": AXES[axis], "joint": axis, "file": FILES[axis], "rows": self._rows(table)}
+                for axis, table in sorted(tables.tables.items())
+            ],
+        }
+
+    def parse(self, files: Sequence[SourceFile]) -> CompTables:
+        """Read one file per joint; its name says which: ``joint0`` or the letter, as in ``joint0-x.comp``."""
+        found: dict[int, CompTable] = {}
+        for source in files:
+            axis = _axis_of(source)
+            if axis in found:
+                raise source.fail(f"is a second file for {AXES[axis]}; give one per joint")
+            found[axis] = parse_comp(source, self.settings.comp_file_type, self.settings.mm_per_unit)
+        if not found:
+            raise InputError(f"no COMP_FILE was given; expected {', '.join(FILES)}")
+        return CompTables(found)
+
+    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CompTables, list[str]]:
+        """Read COMP_FILEs under any name: ``comp_files`` says whose they are, else a letter at the end of the name."""
+        settings = self.settings
+        found: dict[int, CompTable] = {}
+        remarks = []
+        for source in files:
+            axis = _axis_of_foreign(source, settings.comp_files)
+            if axis in found:
+                raise source.fail(f"is a second file for {AXES[axis]}; give one per joint")
+            found[axis] = parse_comp(source, settings.comp_file_type, settings.mm_per_unit)
+            remarks.append(f"{source.path.name} was taken for {AXES[axis]}, type {settings.comp_file_type}")
+        return CompTables(found), remarks
+
+    def emulate(self, tables: CompTables, points: Points) -> FloatArray:
+        """Return the trims at the commanded positions in the direction of the last travel; its mean if unknown.
+
+        This is the settled correction; what the control's filter does with small steps from standstill is
+        :func:`compgen.controls.linuxcnc_comp.standstill_outcome`.
+        """
+        added = np.zeros((len(points), 3))
+        for axis, table in tables.tables.items():
+            position = points.position_mm[:, axis]
+            forward, reverse = table.at(position, 1), table.at(position, -1)
+            travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, axis])
+            added[:, axis] = np.select([travel > 0, travel < 0], [forward, reverse], 0.5 * (forward + reverse))
+        return added
+
+    def violations(self, tables: CompTables) -> list[str]:
+        """Return joints without a table, and travel that a table leaves out: that of a file in another unit among them."""
+        found = [f"there is no COMP_FILE for {AXES[axis]}" for axis in range(3) if axis not in tables.tables]
+        for axis, table in sorted(tables.tables.items()):
+            first, last = table.nominal_mm[0], table.nominal_mm[-1]
+            left_out = coverage_violations(self.machine, axis, first, last, f"the COMP_FILE of {AXES[axis]}")
+            other = "inch" if self.settings.machine_units == "mm" else "mm"
+            share = MM_PER_UNIT[other] / self.settings.mm_per_unit
+            if left_out and not coverage_violations(self.machine, axis, first * share, last * share, ""):
+                left_out = [f"{text}; in {other} it would cover it: is machine_units right?" for text in left_out]
+            found += left_out
+        return found
+
+    def resolution_mm(self) -> float:
+        """Half of the last decimal, and what float32 takes away."""
+        return _RESOLUTION_MM
+
+    def table_nodes_mm(self, tables: CompTables) -> tuple[FloatArray, ...]:
+        """Return the nominal positions of each joint."""
+        return nodes_by_axis((axis, table.nominal_mm) for axis, table in tables.tables.items())
+
+    def usage(self, tables: CompTables) -> list[Usage]:
+        """Return the rows of each joint against the 256 that LinuxCNC takes."""
+        return [
+            Usage(f"rows of {AXES[axis]}", len(table.nominal_mm), MOST_ROWS, "rows")
+            for axis, table in sorted(tables.tables.items())
+        ]
+
+    def _as_written(self, nominal_mm: FloatArray, forward_mm: FloatArray, reverse_mm: FloatArray) -> CompTable:
+        """Return the table of these positions and trims as it is read back from its text."""
+        unit = self.settings.mm_per_unit
+        table = CompTable(nominal_mm / unit, forward_mm / unit, reverse_mm / unit, unit)
+        nominal, forward, reverse = (_written(column) for column in np.array(self._rows(table)).T)
+        if self.settings.comp_file_type == 0:
+            forward, reverse = nominal - forward, nominal - reverse
+        return CompTable(nominal, forward, reverse, unit)
+
+    def _rows(self, table: CompTable) -> list[list[float]]:
+        """Rows of the file, in machine units: nominal, then trims (type 1) or actual positions (type 0)."""
+        forward, reverse = table.forward, table.reverse
+        if self.settings.comp_file_type == 0:
+            forward, reverse = table.nominal - forward, table.nominal - reverse
+        return [list(row) for row in zip(table.nominal.tolist(), forward.tolist(), reverse.tolist(), strict=True)]
+
+
+def _written(values: FloatArray, digits: int = POSITION_DIGITS) -> FloatArray:
+    return np.array([float(fixed(value, digits)) for value in values.tolist()])
+
+
+def _written_mm(position_mm: FloatArray, settings: CompSettings) -> FloatArray:
+    """Positions as the file has them, in mm: two that are equal in the file are equal here, to the last bit."""
+    return _written(position_mm / settings.mm_per_unit) * settings.mm_per_unit
+
+
+def _axis_of_foreign(source: SourceFile, comp_files: tuple[str | None, ...]) -> int:
+    """The axis of a file: as the machine file states it, by our own rule, or by the last letter of its name."""
+    if source.path.name in comp_files:
+        return comp_files.index(source.path.name)
+    last = _LAST_LETTER.search(source.path.stem)
+    if last and not _AXIS_OF_NAME.search(source.path.name):
+        return AXES.index(last.group(1).upper())
+    try:
+        return _axis_of(source)
+    except InputError:
+        message = (
+            "the name does not say which joint it belongs to; state it in the machine file: [controllers.linuxcnc-comp] "
+            f'comp_files = {{ X = "{source.path.name}" }}'
+        )
+        raise source.fail(message) from None
+
+
+def _axis_of(source: SourceFile) -> int:
+    matches = list(_AXIS_OF_NAME.finditer(source.path.name))
+    if not matches:
+        raise source.fail(f"the name does not say which joint it belongs to; expected a name such as {FILES[0]!r}")
+    joint, letter = matches[-1].groups()
+    return int(joint) if joint else AXES.index(letter.upper())

@@ -1,0 +1,786 @@
+"""LinuxCNC volumetric compensation (``linuxcnc-volumetric``): the table of compgen's kinematics module ``volkins``."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, product
+from typing import Any
+
+import numpy as np
+
+from compgen.controls.linuxcnc_comp import (
+    MM_PER_UNIT,
+    SHOWN,
+    check_size,
+    lines_of,
+    number_in,
+    units_setting,
+    whole_in,
+)
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
+from compgen.controls.shared.grids import equidistant_grid, loss_setting, trilinear
+from compgen.controls.shared.terms import error_terms
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray, fixed
+from compgen.data.error_table import ErrorTable
+from compgen.data.lengths import Points
+from compgen.data.machine import Vector3
+from compgen.data.names import AXES, ERROR_INDEX, error_named
+from compgen.data.toml_files import choice, setting, whole
+from compgen.errors import InputError
+from compgen.kinematics.first_order import tool_of
+
+# The table of the LinuxCNC kinematics ``volkins``: E = C P or a grid, evaluated in the arithmetic of the C sources.
+#
+# E(q, t) is the error of the tool tip (actual minus commanded) with the axes at q and the tool offset t; the tip stands at
+# P = q + E(q, t) (less the tool offset), so the control sends the axes to q = P - E(q, t), by iteration.
+
+
+#: Factors of a term, in the words of the file.
+LEVERS = ("1", "x", "y", "z", "tx", "ty", "tz")
+#: Limits of ``volcomp.h``.
+MOST_CURVES, MOST_TERMS, MOST_NODES, MOST_VERTICES, LONGEST_NAME = 64, 512, 10_000, 100_000, 31
+#: The iteration of the inverse ends when no axis moves by more than this and this part of its coordinate (far from
+#: machine zero neighbouring numbers differ by more than the first), or fails after so many rounds.
+LAST_STEP_MM, LAST_PART, MOST_ROUNDS = 1e-13, 1e-15, 50
+
+
+@dataclass(frozen=True)
+class VolCurve:
+    """One curve over ``axis``: values (n,) in mm or rad at ``first_mm + k step_mm``; the end values hold outside."""
+
+    name: str
+    axis: int
+    first_mm: float
+    step_mm: float
+    values: FloatArray
+
+    @property
+    def nodes_mm(self) -> FloatArray:
+        """Positions of the values, shape (n,)."""
+        return np.asarray(self.first_mm + self.step_mm * np.arange(len(self.values)), dtype=np.float64)
+
+    def at(self, position_mm: FloatArray) -> FloatArray:
+        """Value at positions (m,)."""
+        last = len(self.values) - 1
+        ratio = np.clip((position_mm - self.first_mm) / self.step_mm, 0.0, float(last))
+        left = np.minimum(ratio.astype(np.int64), max(last - 1, 0))
+        right = np.minimum(left + 1, last)
+        below = self.values[left]
+        between = below + (ratio - left) * (self.values[right] - below)
+        return np.asarray(np.where(ratio >= last, self.values[last], between))
+
+
+@dataclass(frozen=True)
+class VolTerm:
+    """Adds coefficient x lever x curve to the error of axis ``output``; ``lever`` is one of :data:`LEVERS`."""
+
+    output: int
+    curve: str
+    coefficient: float
+    lever: str
+
+
+@dataclass(frozen=True)
+class VolGrid:
+    """Errors ``vertices_mm`` (nx, ny, nz, 3) at ``first_mm + (i, j, k) step_mm``, for one tool offset."""
+
+    first_mm: tuple[float, float, float]
+    step_mm: tuple[float, float, float]
+    vertices_mm: FloatArray
+
+
+@dataclass(frozen=True)
+class VolTable:
+    """A table as the kinematics module reads it: curves with terms, or a grid.
+
+    Numbers are in mm here; ``unit`` is that of the lengths in the file: the unit of the machine, ``"mm"`` or ``"inch"``.
+    """
+
+    curves: tuple[VolCurve, ...]
+    terms: tuple[VolTerm, ...]
+    grid: VolGrid | None = None
+    unit: str = "mm"
+
+    def scaled(self, factor: float) -> VolTable:
+        """Return the table with all lengths times ``factor``: from the unit of the file to mm, and back.
+
+        A curve is a length where a term takes it as it is (lever 1). Beside a lever it is an angle and has no unit; a curve
+        that is used in both ways is taken as a length, and the coefficient of the terms with a lever makes up for it.
+        """
+        if factor == 1.0:
+            return self
+        lengths = {term.curve for term in self.terms if term.lever == LEVERS[0]}
+        curves = tuple(
+            replace(
+                curve,
+                first_mm=curve.first_mm * factor,
+                step_mm=curve.step_mm * factor,
+                values=curve.values * factor if curve.name in lengths else curve.values,
+            )
+            for curve in self.curves
+        )
+        both = {term for term in self.terms if term.curve in lengths and term.lever != LEVERS[0]}
+        terms = tuple(
+            replace(term, coefficient=term.coefficient / factor) if term in both else term for term in self.terms
+        )
+        grid = self.grid
+        if grid is not None:
+            x, y, z = (value * factor for value in grid.first_mm)
+            hx, hy, hz = (value * factor for value in grid.step_mm)
+            grid = VolGrid((x, y, z), (hx, hy, hz), grid.vertices_mm * factor)
+        return VolTable(curves, terms, grid, self.unit)
+
+    def error(self, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
+        """E at axis positions (n, 3) with tool offsets (3,) or (n, 3): shape (n, 3), mm, actual minus commanded."""
+        if self.grid is not None:
+            return trilinear(
+                self.grid.vertices_mm, np.array(self.grid.first_mm), np.array(self.grid.step_mm), position_mm
+            )
+        tool = np.broadcast_to(tool_mm, position_mm.shape)
+        levers = dict(zip(LEVERS, [np.ones(len(position_mm)), *position_mm.T, *tool.T], strict=True))
+        values = {curve.name: curve.at(position_mm[:, curve.axis]) for curve in self.curves}
+        error = np.zeros((len(position_mm), 3))
+        for term in self.terms:
+            error[:, term.output] += term.coefficient * levers[term.lever] * values[term.curve]
+        return error
+
+    def forward(self, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
+        """Where the tip stands, less the tool offset, with the axes at positions (n, 3): shape (n, 3), mm."""
+        return position_mm + self.error(position_mm, tool_mm)
+
+    def inverse(self, wanted_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
+        """Axis positions at which the tip stands at ``wanted_mm`` (n, 3), less the tool offset: shape (n, 3), mm.
+
+        InputError where the iteration does not end: no machine has such errors, and the control refuses to move.
+        """
+        axes = np.array(wanted_mm, dtype=np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(MOST_ROUNDS):
+                following = wanted_mm - self.error(axes, tool_mm)
+                ended = np.abs(following - axes) <= LAST_STEP_MM + LAST_PART * np.abs(following)
+                axes = following
+                if np.all(ended):
+                    return axes
+        raise InputError(
+            "the errors of the table change too fast with position: no position puts the tool where it belongs"
+        )
+
+    def slope(self, lower_mm: FloatArray, upper_mm: FloatArray, tool_mm: FloatArray) -> float:
+        """Upper bound of the change of E per mm of travel within a box; well below 1 the inverse exists and is unique."""
+        if self.grid is not None:
+            parts = [
+                np.max(np.abs(np.diff(self.grid.vertices_mm, axis=axis)), initial=0.0) / step
+                for axis, step in enumerate(self.grid.step_mm)
+            ]
+            return float(sum(parts))
+        reach = np.concatenate([[1.0], np.maximum(np.abs(lower_mm), np.abs(upper_mm)), np.abs(tool_mm)])
+        largest = dict(zip(LEVERS, reach.tolist(), strict=True))
+        curves = {curve.name: curve for curve in self.curves}
+        sums = np.zeros(3)
+        for term in self.terms:
+            curve = curves[term.curve]
+            steepest = np.max(np.abs(np.diff(curve.values)), initial=0.0) / curve.step_mm
+            own = np.max(np.abs(curve.values)) if term.lever in LEVERS[1:4] else 0.0
+            sums[term.output] += abs(term.coefficient) * (largest[term.lever] * steepest + own)
+        return float(np.max(sums))
+
+
+def checksum(words: Iterable[str]) -> str:
+    """CRC-32 of the words from ``volcomp`` to ``end`` with one blank between two, as 8 hexadecimal digits.
+
+    >>> checksum("volcomp 1 end".split())
+    'CF835787'
+    """
+    total, joint = 0, b""
+    for word in words:
+        total = zlib.crc32(joint + word.encode("ascii", "replace"), total)
+        joint = b" "
+    return f"{total:08X}"
+
+
+# Strict reading of the table of ``volkins``: as strict as the C sources, with the line of what is wrong.
+#
+# Words are separated by white space: ``volcomp 1``, ``unit mm`` or ``unit inch`` (mm where it is missing: tables of versions that
+# wrote mm only), then ``curve NAME AXIS COUNT FIRST STEP`` with COUNT numbers, ``term OUTPUT
+# CURVE COEFFICIENT LEVER``, or ``grid NX NY NZ X0 Y0 Z0 HX HY HZ`` with 3 NX NY NZ numbers (x fastest), then ``end``.
+# Comments (``#`` to the end of the line) and one ``crc32 XXXXXXXX`` of all words up to ``end`` follow.
+
+
+_LONGEST_LINE = 4096
+_MOST_CHARACTERS = 32_000_000
+_MAGIC = ("volcomp", "1")
+
+
+class _WordReader:
+    """The words of a file one by one, with the line they stand in; all that were taken count for the checksum."""
+
+    def __init__(self, source: SourceFile) -> None:
+        self.source, self.line, self.taken = source, 1, list[str]()
+        self._lines = lines_of(source)
+        self._words: Iterator[str] = iter(())
+
+    def take(self, what: str) -> str:
+        """Return the next word, which must be there; InputError at the end of the file."""
+        word = next(self._words, None)
+        while word is None:
+            following = next(self._lines, None)
+            if following is None:
+                raise self.source.fail(f"expected {what}, but the file ends: it was cut", self.line)
+            self._words = iter(self._split(*following))
+            word = next(self._words, None)
+        self.taken.append(word)
+        return word
+
+    def _split(self, line: int, text: str, _: bool) -> list[str]:
+        self.line = line
+        if len(text) > _LONGEST_LINE:
+            raise self.source.fail(f"has {len(text)} characters; {_LONGEST_LINE} are allowed", line)
+        return text.split()
+
+    def number(self, what: str) -> float:
+        """Return the next word as a finite number."""
+        word = self.take(what)  # first: it may stand in the next line
+        return number_in(self.source, self.line, word, what)
+
+    def whole(self, what: str, low: int, high: int) -> int:
+        """Return the next word as a whole number from ``low`` to ``high``."""
+        word = self.take(what)
+        return whole_in(self.source, self.line, word, what, (low, high))
+
+    def step(self) -> float:
+        """Return the next word as a number above zero."""
+        value = self.number("a step")
+        if value <= 0:
+            raise self.source.fail(f"the step {value:g} is not above zero", self.line)
+        return value
+
+    def numbers(self, count: int) -> FloatArray:
+        """Return the next ``count`` words as numbers."""
+        return np.array([self.number("a value") for _ in range(count)])
+
+    def rest(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield line and words of what follows; the words left in the line that is being read come first."""
+        first = (self.line, list(self._words))
+        split = ((line, self._split(line, text, ended)) for line, text, ended in self._lines)
+        return ((line, words) for line, words in chain([first], split) if words)
+
+
+def parse_volcomp(source: SourceFile) -> VolTable:
+    """Read a table; InputError with the line for anything that the kinematics module refuses."""
+    check_size(source, _MOST_CHARACTERS)
+    words = _WordReader(source)
+    for due in _MAGIC:
+        if (word := words.take("'volcomp 1'")) != due:
+            raise source.fail(f"expected 'volcomp 1' at the start, found {word[:SHOWN]!r}", words.line)
+    curves: dict[str, VolCurve] = {}
+    terms: list[VolTerm] = []
+    grid: VolGrid | None = None
+    unit = "mm"
+    word = words.take("'end'")
+    if word == "unit":
+        unit, word = _unit(words), words.take("'end'")
+    while word != "end":
+        if word == "curve":
+            curve = _read_curve(words, curves)
+            curves[curve.name] = curve
+        elif word == "term":
+            terms.append(_read_term(words, curves, len(terms)))
+        elif word == "grid" and grid is None:
+            grid = _read_grid(words)
+        else:
+            raise source.fail(f"expected 'curve', 'term', one 'grid' or 'end', found {word[:SHOWN]!r}", words.line)
+        word = words.take("'end'")
+    if bool(terms) == (grid is not None):
+        raise source.fail("expected either terms or a grid, and not both", words.line)
+    _check_trailer(source, words)
+    return VolTable(tuple(curves.values()), tuple(terms), grid, unit).scaled(MM_PER_UNIT[unit])
+
+
+def _unit(words: _WordReader) -> str:
+    word = words.take("a unit")
+    if word not in MM_PER_UNIT:
+        raise words.source.fail(f"{word[:SHOWN]!r} is not a unit; mm or inch is expected", words.line)
+    return word
+
+
+def _read_curve(words: _WordReader, known: dict[str, VolCurve]) -> VolCurve:
+    name = words.take("a name of a curve")
+    if len(name) > LONGEST_NAME or name in known or len(known) == MOST_CURVES:
+        message = f"expected a new name of at most {LONGEST_NAME} characters for one of at most {MOST_CURVES} curves"
+        raise words.source.fail(f"{message}, found {name[:SHOWN]!r}", words.line)
+    axis = words.whole("an axis (0 X, 1 Y, 2 Z)", 0, 2)
+    count = words.whole("a number of nodes", 1, MOST_NODES)
+    first_mm, step_mm = words.number("the first position"), words.step()
+    return VolCurve(name, axis, first_mm, step_mm, words.numbers(count))
+
+
+def _read_term(words: _WordReader, curves: dict[str, VolCurve], count: int) -> VolTerm:
+    if count == MOST_TERMS:
+        raise words.source.fail(f"is term {count + 1}; {MOST_TERMS} are allowed", words.line)
+    output = words.whole("an axis (0 X, 1 Y, 2 Z)", 0, 2)
+    name = words.take("the name of a curve")
+    if name not in curves:
+        raise words.source.fail(f"no curve above is named {name[:SHOWN]!r}", words.line)
+    coefficient, lever = words.number("a coefficient"), words.take("a lever")
+    if lever not in LEVERS:
+        raise words.source.fail(f"{lever[:SHOWN]!r} is not a lever; {', '.join(LEVERS)} are", words.line)
+    return VolTerm(output, name, coefficient, lever)
+
+
+def _read_grid(words: _WordReader) -> VolGrid:
+    nx, ny, nz = (words.whole("a number of vertices", 1, MOST_NODES) for _ in range(3))
+    if nx * ny * nz > MOST_VERTICES:
+        raise words.source.fail(f"{nx} x {ny} x {nz} vertices are more than {MOST_VERTICES}", words.line)
+    x, y, z = (words.number("the position of the first vertex") for _ in range(3))
+    hx, hy, hz = (words.step() for _ in range(3))
+    values = words.numbers(3 * nx * ny * nz).reshape(nz, ny, nx, 3)
+    return VolGrid((x, y, z), (hx, hy, hz), values.transpose(2, 1, 0, 3))
+
+
+def _check_trailer(source: SourceFile, words: _WordReader) -> None:
+    counted, found = checksum(words.taken), False
+    for line, line_words in words.rest():
+        plain = line_words[: next((k for k, word in enumerate(line_words) if word.startswith("#")), None)]
+        if not plain:
+            continue
+        if found or len(plain) != 2 or plain[0] != "crc32":
+            shown = " ".join(plain)[:SHOWN]
+            raise source.fail(f"only comments and one 'crc32 XXXXXXXX' may follow 'end', found {shown!r}", line)
+        if plain[1].upper() != counted:
+            message = f"the checksum of the words up to 'end' is {counted}, the file says {plain[1][:SHOWN]!r}"
+            raise source.fail(f"{message}: it was changed or damaged; export it again", line)
+        found = True
+    if not found:
+        raise source.fail("there is no 'crc32 XXXXXXXX' behind 'end': the file was cut", words.line)
+
+
+# How the numbers of a ``volkins`` table are written, their checksum, and the files that stand beside a table.
+
+
+#: Decimals of positions and of values in mm, and of angles in rad.
+POSITION_DIGITS, LENGTH_DIGITS, ANGLE_DIGITS = 6, 9, 13
+#: Decimals in inch: lengths no coarser, and after 400 rounded steps a curve still ends where the travel ends.
+_INCH_POSITION_DIGITS, _INCH_LENGTH_DIGITS = 12, 11
+#: Name and last line of the licence text that belongs to the sources.
+LICENCE, _LICENCE_ENDS = "COPYING", "Public License instead of this License."
+#: Suffixes of what else is exported beside the table; each ends with a line that holds ``end of`` and its name.
+COMPANIONS = (".ini", ".hal", ".comp", ".h")
+
+
+def position_digits(table: VolTable) -> int:
+    """Return the decimals of positions in the unit of the table's file."""
+    return POSITION_DIGITS if table.unit == "mm" else _INCH_POSITION_DIGITS
+
+
+def length_digits(table: VolTable) -> int:
+    """Return the decimals of lengths in the unit of the table's file."""
+    return LENGTH_DIGITS if table.unit == "mm" else _INCH_LENGTH_DIGITS
+
+
+def digits_of(table: VolTable, curve: VolCurve) -> int:
+    """Return the decimals of a curve's values: lengths in the unit of the table's file, angles in rad."""
+    linear = curve.name in ERROR_INDEX and error_named(curve.name).kind == "linear"
+    return length_digits(table) if linear else ANGLE_DIGITS
+
+
+def in_file_units(table: VolTable) -> VolTable:
+    """Return the table with the numbers that its file has: lengths in mm or inch (the fields keep their names)."""
+    return table.scaled(1.0 / MM_PER_UNIT[table.unit])
+
+
+def _rounded(values: FloatArray, digits: int) -> FloatArray:
+    flat = [float(fixed(value, digits)) for value in np.ravel(values).tolist()]
+    return np.array(flat).reshape(np.shape(values))
+
+
+def as_written(table: VolTable) -> VolTable:
+    """Return the table as it is read back from its text, in mm."""
+    inside, places = in_file_units(table), position_digits(table)
+    curves = tuple(
+        replace(
+            curve,
+            first_mm=float(fixed(curve.first_mm, places)),
+            step_mm=float(fixed(curve.step_mm, places)),
+            values=_rounded(curve.values, digits_of(table, curve)),
+        )
+        for curve in inside.curves
+    )
+    grid = inside.grid
+    if grid is not None:
+        x, y, z = (float(fixed(value, places)) for value in grid.first_mm)
+        hx, hy, hz = (float(fixed(value, places)) for value in grid.step_mm)
+        grid = VolGrid((x, y, z), (hx, hy, hz), _rounded(grid.vertices_mm, length_digits(table)))
+    return replace(inside, curves=curves, grid=grid).scaled(MM_PER_UNIT[table.unit])
+
+
+def words_of(table: VolTable) -> Iterator[str]:
+    """Yield the words of the table from ``volcomp`` to ``end``, for its checksum."""
+    inside, places = in_file_units(table), position_digits(table)
+    yield from ("volcomp", "1", "unit", table.unit)
+    for curve in inside.curves:
+        yield from ("curve", curve.name, str(curve.axis), str(len(curve.values)))
+        yield from (fixed(curve.first_mm, places), fixed(curve.step_mm, places))
+        yield from (fixed(value, digits_of(table, curve)) for value in curve.values.tolist())
+    for term in inside.terms:
+        yield from ("term", str(term.output), term.curve, fixed(term.coefficient, 0), term.lever)
+    if inside.grid is not None:
+        yield from ("grid", *(str(count) for count in inside.grid.vertices_mm.shape[:3]))
+        yield from (fixed(value, places) for value in (*inside.grid.first_mm, *inside.grid.step_mm))
+        for row in grid_rows(inside.grid):
+            yield from (fixed(value, length_digits(table)) for value in row)
+    yield "end"
+
+
+def grid_rows(grid: VolGrid) -> list[list[float]]:
+    """Return ex, ey, ez of every vertex, x fastest."""
+    rows: list[list[float]] = grid.vertices_mm.transpose(2, 1, 0, 3).reshape(-1, 3).tolist()
+    return rows
+
+
+def is_companion(source: SourceFile) -> bool:
+    """Whether a file is one of those that are exported beside the table, by its name."""
+    return source.path.suffix.lower() in COMPANIONS or source.path.name.endswith(LICENCE)
+
+
+def check_companion(source: SourceFile) -> None:
+    """Raise InputError if INI, HAL, C source or licence text does not end with its last line: it was cut."""
+    last = source.text.rstrip().rpartition("\n")[2]
+    whole = (
+        last == _LICENCE_ENDS if source.path.name.endswith(LICENCE) else last.startswith(("# end of ", "// end of "))
+    )
+    if not whole or not source.text.endswith("\n"):
+        raise source.fail(
+            "does not end with its last line ('... end of ...'): the file was cut", source.text.count("\n") + 1
+        )
+
+
+# What is said to the user of a ``volkins`` table, and what its template needs.
+
+
+#: Decimals of travel limits in the INI file.
+LIMIT_DIGITS = 6
+
+
+def shown_table(table: VolTable) -> dict[str, Any]:
+    """Return the table in plain numbers for its template, with the checksum."""
+    inside = in_file_units(table)
+    grid = inside.grid
+    return {
+        "unit": table.unit,
+        "position_digits": position_digits(table),
+        "curves": [
+            {
+                "name": curve.name,
+                "axis": curve.axis,
+                "first": curve.first_mm,
+                "step": curve.step_mm,
+                "digits": digits_of(table, curve),
+                "values": curve.values.tolist(),
+            }
+            for curve in inside.curves
+        ],
+        "terms": [vars(term) for term in inside.terms],
+        "grid": None
+        if grid is None
+        else {
+            "count": list(grid.vertices_mm.shape[:3]),
+            "corner": [*grid.first_mm, *grid.step_mm],
+            "digits": length_digits(table),
+            "rows": grid_rows(grid),
+        },
+        "crc32": checksum(words_of(table)),
+    }
+
+
+def _outward(range_mm: tuple[float, float], margin_mm: float, scale: float) -> list[float]:
+    """Limits of travel in machine units, rounded outward to the decimals of the INI file: the ends can be reached."""
+    low, high = range_mm
+    fine = 10.0**LIMIT_DIGITS
+    # a rounding error of the division must not move a limit that has few decimals
+    below, above = (round(value / scale * fine, 3) for value in (low - margin_mm, high + margin_mm))
+    return [float(np.floor(below)) / fine, float(np.ceil(above)) / fine]
+
+
+def _parameters(gauge_mm: Vector3, coordinates: str, unit: str) -> list[dict[str, str]]:
+    joints = ", ".join(f"{joint} is {letter}" for joint, letter in enumerate(coordinates))
+    rows = [
+        {
+            "name": "[KINS] KINEMATICS",
+            "value": f"volkins file=volcomp.tab coordinates={coordinates}",
+            "meaning": "the table, relative to the folder of the INI file, and the axis of each joint",
+        },
+        {"name": "[KINS] JOINTS", "value": str(len(coordinates)), "meaning": f"joint {joints}"},
+        {
+            "name": "[TRAJ] LINEAR_UNITS",
+            "value": unit,
+            "meaning": "unit of all numbers in the exported files; on a machine in another unit volkins.loaded stays false",
+        },
+        {
+            "name": "volkins.loaded",
+            "value": "true",
+            "meaning": "belongs into the e-stop chain (volkins.hal): false means that nothing is compensated",
+        },
+    ]
+    rows += [
+        {
+            "name": f"volkins.gauge-{letter.lower()}",
+            "value": f"{value / MM_PER_UNIT[unit]:.9g} {unit}",
+            "meaning": "tool offset of the error model where the control's tool offset is zero",
+        }
+        for letter, value in zip(AXES, gauge_mm, strict=True)
+    ]
+    return rows
+
+
+# LinuxCNC volumetric compensation: the table of the kinematics module ``volkins``, which comes with compgen.
+#
+# The module (``templates/linuxcnc-volumetric/``, GPL-2.0-or-later) evaluates E = C P, or a grid, in every servo cycle, and
+# takes the tool offset from the control. Its arithmetic is that of :mod:`compgen.controls.linuxcnc_volumetric`.
+
+
+#: Values of a grid are written with the digits of lengths; eight of them and the rounding of all curves of one axis.
+_ROUNDED_CURVES = 12
+#: Vertices of a grid along one axis: 46 x 46 x 46 is within what the module takes.
+MOST_ALONG_AXIS = 46
+#: Axes and joints that LinuxCNC knows.
+_AXIS_LETTERS, _MOST_JOINTS = "XYZABCUVW", 16
+#: A table whose errors change by more than this per mm of travel is refused; real machines stay below 0.01.
+STEEPEST = 0.5
+
+
+def _coordinates(value: Any) -> str:
+    """One letter of an axis for each joint, X, Y and Z among them."""
+    letters = str(value).upper() if isinstance(value, str) else ""
+    if set(letters) - set(_AXIS_LETTERS) or not set(AXES) <= set(letters) or len(letters) > _MOST_JOINTS:
+        raise ValueError(f"the axis of each joint, e.g. 'XYZA', X, Y and Z among at most {_MOST_JOINTS}, is expected")
+    return letters
+
+
+@dataclass(frozen=True)
+class VolumetricSettings:
+    """Settings ``[controllers.linuxcnc-volumetric]``.
+
+    A grid holds for the tool offset of the machine file only. ``gauge_mm`` goes into the pins ``volkins.gauge-*``.
+    """
+
+    form: str = setting(
+        choice("curves", "grid"),
+        "curves",
+        meaning='"curves": E = C P with the tool in use; "grid": for the tool offset of the machine file only',
+    )
+    loss_mm: float = loss_setting()
+    most_nodes: int = setting(whole(2, 1000), 400, meaning="most nodes per axis (a grid has at most 46)")
+    gauge_mm: tuple[float, float, float] = setting(
+        toml_files.vector3,
+        (0.0, 0.0, 0.0),
+        meaning="tool offset of the error model where the control's tool offset is zero",
+    )
+    machine_units: str = units_setting(
+        "[TRAJ] LINEAR_UNITS, mm or inch: all numbers are written in it, and the module refuses a table in another unit"
+    )
+    coordinates: str = setting(
+        _coordinates,
+        "XYZ",
+        meaning="axis of each joint from joint 0 on, as in trivkins coordinates=XYYZA; axes other than X, Y, Z pass through",
+    )
+
+
+class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
+    """``linuxcnc-volumetric``: all 21 errors on all 24 chains, with the tool in use."""
+
+    name = "linuxcnc-volumetric"
+    settings_class = VolumetricSettings
+    at_axes = True
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return one term per error, on equidistant nodes; the module evaluates E = C P itself, a grid holds products."""
+        settings = self.settings
+        nodes = [
+            equidistant_grid(
+                self.machine,
+                errors,
+                axis,
+                most=settings.most_nodes if settings.form == "curves" else min(settings.most_nodes, MOST_ALONG_AXIS),
+                loss_mm=settings.loss_mm,
+                products=settings.form == "grid",
+            ).nodes_mm
+            for axis in range(3)
+        ]
+        return error_terms(self.machine, errors, nodes)
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> VolTable:
+        """Return curves and terms, or the grid made of them, rounded as they are written."""
+        ordered = sorted(basis, key=lambda term: ERROR_INDEX[term.name])
+        curves = tuple(self._curve_of_term(term, values[term.name]) for term in ordered)
+        terms = tuple(
+            VolTerm(part.output, term.name, float(-part.sign), LEVERS[0 if part.lever is None else part.lever + 1])
+            for term in ordered
+            for part in term.carrier
+        )
+        table = as_written(VolTable(curves, terms, unit=self.settings.machine_units))
+        return table if self.settings.form == "curves" else as_written(self._as_grid(table))
+
+    def context(self, tables: VolTable) -> dict[str, Any]:
+        """Return curves, terms or grid as they are written, the checksum, and what INI and HAL need."""
+        return {**shown_table(tables), **self._notes(self.settings.gauge_mm, self.settings.coordinates, tables)}
+
+    def parse(self, files: Sequence[SourceFile]) -> VolTable:
+        """Read the table; INI, HAL and C sources that are exported beside it are only checked for their last line."""
+        tables = [source for source in files if not is_companion(source)]
+        for source in files:
+            if is_companion(source):
+                check_companion(source)
+        if not tables:
+            raise InputError("no table was given; expected volcomp.tab")
+        if len(tables) > 1:
+            raise tables[1].fail(f"is a second table; the first is {tables[0].path.name}, and volkins reads one")
+        return parse_volcomp(tables[0])
+
+    def emulate(self, tables: VolTable, points: Points) -> FloatArray:
+        """Return q - P, with q the axis positions that put the tip where the command P says, tool offset of the points."""
+        tool = tool_of(self.machine, points.tool_mm)
+        return tables.inverse(points.position_mm, tool) - points.position_mm
+
+    def violations(self, tables: VolTable) -> list[str]:
+        """Return travel that curves leave out, errors too steep for the inverse, and a unit that is not the machine's."""
+        machine, settings = self.machine, self.settings
+        found = []
+        if tables.unit != settings.machine_units:
+            found.append(
+                f"the table is in {tables.unit}, and machine_units is {settings.machine_units!r}: the control does not use "
+                "such a table, and the machine cannot be switched on"
+            )
+        for axis, first, last, what in _spans(tables):
+            found += coverage_violations(machine, axis, first, last, what)
+        slope = tables.slope(machine.lower_mm, machine.upper_mm, tool_of(machine, None))
+        if slope > STEEPEST:
+            found.append(f"the errors change by up to {slope:.2f} mm per mm of travel; {STEEPEST} is the limit")
+        return found
+
+    def resolution_mm(self) -> float:
+        """Half of the last decimal of every curve; angles with levers of up to 10 m."""
+        return _ROUNDED_CURVES * 0.5 * (10.0**-LENGTH_DIGITS + 1e4 * 10.0**-ANGLE_DIGITS)
+
+    def table_nodes_mm(self, tables: VolTable) -> tuple[FloatArray, ...]:
+        """Return the nodes of curves or grid; a constant has none."""
+        if tables.grid is not None:
+            return nodes_by_axis(enumerate(_grid_lines(tables.grid)))
+        return nodes_by_axis((curve.axis, curve.nodes_mm) for curve in tables.curves if np.ptp(curve.values) > 0)
+
+    def usage(self, tables: VolTable) -> list[Usage]:
+        """Return curves, terms and nodes, or vertices, against the limits of the module."""
+        if tables.grid is not None:
+            return [Usage("vertices", tables.grid.vertices_mm[..., 0].size, MOST_VERTICES, "vertices")]
+        nodes = max(len(curve.values) for curve in tables.curves)
+        return [
+            Usage("curves", len(tables.curves), MOST_CURVES, "curves"),
+            Usage("terms", len(tables.terms), MOST_TERMS, "terms"),
+            Usage("nodes of a curve", nodes, MOST_NODES, "nodes"),
+        ]
+
+    def _notes(self, gauge_mm: Vector3, coordinates: str, table: VolTable) -> dict[str, Any]:
+        """Return sign statement, parameters, warnings, and travel, tool offset and joints for INI and HAL, in machine units."""
+        tool = np.array(gauge_mm) - np.array(self.machine.tool_offset_mm)
+        scale = MM_PER_UNIT[table.unit]
+        margin_mm = float(np.ceil(2.0 * np.max(np.abs(self._at_corners(table)[1])))) or 1.0
+        axes = [
+            {
+                "letter": letter,
+                "joint": coordinates.index(letter),
+                "joints": [joint for joint, other in enumerate(coordinates) if other == letter],
+                "gauge": gauge / scale,
+                "limits": _outward(axis.range_mm, 0.0, scale),
+                "joint_limits": _outward(axis.range_mm, margin_mm, scale),
+            }
+            for letter, gauge, axis in zip(AXES, gauge_mm, self.machine.axes, strict=True)
+        ]
+        return {
+            "sign_statement": self._sign_statement(table),
+            "parameters": _parameters(gauge_mm, coordinates, table.unit),
+            "warnings": self._warnings(table),
+            "tables": [],
+            "control_tool_mm": tool.tolist(),
+            "coordinates": coordinates,
+            "axes": axes,
+            "gantry": len({coordinates.count(letter) for letter in AXES}) > 1,
+            "other_axes": sorted(set(coordinates) - set(AXES)),
+            "margin_mm": margin_mm,
+            "form": "curves" if table.grid is None else "grid",
+        }
+
+    def _at_corners(self, table: VolTable) -> tuple[FloatArray, FloatArray]:
+        """Corners and middles of the volume (27, 3) and the errors there, mm."""
+        lines = [
+            np.array([low, 0.5 * (low + high), high]) for low, high in (axis.range_mm for axis in self.machine.axes)
+        ]
+        points = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3)
+        return points, table.error(points, tool_of(self.machine, None))
+
+    def _sign_statement(self, table: VolTable) -> str:
+        """Return the sign in words, with the axis and corner where the table has its largest error."""
+        points, error = self._at_corners(table)
+        place, axis = divmod(int(np.argmax(np.abs(error))), 3)
+        x, y, z = points[place]
+        return (
+            "The table holds ERRORS (actual minus commanded, ISO 230-1); volkins sends the axes to q = P - E(q). With the axes "
+            f"at X {x:g} Y {y:g} Z {z:g} the error of {AXES[axis]} is {error[place, axis]:+.6f} mm: there the joint stands "
+            f"{-error[place, axis]:+.6f} mm beside what the display says."
+        )
+
+    def _warnings(self, table: VolTable) -> list[str]:
+        tool = tool_of(self.machine, None)
+        at_home = table.error(np.zeros((1, 3)), tool)[0]
+        found = []
+        if np.max(np.abs(at_home)) > 1e-6:
+            shown = ", ".join(f"{letter} {value:+.6f}" for letter, value in zip(AXES, at_home, strict=True))
+            found.append(
+                f"with the axes at 0 the tool stands at {shown} mm: after homing there the display shows these numbers, not 0"
+            )
+        if table.grid is not None:
+            found.append("a grid is made for one tool offset: with another tool, use form = 'curves'")
+        return found
+
+    def _curve_of_term(self, term: Term, values: FloatArray) -> VolCurve:
+        """Return a curve; a squareness is a constant, written as two equal nodes at the ends of the travel of its axis."""
+        if term.axis is None:
+            axis = AXES.index(term.name[-1])
+            low, high = self.machine.axes[axis].range_mm
+            return VolCurve(term.name, axis, low, high - low, np.repeat(values[0], 2))
+        nodes = term.nodes_mm
+        return VolCurve(term.name, term.axis, float(nodes[0]), float(nodes[1] - nodes[0]), np.asarray(values))
+
+    def _as_grid(self, table: VolTable) -> VolTable:
+        """Return the errors of curves at the vertices of the grid of their nodes, with the machine's own tool offset."""
+        lines = []
+        for axis in range(3):
+            moving = [curve for curve in table.curves if curve.axis == axis and not re.match("E[ABC]0", curve.name)]
+            low, high = self.machine.axes[axis].range_mm
+            lines.append(moving[0].nodes_mm if moving else np.array([low, high]))
+        vertices = np.array(list(product(*lines)))
+        values = table.error(vertices, tool_of(self.machine, None)).reshape(*(len(line) for line in lines), 3)
+        x, y, z = ((float(line[0]), float(line[1] - line[0])) for line in lines)
+        return VolTable((), (), VolGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), values), table.unit)
+
+
+def _grid_lines(grid: VolGrid) -> list[FloatArray]:
+    counts = grid.vertices_mm.shape[:3]
+    return [
+        np.asarray(first + step * np.arange(count), dtype=np.float64)
+        for first, step, count in zip(grid.first_mm, grid.step_mm, counts, strict=True)
+    ]
+
+
+def _spans(tables: VolTable) -> list[tuple[int, float, float, str]]:
+    """Return (axis, first, last, what) of everything that depends on an axis."""
+    if tables.grid is not None:
+        lines = enumerate(_grid_lines(tables.grid))
+        return [(axis, float(line[0]), float(line[-1]), "the grid") for axis, line in lines]
+    return [
+        (curve.axis, float(curve.nodes_mm[0]), float(curve.nodes_mm[-1]), f"the curve {curve.name}")
+        for curve in tables.curves
+        if np.ptp(curve.values) > 0
+    ]

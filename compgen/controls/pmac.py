@@ -1,0 +1,688 @@
+"""Omron PMAC and Turbo PMAC (``pmac``): leadscrew, cross-axis, two-dimensional and backlash tables."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from compgen.controls.pmac_tables import (
+    PER_COUNT,
+    BacklashTable,
+    CompTable1D,
+    CompTable2D,
+    IntArray,
+    PmacTables,
+    parse_foreign_pmac,
+    parse_pmac,
+)
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controls.shared.grids import equidistant_grid, loss_setting
+from compgen.controls.shared.terms import continued, one_dimensional_terms, product_terms
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import axis_setting, setting, whole, word_for
+from compgen.errors import CompgenWarning, InputError
+
+# Settings ``[controllers.pmac]`` of a machine file, and positions in counts.
+
+
+_COUNTS_MISSING = (
+    "is missing: tables are in counts of the motors, and nothing but the machine says how many make a mm; write e.g. "
+    "counts_per_mm = { X = 1000.0, Y = 1000.0, Z = 2000.0 } (negative where the motor counts against the axis)"
+)
+
+
+def _scales(value: Any) -> tuple[float, float, float]:
+    """Counts per mm: one number for all axes, or a table with X, Y and Z; none is zero."""
+    if isinstance(value, dict):
+        if set(value) != set(AXES):
+            raise ValueError("one number, or a table { X = ..., Y = ..., Z = ... }, is expected")
+        x, y, z = (toml_files.number(value[axis]) for axis in AXES)
+    else:
+        x = y = z = toml_files.number(value)
+    if not np.all(np.array([x, y, z])):
+        raise ValueError("counts per mm other than zero are expected")
+    return x, y, z
+
+
+@dataclass(frozen=True, kw_only=True)
+class PmacSettings:
+    """Settings ``[controllers.pmac]``; ``desired``: tables go over the commanded position of their source."""
+
+    motors_available: int = setting(whole(3, 32), 32, meaning="motors that can own a table (Turbo PMAC 32, PMAC 8)")
+    motors: tuple[int, int, int] = axis_setting(
+        whole(1, 32),
+        (1, 2, 3),
+        differ="gives ({}) for X, Y, Z; three different motors are needed",
+        meaning="motors of X, Y, Z",
+    )
+    home_mm: tuple[float, float, float] = axis_setting(
+        toml_files.number, (0.0, 0.0, 0.0), meaning="machine coordinates of the motors' zero"
+    )
+    counts_per_mm: tuple[float, float, float] = setting(
+        _scales, meaning="counts of a motor per mm, negative where it counts against its axis"
+    )
+    two_dimensional: bool = setting(toml_files.flag, False, meaning="write angular errors as two-dimensional tables")
+    desired: bool = setting(
+        word_for({"desired": True, "actual": False}),
+        key="source_position",
+        stated="desired",
+        meaning="whether tables go over the desired or the actual position of their source",
+    )
+    max_entries: int = setting(whole(8, 100_000), 20_000, meaning="largest number of entries of one table")
+    loss_mm: float = loss_setting()
+
+    def counts(self, position_mm: FloatArray) -> Mapping[int, FloatArray]:
+        """Return the positions (n,) of the three motors in counts at axis positions (n, 3)."""
+        return {
+            motor: self.counts_per_mm[axis] * (position_mm[:, axis] - self.home_mm[axis])
+            for axis, motor in enumerate(self.motors)
+        }
+
+    @property
+    def free_motors(self) -> list[int]:
+        """Motors without an axis that may own a table."""
+        return [number for number in range(1, self.motors_available + 1) if number not in self.motors]
+
+
+# What PMAC tables can hold, and their numbers: rings of nodes from the motor's zero, negative travel at the far end.
+
+
+#: A function or product that moves its target by less than this (rms) needs no table.
+NOTHING_MM = 0.02 * MM_PER_UM
+
+
+@dataclass(frozen=True)
+class Ring:
+    """Nodes ``number * step`` counts from the motor's zero: those over the travel, and one more on either side.
+
+    ``low`` ... ``high`` are the numbers over the travel, ``first`` <= 0 <= ``last`` all that the table holds; the
+    position of the table is ``number`` modulo ``size``.
+    """
+
+    axis: int
+    step: int
+    low: int
+    high: int
+
+    @property
+    def first(self) -> int:
+        """Lowest number in the table."""
+        return min(self.low, 0) - 1
+
+    @property
+    def last(self) -> int:
+        """Highest number in the table."""
+        return max(self.high, 0) + 1
+
+    @property
+    def size(self) -> int:
+        """Number of entries; length / step."""
+        return self.last - self.first + 1
+
+    def nodes_mm(self, settings: PmacSettings) -> FloatArray:
+        """Positions of the nodes over the travel in mm, ascending."""
+        return np.sort(self.to_mm(settings, np.arange(self.low, self.high + 1)))
+
+    def to_mm(self, settings: PmacSettings, numbers: IntArray) -> FloatArray:
+        """Positions of nodes in mm."""
+        return settings.home_mm[self.axis] + self.step * numbers / settings.counts_per_mm[self.axis]
+
+    def positions_mm(self, settings: PmacSettings) -> FloatArray:
+        """Where each place 0 ... size - 1 of the table takes its value, mm: nodes beyond the travel hold its end."""
+        places = np.arange(self.size)
+        numbers = np.where(places <= self.last, places, places - self.size)
+        return self.to_mm(settings, np.clip(numbers, self.low, self.high))
+
+
+def _pair(term: Term) -> tuple[int, int]:
+    lever = term.carrier[0].lever
+    first, second = sorted((term.axis or 0, lever or 0))
+    return first, second
+
+
+# Words for the people at a PMAC: the sign, what must be set, warnings, and the tables as the template writes them.
+
+
+_ENTRIES_PER_LINE = 10
+
+
+def table_context(table: CompTable1D | CompTable2D, letters: Mapping[int, str]) -> dict[str, Any]:
+    """Return one table as the template writes it: command, title, rows of entries."""
+    if isinstance(table, CompTable1D):
+        mark = "D" if table.desired else ""
+        command = f"DEFINE COMP {len(table.entries)},#{table.source}{mark},#{table.target},{table.length}"
+        title = f"{_letter(letters, table.target)} over {_letter(letters, table.source)}"
+        rows = [
+            table.entries[k : k + _ENTRIES_PER_LINE].tolist() for k in range(0, len(table.entries), _ENTRIES_PER_LINE)
+        ]
+        return {"motor": table.motor, "command": command, "title": title, "rows": rows}
+    marks = ["D" if flag else "" for flag in (table.row_desired, table.column_desired)]
+    size = f"{table.values.shape[0] - 1}.{table.values.shape[1] - 1}"
+    sources = f"#{table.row}{marks[0]},#{table.column}{marks[1]},#{table.target}"
+    names = [_letter(letters, motor) for motor in (table.target, table.row, table.column)]
+    return {
+        "motor": table.motor,
+        "command": f"DEFINE COMP {size},{sources},{table.row_span},{table.column_span}",
+        "title": f"{names[0]} over {names[1]} (row motor, along each line) and {names[2]} (column motor)",
+        "rows": [table.values[0, 1:].tolist(), *table.values[1:].tolist()],
+    }
+
+
+def _letter(letters: Mapping[int, str], motor: int) -> str:
+    return letters.get(motor, f"motor {motor}")
+
+
+# ``pmac``: leadscrew, cross-axis, two-dimensional and backlash tables of PMAC and Turbo PMAC.
+#
+# Source: PMAC User Manual p. 79-83, PMAC 2 Software Reference p. 207-211, Turbo PMAC Software Reference p. 301-306. The
+# tables add to the commanded position of the target; they are zero at the motor's zero and repeat beyond their span.
+
+
+_MOST_PER_TARGET = 6
+_SPAN_SLACK = 1e-6
+#: Spacings of a pitch table are divided into at most so many parts to hold a reversal.
+_MOST_PARTS = 64
+
+
+class Pmac(Controller[PmacSettings, PmacTables]):
+    """PMAC and Turbo PMAC ``DEFINE COMP``."""
+
+    name = "pmac"
+    settings_class = PmacSettings
+    anchored = True
+    bidirectional = True
+
+    @classmethod
+    def read_settings(cls, machine: Machine) -> PmacSettings:
+        """Read the settings; ``counts_per_mm`` is mandatory."""
+        section = machine.controller_settings(cls.name)
+        if "counts_per_mm" not in section:
+            raise section.fail("counts_per_mm", _COUNTS_MISSING)
+        settings = toml_files.read_settings(PmacSettings, section)
+        if max(settings.motors) > settings.motors_available:
+            raise section.fail(
+                "motors",
+                f"motor {max(settings.motors)} does not exist; use 1 to {settings.motors_available} (motors_available)",
+            )
+        return settings
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return the functions and products that get a table: pitch, and as many others as there are motors to own them."""
+        curves = [self._curve(errors, output, axis) for output in range(3) for axis in range(3)]
+        pitch = [term for term in curves if term.axis == term.carrier[0].output]
+        groups = [[term] for term in curves if term.axis != term.carrier[0].output]
+        if self.settings.two_dimensional:
+            groups += self._sheets(errors)
+        sizes = [sum(self._size(term) ** 2 for term in group) for group in groups]
+        ranked = sorted(range(len(groups)), key=lambda k: -sizes[k])[: len(self.settings.free_motors)]
+        kept = [groups[k] for k in sorted(ranked) if sizes[k] > NOTHING_MM**2]
+        terms = pitch + [term for group in kept for term in group]
+        return [continued(term, self.machine.axes[term.axis or 0].range_mm) for term in terms]
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> PmacTables:
+        """Return the tables in whole 1/16 counts."""
+        return PmacTables(tuple(self._tables_from(basis, values)))
+
+    def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
+        """Only the reversal of an axis along itself goes into tables."""
+        return ReversalCurves({key: curve for key, curve in reversal.curves.items() if key[0] == key[1]})
+
+    def with_reversal(self, tables: PmacTables, reversal: ReversalCurves) -> PmacTables:
+        """Return the tables with Ixx86 and, where the reversal varies, a backlash table and its half in the pitch table.
+
+        With the reversal B the control takes -B off after negative travel, so both directions stand at +B/2 of the
+        mean; -(B - B at zero)/2 goes into the pitch table, the rest is a constant. B, both halves and "positive" are those
+        of the motor: a motor that counts against its axis sees the same B in its counts.
+        """
+        lines, backlash, constants = list(tables.tables), [], {}
+        for (axis, _), curve in sorted(reversal.curves.items()):
+            if np.max(np.abs(curve.value)) < WORTH_MM:
+                continue
+            motor = self.settings.motors[axis]
+            place = next(k for k, t in enumerate(lines) if isinstance(t, CompTable1D) and t.motor == motor)
+            lines[place], table, constants[motor] = self._with_backlash(axis, lines[place], curve)
+            backlash += [table] if table is not None else []
+        backlash.sort(key=lambda table: -table.motor)
+        return replace(tables, tables=tuple(lines), backlash=tuple(backlash), constants=constants)
+
+    def context(self, tables: PmacTables) -> dict[str, Any]:
+        """Return the tables with their entries, the sign with a worked number, and what must be set."""
+        letters = {motor: AXES[axis] for axis, motor in enumerate(self.settings.motors)}
+        return {
+            **self._pmac_notes(tables),
+            "tables": [table_context(table, letters) for table in tables.tables],
+            "backlash": [
+                {
+                    "motor": t.motor,
+                    "length": t.length,
+                    "letter": letters.get(t.motor, "?"),
+                    "entries": t.entries.tolist(),
+                }
+                for t in tables.backlash
+            ],
+            "constants": sorted(tables.constants.items()),
+            "table_count": len(tables.tables) + len(tables.backlash),
+        }
+
+    def parse(self, files: Sequence[SourceFile]) -> PmacTables:
+        """Read download files; motors that are no axis of the machine file cannot be sources or targets."""
+        settings = self.settings
+        if not files:
+            raise InputError("no file was given; comp.pmc is one")
+        tables = parse_pmac(files)
+        for table in (*tables.tables, *tables.backlash):
+            unknown = sorted(_motors(table) - set(settings.motors))
+            if unknown:
+                raise files[0].fail(
+                    f"the table of motor {table.motor} uses motor {unknown[0]}, which is not an axis of the machine file "
+                    f"(motors {settings.motors})"
+                )
+        return tables
+
+    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[PmacTables, list[str]]:
+        """Read a download file or backup of a real control; tables of other motors are kept apart and named."""
+        tables, remarks = parse_foreign_pmac(files)
+        known = set(self.settings.motors)
+        apart = [t for t in (*tables.tables, *tables.backlash) if not _motors(t) <= known]
+        kept = replace(
+            tables,
+            tables=tuple(t for t in tables.tables if _motors(t) <= known),
+            backlash=tuple(t for t in tables.backlash if _motors(t) <= known),
+            constants={motor: value for motor, value in tables.constants.items() if motor in known},
+        )
+        if apart:
+            named = "; ".join(f"motor {t.motor} (uses {_listed(_motors(t))})" for t in apart)
+            remarks.append(f"tables of motors that are no axis of the machine file, kept apart: {named}")
+        if not kept.tables and not kept.backlash:
+            raise files[0].fail(f"holds no table of the motors {_listed(known)}; {remarks[-1]}")
+        return kept, remarks
+
+    def emulate(self, tables: PmacTables, points: Points) -> FloatArray:
+        """Return the sum of all tables of each target, and minus the backlash after negative travel of a motor.
+
+        Where the last direction of travel is unknown half of the backlash is taken off, with a CompgenWarning.
+        """
+        settings = self.settings
+        position = np.asarray(points.position_mm, dtype=np.float64)
+        counts = settings.counts(position)
+        total = {motor: np.zeros(len(position)) for motor in settings.motors}
+        if tables.enabled is not False:
+            for table in tables.tables:
+                total[table.target] += table.at(counts)
+        for motor in settings.motors:
+            total[motor] -= self._backlash(tables, motor, counts, points)
+        scale = PER_COUNT * np.array(settings.counts_per_mm)
+        return np.column_stack([total[motor] for motor in settings.motors]) / scale + 0.0
+
+    def _backlash(self, tables: PmacTables, motor: int, counts: Mapping[int, FloatArray], points: Points) -> FloatArray:
+        size = np.full(len(points), float(tables.constants.get(motor, 0)))
+        own = [table for table in tables.backlash if table.motor == motor and tables.enabled is not False]
+        for table in own:
+            size += table.at(counts)
+        if not np.any(size):
+            return size
+        axis = self.settings.motors.index(motor)
+        travel = np.zeros(len(points)) if points.approach is None else points.approach[:, axis]
+        if np.any(travel == 0):
+            message = (
+                f"motor {motor} has backlash compensation, and some points do not say from where they were approached: "
+                "half of it is taken off there; give approach_x, approach_y, approach_z"
+            )
+            warnings.warn(message, CompgenWarning, stacklevel=3)
+        return np.asarray(size * 0.5 * (1.0 - np.sign(travel * self.settings.counts_per_mm[axis])))
+
+    def violations(self, tables: PmacTables) -> list[str]:
+        """Return tables out of order, too long, shorter than the travel, or not enabled."""
+        settings = self.settings
+        found = [] if tables.enabled else ["I51 is not 1: the tables do not act"]
+        for kind, group in (("COMP", tables.tables), ("BLCOMP", tables.backlash)):
+            owners = [table.motor for table in group]
+            if owners != sorted(owners, reverse=True):
+                found.append(
+                    f"{kind} tables are defined in the order {owners}; expected from the highest motor down (ERR003)"
+                )
+            if owners and max(owners) > settings.motors_available:
+                found.append(
+                    f"motor {max(owners)} has a {kind} table; the control has {settings.motors_available} motors"
+                )
+        for table in tables.tables:
+            found += self._table_violations(table)
+        return found
+
+    def _table_violations(self, table: CompTable1D | CompTable2D) -> list[str]:
+        settings = self.settings
+        found = []
+        if (size := _entries(table)) > settings.max_entries:
+            found.append(f"the table of motor {table.motor} has {size} entries, max_entries is {settings.max_entries}")
+        for motor, span in _spans(table):
+            axis = settings.motors.index(motor)
+            low, high = self.machine.axes[axis].range_mm
+            ends = sorted(settings.counts_per_mm[axis] * (end - settings.home_mm[axis]) for end in (low, high))
+            needed = max(ends[1], 0.0) - min(ends[0], 0.0)
+            if needed > span * (1.0 + _SPAN_SLACK):
+                found.append(
+                    f"the table of motor {table.motor} spans {span} counts of motor {motor}, the travel needs "
+                    f"{needed:g}: positions roll over within the travel"
+                )
+        return found + _end_violations(table)
+
+    def usage(self, tables: PmacTables) -> list[Usage]:
+        """Return the motors that own a table against those there are, and the longest table."""
+        longest = max((_entries(table) for table in tables.tables), default=0)
+        return [
+            Usage("motors with a COMP table", len(tables.tables), self.settings.motors_available, "tables"),
+            Usage("entries of one table", longest, self.settings.max_entries, "entries", stated=False),
+        ]
+
+    def anchor_mm(self) -> FloatArray:
+        """Return the motors' zero, where every table is zero."""
+        return np.array(self.settings.home_mm)
+
+    def table_nodes_mm(self, tables: PmacTables) -> tuple[FloatArray, ...]:
+        """Return the entries' positions over the travel and one beyond, by source."""
+        settings = self.settings
+        found = []
+        for table in (*tables.tables, *tables.backlash):
+            for motor, step in _steps(table):
+                axis = settings.motors.index(motor)
+                ring = self._ring_of(axis, 1.0)
+                step_mm = step / abs(settings.counts_per_mm[axis])
+                low, high = self.machine.axes[axis].range_mm
+                first = np.floor((low - settings.home_mm[axis]) / step_mm)
+                last = np.ceil((high - settings.home_mm[axis]) / step_mm)
+                found.append((ring.axis, settings.home_mm[axis] + step_mm * np.arange(first, last + 1)))
+        return nodes_by_axis(found)
+
+    def resolution_mm(self) -> float:
+        """Half of 1/16 count for every table that may act on one axis."""
+        most = _MOST_PER_TARGET if self.settings.two_dimensional else 3
+        return most * 0.5 / (PER_COUNT * float(np.min(np.abs(self.settings.counts_per_mm))))
+
+    def _ring_of(self, axis: int, step_mm: float) -> Ring:
+        """Return the ring of an axis with nodes about ``step_mm`` apart (at least one count)."""
+        scale = self.settings.counts_per_mm[axis]
+        step = max(1, math.ceil(step_mm * abs(scale) - 1e-6))
+        ends = sorted(scale * (end - self.settings.home_mm[axis]) for end in self.machine.axes[axis].range_mm)
+        low, high = math.floor(ends[0] / step + 1e-9), math.ceil(ends[1] / step - 1e-9)
+        return Ring(axis, step, low, max(high, low + 1))
+
+    def _step_mm(self, errors: ErrorTable, axis: int, output: int) -> float:
+        """Widest step from the motor's zero that loses nothing that matters."""
+        home = list(self.machine.reference_point_mm)
+        low, high = self.machine.axes[axis].range_mm
+        home[axis] = min(max(self.settings.home_mm[axis], low), high)
+        anchored = replace(self.machine, reference_point_mm=(home[0], home[1], home[2]))
+        most = min(self.settings.max_entries, 400)
+        grid = equidistant_grid(
+            anchored, errors, axis, most=most, anchor=True, loss_mm=self.settings.loss_mm, output=output
+        )
+        return float(grid.step)
+
+    def _curve(self, errors: ErrorTable, output: int, axis: int) -> Term:
+        settings = self.settings
+        ring = self._ring_of(axis, self._step_mm(errors, axis, output))
+        nodes = ring.nodes_mm(settings)
+        lines = [nodes if k == axis else np.zeros(1) for k in range(3)]
+        origin = settings.home_mm if settings.two_dimensional else None
+        term = one_dimensional_terms(self.machine, errors, lines, [(output, axis)], lever_origin_mm=origin)[0]
+        home = settings.home_mm[axis]
+        if not nodes[0] - 1e-9 <= home <= nodes[-1] + 1e-9:
+            return term
+        start = term.start - np.interp(home, nodes, term.start)
+        return replace(term, start=start, zero_at_mm=float(np.clip(home, nodes[0], nodes[-1])))
+
+    def _sheets(self, errors: ErrorTable) -> list[list[Term]]:
+        """Products by output and pair of axes, levers from the motor's zero; each group fits one two-dimensional table."""
+        groups: dict[tuple[int, int, int], list[Term]] = {}
+        for output in range(3):
+            rings = [self._ring_of(k, self._step_mm(errors, k, output)) for k in range(3)]
+            nodes = [ring.nodes_mm(self.settings) for ring in rings]
+            for term in product_terms(self.machine, errors, nodes, self.settings.home_mm):
+                if term.carrier[0].output == output:
+                    groups.setdefault((output, *_pair(term)), []).append(term)
+        return [group for _, group in sorted(groups.items())]
+
+    def _size(self, term: Term) -> float:
+        """Rms of a term over the volume without a constant, mm."""
+        lever = term.carrier[0].lever
+        factor = 1.0 if lever is None or lever > 2 else self.machine.axes[lever].length_mm / math.sqrt(12.0)
+        return float(np.std(term.start)) * factor
+
+    def _tables_from(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> list[CompTable1D | CompTable2D]:
+        """Return the tables, from the highest motor to the lowest, in whole 1/16 counts."""
+        free = iter(self.settings.free_motors)
+        found: list[CompTable1D | CompTable2D] = []
+        products: dict[tuple[int, int, int], list[Term]] = {}
+        for term in basis:
+            part = term.carrier[0]
+            if part.lever is not None:
+                products.setdefault((part.output, *_pair(term)), []).append(term)
+                continue
+            owner = self.settings.motors[part.output] if part.output == term.axis else next(free)
+            found.append(self._line(owner, term, np.asarray(values[term.name])))
+        for (output, *pair), terms in products.items():
+            found.append(self._sheet(next(free), output, (pair[0], pair[1]), terms, values))
+        return sorted(found, key=lambda table: -table.motor)
+
+    def _ring_from(self, axis: int, nodes_mm: FloatArray) -> Ring:
+        """Return the ring whose nodes over the travel these are."""
+        step = round(abs(self.settings.counts_per_mm[axis]) * float(nodes_mm[1] - nodes_mm[0]))
+        ring = self._ring_of(axis, step / abs(self.settings.counts_per_mm[axis]))
+        return replace(ring, step=step)
+
+    def _sixteenths(self, axis: int, values_mm: FloatArray) -> IntArray:
+        """Return displacements of an axis in whole 1/16 counts of its motor."""
+        return np.rint(PER_COUNT * self.settings.counts_per_mm[axis] * np.asarray(values_mm)).astype(np.int64)
+
+    def _line(self, owner: int, term: Term, values: FloatArray) -> CompTable1D:
+        settings = self.settings
+        axis, output = int(term.axis or 0), term.carrier[0].output
+        ring = self._ring_from(axis, term.nodes_mm)
+        at = self._sixteenths(output, np.interp(ring.positions_mm(settings), term.nodes_mm, values))
+        at[0] = 0
+        return CompTable1D(
+            motor=owner,
+            source=settings.motors[axis],
+            target=settings.motors[output],
+            length=ring.step * ring.size,
+            entries=np.append(at[1:], 0),
+            desired=settings.desired,
+        )
+
+    def _sheet(
+        self, owner: int, output: int, pair: tuple[int, int], terms: Sequence[Term], values: Mapping[str, FloatArray]
+    ) -> CompTable2D:
+        """Two-dimensional table with the row motor of the first axis of the pair; the far edges repeat the zero edges."""
+        settings = self.settings
+        rings = [self._lever_ring(axis, terms) for axis in pair]
+        along = [ring.positions_mm(settings) for ring in rings]
+        second, first = np.meshgrid(along[1], along[0], indexing="ij")
+        position_mm = np.zeros((first.size, 3))
+        position_mm[:, pair[0]], position_mm[:, pair[1]] = first.ravel(), second.ravel()
+        total = np.zeros(first.size)
+        for term in terms:
+            carrier = term.carrier_field(position_mm, np.zeros(3))[:, output]
+            total += carrier * term.curve(np.asarray(values[term.name]), position_mm)
+        inner = self._sixteenths(output, total).reshape(first.shape)
+        inner[0, 0] = 0
+        row, column = (settings.motors[axis] for axis in pair)
+        return CompTable2D(
+            motor=owner,
+            row=row,
+            column=column,
+            target=settings.motors[output],
+            row_span=rings[0].step * rings[0].size,
+            column_span=rings[1].step * rings[1].size,
+            values=np.pad(inner, ((0, 1), (0, 1)), mode="wrap"),
+            row_desired=settings.desired,
+            column_desired=settings.desired,
+        )
+
+    def _lever_ring(self, axis: int, terms: Sequence[Term]) -> Ring:
+        """Ring of one axis of a two-dimensional table: that of its functions, or a wide one if it is a lever only."""
+        nodes = next((term.nodes_mm for term in terms if term.axis == axis), None)
+        if nodes is not None:
+            return self._ring_from(axis, nodes)
+        return self._ring_of(axis, 0.5 * self.machine.axes[axis].length_mm)
+
+    def _pmac_notes(self, tables: PmacTables) -> dict[str, Any]:
+        """Return the texts of the context: sign_statement, parameters, warnings, motors."""
+        return {
+            "sign_statement": (
+                "Entries are 1/16 count of the target motor, and the control ADDS them to its commanded position: 160 adds 10 "
+                "counts. The first entry stands one spacing above the motor's zero, negative positions stand at the far end "
+                "of the table, the last entry is the value at zero."
+            ),
+            "parameters": self._parameters(tables),
+            "warnings": self._warnings(tables),
+            "motors": [
+                {"letter": letter, "motor": motor, "counts": counts, "home": home}
+                for letter, motor, counts, home in zip(
+                    AXES, self.settings.motors, self.settings.counts_per_mm, self.settings.home_mm, strict=True
+                )
+            ],
+            "has_sheets": any(isinstance(table, CompTable2D) for table in tables.tables),
+            "owners": sorted(table.motor for table in tables.tables),
+            "overwrites": self._overwrites(tables),
+        }
+
+    def _parameters(self, tables: PmacTables) -> list[dict[str, object]]:
+        rows: list[tuple[str, object, str]] = [
+            ("I51", 1, "compensation tables enabled; set by the last line of the file")
+        ]
+        for motor, value in sorted(tables.constants.items()):
+            rows.append((f"I{motor}86", value, "backlash at the motor's zero, 1/16 count; set by the file"))
+        for letter, motor, counts, home in zip(
+            AXES, self.settings.motors, self.settings.counts_per_mm, self.settings.home_mm, strict=True
+        ):
+            meaning = f"the tables assume {counts:g} counts per mm of {letter}, and zero at {letter} = {home:g} mm"
+            rows.append((f"#{motor} -> {letter}", f"{counts:g}", meaning))
+        return [{"name": name, "value": value, "meaning": meaning} for name, value, meaning in rows]
+
+    def _overwrites(self, tables: PmacTables) -> list[str]:
+        """Say which tables and variables the file overwrites, those of motors without an axis first."""
+        own = sorted(table.motor for table in tables.tables if table.motor in self.settings.motors)
+        others = sorted(table.motor for table in tables.tables if table.motor not in self.settings.motors)
+        names = {motor: letter for letter, motor in zip(AXES, self.settings.motors, strict=True)}
+        first = "Of motors that are not X, Y or Z: nothing."
+        if others:
+            first = (
+                f"Motors that are not X, Y or Z and get a table: {', '.join(map(str, others))}. NOT KNOWN whether they have one: "
+                "list them first, a table that is there is lost."
+            )
+        found = [first, f"The tables of motors {', '.join(f'{motor} ({names[motor]})' for motor in own)}."]
+        variables = [
+            "I51 (it acts on the tables of all motors)",
+            *(f"I{motor}86" for motor in sorted(tables.constants)),
+        ]
+        return [*found, f"The variables {', '.join(variables)}."]
+
+    def _warnings(self, tables: PmacTables) -> list[str]:
+        found: list[str] = []
+        owners = [table.motor for table in tables.tables if table.motor not in self.settings.motors]
+        if owners:
+            found.append(
+                f"the file keeps tables of X, Y and Z at the motors {', '.join(map(str, sorted(owners)))}, which the machine "
+                "file does not have as axes: a table that one of them has on the control is lost"
+            )
+        if any(isinstance(table, CompTable2D) for table in tables.tables):
+            found.append(
+                "tables of two dimensions: the order of the arguments was put together from the remarks of the manuals "
+                "(row motor, column motor, target, row span, column span); check it with section 3 of the preflight list"
+            )
+        if any(value < 0 for value in tables.constants.values()):
+            found.append("a backlash Ixx86 is negative: the position reached in positive direction is the larger one")
+        return found
+
+    def _with_backlash(
+        self, axis: int, table: CompTable1D | CompTable2D, curve: Curve
+    ) -> tuple[CompTable1D, BacklashTable | None, int]:
+        """Pitch table with its part of the reversal, backlash table (None: constant) and Ixx86, in 1/16 count."""
+        settings = self.settings
+        assert isinstance(table, CompTable1D)
+        scale, home = abs(settings.counts_per_mm[axis]), settings.home_mm[axis]
+        at_home = float(curve.at(np.array([home]))[0])
+        constant = round(-PER_COUNT * scale * at_home)
+        if len(curve.position_mm) == 1:
+            return table, None, constant
+        ring = self._ring_for(axis, table, curve)
+        counts = {motor: np.zeros(ring.size) for motor in settings.motors}
+        counts[table.source] = settings.counts_per_mm[axis] * (ring.positions_mm(settings) - home)
+        pitch = np.rint(table.at(counts)).astype(np.int64)
+        varying = curve.at(ring.positions_mm(settings)) - at_home
+        varying[0] = 0.0
+        # In the motor's own counts a reversal B is |counts per mm| B, whichever way the motor counts: where it counts
+        # against its axis, both the position and the direction of travel change their sign.
+        size = np.rint(-PER_COUNT * scale * varying).astype(np.int64)
+        half = np.rint(-0.5 * PER_COUNT * scale * varying).astype(np.int64)
+        entries: IntArray = np.append(pitch[1:] + half[1:], 0)
+        length = ring.step * ring.size
+        own = BacklashTable(settings.motors[axis], length, np.append(size[1:], 0))
+        return replace(table, entries=entries, length=length), own if np.any(size) else None, constant
+
+    def _ring_for(self, axis: int, table: CompTable1D, curve: Curve) -> Ring:
+        """Return the ring of a pitch table, its spacing divided as far as the reversal needs it."""
+        scale, step = abs(self.settings.counts_per_mm[axis]), table.length // len(table.entries)
+        where = np.unique(np.concatenate([np.array(self.machine.axes[axis].range_mm), curve.position_mm]))
+        where = np.clip(where, *self.machine.axes[axis].range_mm)
+        rings = []
+        for part in (part for part in range(1, _MOST_PARTS + 1) if step % part == 0):
+            ring = self._ring_of(axis, step / part / scale)
+            nodes = ring.nodes_mm(self.settings)
+            miss = float(np.max(np.abs(np.interp(where, nodes, curve.at(nodes)) - curve.at(where))))
+            rings.append((miss, ring))
+            if miss <= WORTH_MM:
+                break
+        return min(rings, key=lambda pair: pair[0])[1]
+
+
+def _motors(table: CompTable1D | CompTable2D | BacklashTable) -> set[int]:
+    if isinstance(table, BacklashTable):
+        return {table.motor}
+    sources = {table.source} if isinstance(table, CompTable1D) else {table.row, table.column}
+    return sources | {table.target}
+
+
+def _listed(motors: set[int]) -> str:
+    return ", ".join(f"#{motor}" for motor in sorted(motors))
+
+
+def _entries(table: CompTable1D | CompTable2D) -> int:
+    return len(table.entries) if isinstance(table, CompTable1D) else int(table.values.size) - 1
+
+
+def _spans(table: CompTable1D | CompTable2D) -> list[tuple[int, int]]:
+    if isinstance(table, CompTable1D):
+        return [(table.source, table.length)]
+    return [(table.row, table.row_span), (table.column, table.column_span)]
+
+
+def _steps(table: CompTable1D | CompTable2D | BacklashTable) -> list[tuple[int, float]]:
+    """Sources and the distance of their nodes in counts."""
+    if isinstance(table, CompTable2D):
+        rows, columns = (size - 1 for size in table.values.shape)
+        return [(table.row, table.row_span / columns), (table.column, table.column_span / rows)]
+    motor = table.motor if isinstance(table, BacklashTable) else table.source
+    return [(motor, table.length / len(table.entries))]
+
+
+def _end_violations(table: CompTable1D | CompTable2D) -> list[str]:
+    """What happens at the roll-over: the last entry is the value at zero, far edges are the zero edges."""
+    if isinstance(table, CompTable1D):
+        if table.entries[-1] == 0:
+            return []
+        return [f"the table of motor {table.motor} ends with {table.entries[-1]}: the value jumps at zero; expected 0"]
+    values = table.values
+    if np.array_equal(values[-1], values[0]) and np.array_equal(values[:, -1], values[:, 0]):
+        return []
+    return [f"the far edges of the table of motor {table.motor} are not its zero edges: the value jumps at zero"]

@@ -1,0 +1,1 @@
+"""What several controls share: the base class, tables as term lists, node positions, whole numbers."""

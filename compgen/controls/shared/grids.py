@@ -1,0 +1,366 @@
+"""Node positions for tables, as few as hold the error curves within a loss, and interpolation in regular grids."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from decimal import ROUND_CEILING, Decimal
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.kinematics.first_order import coefficients
+
+# The fewest nodes of a polyline that stays within a tolerance of curves: a shortest path over candidate nodes.
+
+
+def fewest_nodes(
+    position_mm: FloatArray, values: FloatArray, tolerances: FloatArray, required: Sequence[int] = ()
+) -> list[int]:
+    """Return the indices of the fewest candidates whose polylines hold every curve, ends included.
+
+    Parameters
+    ----------
+    position_mm : candidates (n,), ascending.
+    values : curves at the candidates, shape (k, n); between them they are straight.
+    tolerances : largest deviation of each curve at the candidates, shape (k,).
+    required : indices that must be nodes.
+
+    Among the smallest sets that with the least sum of squared deviations (in tolerances) is taken. Exact: dynamic
+    programming over all pairs; a pair is allowed if the line between the two passes all candidates in between.
+    """
+    count = len(position_mm)
+    scaled = np.asarray(values, dtype=np.float64) / np.asarray(tolerances, dtype=np.float64)[:, None]
+    best = np.full((count, 2), np.inf)  # number of pieces, sum of squares; of the part up to the node
+    best[0], before = 0.0, np.zeros(count, dtype=np.int64)
+    stops = sorted({*required, count - 1})
+    for first in range(count - 1):
+        stop = next(index for index in stops if index > first)
+        fits, squares = _pieces(position_mm[first : stop + 1], scaled[:, first : stop + 1])
+        for last in (first + 1 + np.flatnonzero(fits)).tolist():
+            pieces, square = best[first, 0] + 1.0, best[first, 1] + squares[last - first - 1]
+            if pieces < best[last, 0] or (pieces == best[last, 0] and square < best[last, 1]):
+                best[last], before[last] = (pieces, square), first
+    path = [count - 1]
+    while path[-1]:
+        path.append(int(before[path[-1]]))
+    return path[::-1]
+
+
+def _pieces(position_mm: FloatArray, values: FloatArray) -> tuple[np.ndarray, FloatArray]:
+    """For the lines from the first candidate to every later one: whether all between lie within 1, sum of squares.
+
+    ``values`` (k, n); both results have shape (n-1,).
+    """
+    along = position_mm[1:] - position_mm[0]
+    rise = values[:, 1:] - values[:, :1]
+    slope = rise / along
+    nothing = np.full((len(values), 1), np.inf)
+    lowest = np.hstack([-nothing, np.maximum.accumulate((rise - 1.0) / along, axis=1)[:, :-1]])
+    highest = np.hstack([nothing, np.minimum.accumulate((rise + 1.0) / along, axis=1)[:, :-1]])
+    margin = 1e-9 * (1.0 + np.abs(slope))
+    fits = np.all((slope >= lowest - margin) & (slope <= highest + margin), axis=0)
+    xx, xy, yy = np.cumsum(along**2), np.cumsum(along * rise, axis=1), np.cumsum(rise**2, axis=1)
+    squares = np.sum(yy - 2.0 * slope * xy + slope**2 * xx, axis=0)  # the end itself adds nothing
+    return fits, np.maximum(squares, 0.0)
+
+
+# Node positions for tables: as few as hold the error curves within a wanted loss, equidistant where a control demands it.
+
+
+#: Loss by interpolation between table nodes that is not worth another node, as a displacement of the tool.
+NEGLIGIBLE_LOSS_MM = 0.05 * MM_PER_UM
+#: A loss of this share of the standard uncertainty of a curve is not worth another node either ...
+UNCERTAINTY_SHARE = 0.1
+#: ... as far as it does not exceed this share of the curve's range.
+RANGE_SHARE = 0.02
+#: A table is not refined beyond this many intervals, whatever the control could take.
+MOST_INTERVALS = 400
+#: Every number of intervals is tried up to this one, then 5 % more each.
+EVERY_COUNT = 60
+#: Where no grid reaches the wanted loss: the coarsest is taken that loses at most this much more than the best.
+NEARLY_BEST = 1.25
+#: Where a bent curve is looked at within an interval; no simple fractions, which refined nodes would hit.
+BETWEEN = np.array([0.13, 0.29, 0.41, 0.53, 0.67, 0.79, 0.91])
+#: Steps are whole multiples of this.
+STEP_QUANTUM = Decimal("0.0001")
+
+
+@dataclass(frozen=True)
+class EquidistantGrid:
+    """Equidistant nodes ``start + k step``, k = 0 ... count - 1, in exact decimal numbers (mm)."""
+
+    start: Decimal
+    step: Decimal
+    count: int
+
+    @property
+    def last(self) -> Decimal:
+        """Position of the last node, exact."""
+        return self.start + (self.count - 1) * self.step
+
+    @property
+    def nodes_mm(self) -> FloatArray:
+        """Node positions, shape (count,)."""
+        return np.array([float(self.start + k * self.step) for k in range(self.count)])
+
+
+def loss_setting(
+    meaning: str = "loss by interpolation between nodes, um at the tool, that is worth no further node",
+) -> Any:
+    """Declare ``loss_um``: the loss by interpolation, as a displacement of the tool, that is worth no further node; in mm."""
+    default = NEGLIGIBLE_LOSS_MM / MM_PER_UM
+    return toml_files.setting(toml_files.positive, key="loss_um", unit=MM_PER_UM, stated=default, meaning=meaning)
+
+
+def take_loss_mm(section: toml_files.Section) -> float:
+    """Take ``loss_um`` from a control's settings: the loss by interpolation that is worth no further node; in mm."""
+    return section.take("loss_um", toml_files.positive, NEGLIGIBLE_LOSS_MM / MM_PER_UM) * MM_PER_UM
+
+
+def curve_nodes_mm(machine: Machine, errors: ErrorTable, axis: int, most: int = 1000) -> FloatArray:
+    """Return the union of the positions of all curves of an axis within its travel, the travel ends included."""
+    low, high = machine.axes[axis].range_mm
+    curves = [curve for name, curve in errors.curves.items() if error_named(name).axis == axis]
+    positions = np.concatenate([[low, high], *(curve.position_mm for curve in curves)])
+    inside = np.unique(np.round(positions[(positions >= low) & (positions <= high)], 6))
+    return inside if len(inside) <= most else np.linspace(low, high, most)
+
+
+def uneven_nodes_mm(
+    machine: Machine, errors: ErrorTable, axis: int, *, loss_mm: float = NEGLIGIBLE_LOSS_MM, most: int = 1000
+) -> FloatArray:
+    """Return the fewest nodes, taken from those of the curves, with which no curve of the axis loses what matters.
+
+    Travel ends are nodes, and so is the reference point if a curve has a node there.
+    """
+    candidates = curve_nodes_mm(machine, errors, axis, most)
+    curves = [_Held.of(machine, name, curve, loss_mm) for name, curve in _curves_of(errors, axis)]
+    if not curves:
+        return candidates
+    values = np.array([item.curve.at(candidates) for item in curves])
+    tolerances = np.array([item.tolerance for item in curves])
+    reference = np.flatnonzero(np.abs(candidates - machine.reference_point_mm[axis]) < 1e-6)
+    return candidates[fewest_nodes(candidates, values, tolerances, reference.tolist())]
+
+
+def equidistant_grid(
+    machine: Machine,
+    errors: ErrorTable,
+    axis: int,
+    *,
+    most: int,
+    step_mm: float | None = None,
+    anchor: bool = False,
+    loss_mm: float = NEGLIGIBLE_LOSS_MM,
+    output: int | None = None,
+    products: bool = True,
+) -> EquidistantGrid:
+    """Return an equidistant grid that covers the travel.
+
+    Parameters
+    ----------
+    machine, errors, axis : whose travel and curves are to be held.
+    most : largest number of nodes that the control takes.
+    step_mm : a step that the user asks for; otherwise the widest one that loses nothing that matters.
+    anchor : True if the reference point must be a node.
+    loss_mm : loss by interpolation, as a displacement of the tool, that is worth no further node; a tenth of the
+        standard uncertainty of a curve is not either.
+    output : only curves that move this axis count; default all.
+    products : False if the control multiplies curves with levers itself, so that only the curves have to be held.
+    """
+    low, high = machine.axes[axis].range_mm
+    if step_mm is not None:
+        return _grid(machine, axis, Decimal(repr(step_mm)), anchor)
+    curves = [_Held.of(machine, name, curve, loss_mm) for name, curve in _curves_of(errors, axis, machine, output)]
+    curves = curves if products else [replace(item, bent=False) for item in curves]
+    tried: list[tuple[float, EquidistantGrid]] = []
+    for grid in _candidates(machine, errors, axis, anchor, most):
+        nodes_mm = grid.nodes_mm
+        tried.append((max((item.loss(nodes_mm) for item in curves), default=0.0), grid))
+        if tried[-1][0] <= 1.0:
+            return grid
+    return nearly_best(tried) or _grid(machine, axis, _round_up(Decimal(repr(high - low))), anchor)
+
+
+def nearly_best(tried: Sequence[tuple[float, EquidistantGrid]]) -> EquidistantGrid | None:
+    """Return the first of grids with their losses, coarsest first, that loses hardly more than the best one."""
+    enough = NEARLY_BEST * min((loss for loss, _ in tried), default=0.0)
+    return next((grid for loss, grid in tried if loss <= enough), None)
+
+
+def worth_mm(errors: ErrorTable, axis: int, loss_mm: float) -> float:
+    """Return the loss of positioning that is worth no further node: as wanted, or what its uncertainty makes idle."""
+    curve = errors.curves.get(f"E{AXES[axis]}{AXES[axis]}")
+    return loss_mm if curve is None else max(loss_mm, _idle_loss(curve))
+
+
+def _idle_loss(curve: Curve) -> float:
+    """Loss of a curve, in its own unit, that its uncertainty hides; 0 if that is not known."""
+    if not np.all(np.isfinite(curve.u)):
+        return 0.0
+    return min(UNCERTAINTY_SHARE * float(np.sqrt(np.mean(curve.u**2))), RANGE_SHARE * float(np.ptp(curve.value)))
+
+
+def _curves_of(
+    errors: ErrorTable, axis: int, machine: Machine | None = None, output: int | None = None
+) -> Iterator[tuple[str, Curve]]:
+    """Curves over an axis, those only that move the axis ``output`` if one is given."""
+    moving = None
+    if machine is not None and output is not None:
+        parts = coefficients(machine.chain, machine.squareness_reference)
+        moving = {part.error for part in parts if part.output == output}
+    for name, curve in errors.curves.items():
+        if error_named(name).axis == axis and (moving is None or name in moving):
+            yield name, curve
+
+
+@dataclass(frozen=True)
+class _Held:
+    """A curve that tables have to hold to within ``tolerance`` (mm or rad); with ``bent`` also curve times position.
+
+    An angular error whose lever holds its own axis' travel acts as curve times position, which is bent between the
+    nodes of the curve; it is looked at there as well, to within ``bent_tolerance`` mm.
+    """
+
+    curve: Curve
+    tolerance: float
+    bent: bool
+    bent_tolerance: float
+
+    @classmethod
+    def of(cls, machine: Machine, name: str, curve: Curve, loss_mm: float) -> _Held:
+        error = error_named(name)
+        ends = np.abs(np.concatenate([machine.lower_mm, machine.upper_mm, machine.tool_offset_mm]))
+        lever_mm = 1.0 if error.kind == "linear" else max(1.0, float(np.max(ends)))
+        u = _idle_loss(curve)
+        bent = error.kind == "angular" and error.direction != error.axis and len(curve.position_mm) > 1
+        bent = bent and name not in SQUARENESS_NAMES and error.axis in machine.chain.lever_axes(error.axis or 0)
+        return cls(curve, max(loss_mm / lever_mm, u), bent, max(loss_mm, u * lever_mm))
+
+    def loss(self, nodes_mm: FloatArray) -> float:
+        """Largest loss by interpolation between the nodes, 1 where it is just tolerated."""
+        curve, at_nodes = self.curve, self.curve.at(nodes_mm)
+        loss = _missed(nodes_mm, curve.position_mm, at_nodes, curve.value) / self.tolerance
+        if not self.bent:
+            return loss
+        start, step = curve.position_mm[:-1, None], np.diff(curve.position_mm)[:, None]
+        where = (start + step * BETWEEN).ravel()
+        missed = _missed(nodes_mm, where, at_nodes * nodes_mm, curve.at(where) * where)
+        return max(loss, missed / self.bent_tolerance)
+
+
+def _missed(nodes_mm: FloatArray, where_mm: FloatArray, at_nodes: FloatArray, wanted: FloatArray) -> float:
+    return float(np.max(np.abs(np.interp(where_mm, nodes_mm, at_nodes) - wanted)))
+
+
+def _candidates(machine: Machine, errors: ErrorTable, axis: int, anchor: bool, most: int) -> list[EquidistantGrid]:
+    """Grids within ``most`` nodes by their number: even parts of the travel, and steps that hit the curves' nodes."""
+    low, high = machine.axes[axis].range_mm
+    length = Decimal(repr(high)) - Decimal(repr(low))
+    steps = {_round_up(length / count) for count in _interval_counts(most)}
+    common = common_step(machine, errors, axis, anchor=anchor)
+    parts = (common / part for part in range(1, 11))
+    steps |= {step for step in parts if step % STEP_QUANTUM == 0 and length / step <= most}
+    grids = [_grid(machine, axis, step, anchor) for step in steps]
+    return sorted((grid for grid in grids if grid.count <= most), key=lambda grid: (grid.count, grid.step))
+
+
+def _interval_counts(most: int) -> list[int]:
+    counts = list(range(1, EVERY_COUNT + 1))
+    while counts[-1] < MOST_INTERVALS:
+        counts.append(int(1.05 * counts[-1]))
+    return [count for count in counts if count < most]
+
+
+def common_step(machine: Machine, errors: ErrorTable, axis: int, *, anchor: bool) -> Decimal:
+    """Widest step with which the nodes of all curves, the travel ends and the origin of the grid are nodes."""
+    origin = machine.reference_point_mm[axis] if anchor else machine.axes[axis].range_mm[0]
+    distances = np.abs(curve_nodes_mm(machine, errors, axis) - origin) / float(STEP_QUANTUM)
+    return max(1, math.gcd(*np.rint(distances).astype(np.int64).tolist())) * STEP_QUANTUM
+
+
+def _round_up(step: Decimal) -> Decimal:
+    return max(step.quantize(STEP_QUANTUM, rounding=ROUND_CEILING), STEP_QUANTUM)
+
+
+def _grid(machine: Machine, axis: int, step: Decimal, anchor: bool) -> EquidistantGrid:
+    low, high = (Decimal(repr(end)) for end in machine.axes[axis].range_mm)
+    origin = Decimal(repr(machine.reference_point_mm[axis])) if anchor else low
+    below = math.ceil((origin - low) / step)
+    above = math.ceil((high - origin) / step)
+    return EquidistantGrid(origin - below * step, step, below + above + 1)
+
+
+# Trilinear interpolation in a regular grid of boxes, as three-dimensional error compensation does it.
+#
+# FANUC, additional manual A-79351E, sheet 3/13: inside a box each component is the sum over its eight corners of the
+# corner's value times (1 - x) or x, (1 - y) or y, (1 - z) or z, with the ratios x, y, z = 0 ... 1 within the box.
+
+
+#: Corner (x, y, z) of C1 ... C8 in FANUC's formula: round the lower face, then round the upper one.
+FANUC_CORNERS: tuple[tuple[int, int, int], ...] = (
+    (0, 0, 0),
+    (1, 0, 0),
+    (1, 1, 0),
+    (0, 1, 0),
+    (0, 0, 1),
+    (1, 0, 1),
+    (1, 1, 1),
+    (0, 1, 1),
+)
+
+
+def box_of_corners(corners: FloatArray) -> FloatArray:
+    """Return a grid of one box (2, 2, 2, k) from values (8, k) in FANUC's order C1 ... C8.
+
+    >>> box_of_corners(np.arange(8.0)[:, None])[1, 0, 0, 0], box_of_corners(np.arange(8.0)[:, None])[0, 1, 1, 0]
+    (np.float64(1.0), np.float64(7.0))
+    """
+    values = np.asarray(corners, dtype=np.float64)
+    box = np.empty((2, 2, 2, values.shape[1]))
+    for corner, value in zip(FANUC_CORNERS, values, strict=True):
+        box[corner] = value
+    return box
+
+
+def _cells(ratio: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Cell number and share within it for ratios (n,) that count in cells from the first vertex; clamped."""
+    inside = np.clip(ratio, 0.0, count - 1)
+    cell = np.minimum(np.floor(inside), max(count - 2, 0))
+    return cell, inside - cell
+
+
+def trilinear(vertices: FloatArray, start_mm: FloatArray, step_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
+    """Interpolate a regular grid of vertex values.
+
+    Parameters
+    ----------
+    vertices : values (nx, ny, nz, k) in any unit; index [i, j, l] stands at ``start_mm + (i, j, l) step_mm``. An
+        axis with a single vertex is constant along itself.
+    start_mm, step_mm : position of vertex [0, 0, 0] and the (positive) distances, shape (3,), mm.
+    position_mm : shape (n, 3), mm; outside the grid the value of its surface holds (clamped).
+
+    Returns
+    -------
+    values at the positions, shape (n, k).
+    """
+    grid = np.asarray(vertices, dtype=np.float64)
+    ratio = (np.asarray(position_mm, dtype=np.float64) - start_mm) / step_mm
+    cells, shares = zip(*(_cells(ratio[:, axis], grid.shape[axis]) for axis in range(3)), strict=True)
+    result = np.zeros((len(ratio), grid.shape[3]))
+    for corner in product((0, 1), repeat=3):
+        weight = np.ones(len(ratio))
+        index = []
+        for axis, upper in enumerate(corner):
+            weight = weight * (shares[axis] if upper else 1.0 - shares[axis])
+            index.append(np.minimum(cells[axis] + upper, grid.shape[axis] - 1).astype(np.intp))
+        result += weight[:, None] * grid[index[0], index[1], index[2]]
+    return result

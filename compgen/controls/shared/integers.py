@@ -1,0 +1,239 @@
+"""The best whole numbers for a table: dynamic programming over the cumulative curve.
+
+A table of counts A_k at nodes x_k acts as the polyline through them. Wanted is a curve whose projection onto polylines
+with these nodes is v (in counts). As the projection is orthogonal, every table misses the wanted curve by what the
+projection misses plus
+
+    J(A) = integral of w (polyline of A - v)^2 = sum over sections d^T G d,   d = A - v at both ends of a section,
+
+so that J alone decides. Sought are whole numbers with A = 0 at the reference node and steps of at most ``limit``.
+
+**Bound.** If no step of v exceeds the limit, nor does any step of the rounded v, because floor(a + m + 1/2) =
+floor(a + 1/2) + m for whole m and rounding is monotone. So tables exist that stay within half a count at every node, and
+hence, as a polyline, everywhere; among them that with the smallest J is taken. Where the limit binds on one side of the
+reference node, none exists there, and J alone is minimised on that side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.kinematics.curves import hat_entries, hat_matrix
+
+IntArray = NDArray[np.int64]
+
+#: Largest deviation at a node in counts that rounding needs.
+HALF = 0.5
+#: Rounding noise of numbers in counts.
+NOISE = 1e-9
+#: Weight of what lies beyond the travel, so that nodes out there continue the curve.
+BEYOND = 1e-6
+
+
+@dataclass(frozen=True)
+class IntegerCurve:
+    """Whole numbers at the nodes of a table, and how well they do.
+
+    Parameters
+    ----------
+    counts : cumulative curve A, shape (n,), zero at the reference node.
+    rms, largest : deviation of the polyline from the wanted one, in counts: weighted over the axis, and the largest.
+    limited : whether the limit of the steps keeps the table from staying within half a count.
+    full_sections : with ``limited``, the sections (0 is the first) whose step is as large as the limit.
+    """
+
+    counts: IntArray
+    rms: float
+    largest: float
+    limited: bool
+    full_sections: tuple[int, ...] = ()
+
+
+def section_weights(
+    nodes_mm: FloatArray,
+    range_mm: tuple[float, float],
+    zone_mm: tuple[float, float] | None = None,
+    zone_weight: float = 1.0,
+) -> FloatArray:
+    """Return G of every section as (n-1, 3): the integrals of h0^2, h0 h1, h1^2 with the two hat functions h, in mm.
+
+    The weight is 1 within ``range_mm``, ``zone_weight`` in the zone, and almost nothing beyond the range.
+    """
+    zone = () if zone_mm is None else zone_mm
+    cuts = np.unique(np.clip([*nodes_mm, *range_mm, *zone], nodes_mm[0], nodes_mm[-1]))
+    middle, half = 0.5 * (cuts[1:] + cuts[:-1]), 0.5 * np.diff(cuts)
+    weight = np.where((middle > range_mm[0]) & (middle < range_mm[1]), 1.0, BEYOND)
+    if zone_mm is not None:
+        weight = np.where((middle > zone_mm[0]) & (middle < zone_mm[1]), weight * zone_weight, weight)
+    result = np.zeros((len(nodes_mm) - 1, 3))
+    for point in (-1.0 / np.sqrt(3.0), 1.0 / np.sqrt(3.0)):  # Gauss: exact for products of two lines
+        left, share = hat_entries(nodes_mm, middle + half * point)
+        products = np.column_stack([(1.0 - share) ** 2, (1.0 - share) * share, share**2])
+        np.add.at(result, left, (weight * half)[:, None] * products)
+    return result
+
+
+def nearest_polyline(
+    nodes_mm: FloatArray, position_mm: FloatArray, wanted: FloatArray, weight: FloatArray, reference: int
+) -> tuple[FloatArray, FloatArray]:
+    """Project a curve that is given at any positions (m,) onto polylines that are zero at node ``reference``.
+
+    Returns the values (n,) at the nodes and G (n-1, 3) of the sections, both with the weights (m,) of the positions.
+    Every section needs weighted positions enough to determine its ends.
+    """
+    matrix = hat_matrix(nodes_mm, position_mm)
+    left, share = hat_entries(nodes_mm, position_mm)
+    sections = np.zeros((len(nodes_mm) - 1, 3))
+    products = np.column_stack([(1.0 - share) ** 2, (1.0 - share) * share, share**2])
+    np.add.at(sections, left, weight[:, None] * products)
+    free = np.arange(len(nodes_mm)) != reference
+    root = np.sqrt(weight)
+    values = np.zeros(len(nodes_mm))
+    values[free] = np.linalg.lstsq(matrix[:, free] * root[:, None], wanted * root, rcond=None)[0]
+    return values, sections
+
+
+def best_integers(wanted: FloatArray, sections: FloatArray, reference: int, limit: int | None) -> IntegerCurve:
+    """Return the whole numbers closest to a polyline, exact by dynamic programming.
+
+    Parameters
+    ----------
+    wanted : values v (n,) of the polyline at the nodes in counts, zero at the reference node.
+    sections : G of the sections, shape (n-1, 3), from :func:`section_weights` or :func:`nearest_polyline`.
+    reference : index of the node where the table is zero.
+    limit : largest step between neighbours in counts, or None.
+    """
+    counts = np.zeros(len(wanted), dtype=np.int64)
+    right, limited_right = _side(wanted[reference:], sections[reference:], limit)
+    left, limited_left = _side(wanted[reference::-1], sections[:reference][::-1, ::-1], limit)
+    counts[reference:], counts[reference::-1] = right, left
+    limited = limited_left or limited_right
+    steps = np.abs(np.diff(counts))
+    total = float(np.sum(sections @ np.array([1.0, 2.0, 1.0])))
+    return IntegerCurve(
+        counts=counts,
+        rms=float(np.sqrt(_square(counts - wanted, sections) / total)) if total else 0.0,
+        largest=float(np.max(np.abs(counts - wanted))),
+        limited=limited,
+        full_sections=tuple(np.flatnonzero(steps == limit).tolist()) if limited else (),
+    )
+
+
+def _side(wanted: FloatArray, sections: FloatArray, limit: int | None) -> tuple[IntArray, bool]:
+    """Return the best counts (n,) from the reference node (first, count 0) outwards, and whether the limit binds."""
+    low = np.ceil(wanted - HALF - NOISE).astype(np.int64)
+    high = np.floor(wanted + HALF + NOISE).astype(np.int64)
+    low[0] = high[0] = 0
+    found = _cheapest(wanted, sections, low, high, limit)
+    if found is not None or limit is None:
+        assert found is not None  # without a limit every whole number can be reached
+        return found, False
+    best = _cheapest(wanted, sections, *_windows(wanted, sections, limit), limit)
+    assert best is not None  # the windows hold the rounded curve from which they were made
+    return best, True
+
+
+def _square(deviation: FloatArray, sections: FloatArray) -> float:
+    """J of deviations (n,) at the nodes."""
+    first, last = deviation[:-1], deviation[1:]
+    parts = sections[:, 0] * first**2 + 2.0 * sections[:, 1] * first * last + sections[:, 2] * last**2
+    return float(np.sum(parts))
+
+
+def _cheapest(
+    wanted: FloatArray, sections: FloatArray, low: IntArray, high: IntArray, limit: int | None
+) -> IntArray | None:
+    """Return the counts within ``low`` ... ``high`` (n,) of smallest J, or None if the limit leaves none."""
+    cost, choices = np.zeros(high[0] - low[0] + 1), []
+    for k in range(1, len(wanted)):
+        reach = limit if limit is not None else int(max(high[k] - low[k - 1], high[k - 1] - low[k], 0))
+        states = np.arange(low[k], high[k] + 1)
+        before = states[:, None] + np.arange(-reach, reach + 1)
+        index = before - low[k - 1]
+        inside = (index >= 0) & (index < len(cost))
+        first, last = before - wanted[k - 1], (states - wanted[k])[:, None]
+        g0, g1, g2 = sections[k - 1]
+        total = np.where(inside, cost[np.clip(index, 0, len(cost) - 1)], np.inf)
+        total = total + g0 * first**2 + 2.0 * g1 * first * last + g2 * last**2
+        choice = np.argmin(total, axis=1) if len(states) else np.zeros(0, dtype=np.int64)
+        cost = total[np.arange(len(states)), choice]
+        if not np.any(np.isfinite(cost)):
+            return None
+        choices.append(before[np.arange(len(states)), choice])
+    counts = np.empty(len(wanted), dtype=np.int64)
+    counts[-1] = low[-1] + int(np.argmin(cost))
+    for k in range(len(wanted) - 1, 0, -1):
+        counts[k - 1] = choices[k - 1][counts[k] - low[k]]
+    return counts
+
+
+def _windows(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[IntArray, IntArray]:
+    """Return windows (n,) that provably hold the best counts.
+
+    With the real-valued curve u that a solver finds within the limit, and any table A at least as good as the rounded
+    one R, convexity gives (A-u)^T M (A-u) <= J(R) - J(u) + gap, with gap the most that the gradient at u could still
+    gain over all curves within the limit. Both sections of a node hold at least their smallest eigenvalue of it.
+    """
+    curve, gap = _reachable(wanted, sections, limit)
+    rounded = _clamped(curve, limit)
+    room = max(_square(rounded - wanted, sections) - _square(curve - wanted, sections) + gap, 0.0)
+    mean, half = 0.5 * (sections[:, 0] + sections[:, 2]), 0.5 * (sections[:, 0] - sections[:, 2])
+    least = np.maximum(mean - np.hypot(half, sections[:, 1]), 0.0)
+    stiffness = np.concatenate([[0.0], least]) + np.concatenate([least, [0.0]])
+    radius = np.sqrt(room * (1.0 + NOISE) / np.maximum(stiffness, 1e-300)) + 1.0
+    low, high = np.empty(len(wanted), dtype=np.int64), np.empty(len(wanted), dtype=np.int64)
+    low[0] = high[0] = 0
+    for k in range(1, len(wanted)):
+        low[k] = max(np.ceil(max(curve[k] - radius[k], -1e15)), low[k - 1] - limit)
+        high[k] = min(np.floor(min(curve[k] + radius[k], 1e15)), high[k - 1] + limit)
+    return low, high
+
+
+def _clamped(curve: FloatArray, limit: int) -> IntArray:
+    """Round a curve (n,) from its first value 0 on, no step larger than the limit."""
+    counts = np.floor(curve + 0.5).astype(np.int64)
+    counts[0] = 0
+    for k in range(1, len(counts)):
+        counts[k] = np.clip(counts[k], counts[k - 1] - limit, counts[k - 1] + limit)
+    return counts
+
+
+def _reachable(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[FloatArray, float]:
+    """Return a real-valued curve (n,) of small J with steps within the limit, and how much is certainly left."""
+    import osqp  # imported here: slow to load, and only steep curves need it
+    from scipy.sparse import csc_matrix, dia_matrix
+
+    count = len(wanted) - 1
+    scale = 1.0 / float(np.max(sections))
+    both, cross = sections[:, 2] + np.append(sections[1:, 0], 0.0), sections[1:, 1]
+    bands = scale * np.array([np.append(cross, 0.0), both, np.append(0.0, cross)])
+    matrix = csc_matrix(dia_matrix((bands, [-1, 0, 1]), shape=(count, count)))
+    upper = csc_matrix(dia_matrix((bands[1:], [0, 1]), shape=(count, count)))
+    difference = csc_matrix(dia_matrix((np.array([np.ones(count), -np.ones(count)]), [0, -1]), shape=(count, count)))
+    bounds = np.full(count, float(limit))
+    solver = osqp.OSQP()
+    options = {"verbose": False, "eps_abs": 1e-6, "eps_rel": 1e-9, "max_iter": 20_000, "polishing": True}
+    solver.setup(upper, -matrix @ wanted[1:], difference, -bounds, bounds, **options)
+    found = np.asarray(solver.solve(raise_error=False).x, dtype=np.float64)
+    steps = np.clip(np.diff(np.nan_to_num(found), prepend=0.0), -limit, limit)
+    gradient = 2.0 * np.cumsum((matrix @ (np.cumsum(steps) - wanted[1:]))[::-1])[::-1] / scale
+    gap = float(np.sum(np.abs(gradient) * limit + gradient * steps))
+    return np.concatenate([[0.0], np.cumsum(steps)]), max(gap, 0.0)
+
+
+def lowest_free(taken: Sequence[tuple[int, int]], start: int, count: int) -> int:
+    """Return the lowest first number, from ``start`` on, of ``count`` numbers that meet no taken block.
+
+    >>> lowest_free([(5, 9), (12, 12)], 1, 4), lowest_free([(5, 9), (12, 12)], 1, 5)
+    (1, 13)
+    """
+    first = start
+    for low, high in sorted(taken):
+        if low < first + count and high >= first:
+            first = high + 1
+    return first

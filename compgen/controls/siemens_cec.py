@@ -1,0 +1,481 @@
+"""SINUMERIK cross-error compensation (CEC, sag): any axis corrected as a function of any axis, and products of tables.
+
+Source: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245-252, 264; 802D sl, p. 215-222.
+The sign of the sum is not in the readable documents; it is inferred, see ``templates/siemens-cec/format.toml``.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controls.shared.grids import equidistant_grid
+from compgen.controls.shared.terms import one_dimensional_terms, product_terms
+from compgen.controls.siemens_cec_tables import (
+    MM_DECIMALS,
+    MODE_WORDS,
+    NEGLIGIBLE_PRODUCT_MM,
+    CecMap,
+    CecTable,
+    Choice,
+    backlash_rows,
+    beside_kept,
+    chosen_terms,
+    folded_tables,
+    labels_in,
+    reversal_statement,
+    sum_into_axes,
+    term_names,
+    terms_of_tables,
+    with_reversal_tables,
+    without_products,
+    written_decimals,
+)
+from compgen.controls.siemens_machine_data import (
+    CecSettings,
+    cec_overwrites,
+    cec_parameters,
+    cec_reservations,
+    cec_sign_statement,
+    cec_usage,
+    cec_warnings,
+    largest_sums,
+    set_violations,
+    stated_limit_violations,
+    take_cec_settings,
+)
+from compgen.controls.siemens_text import (
+    PROTECTING,
+    SWITCHES,
+    ArchiveAssignments,
+    ArchiveFindings,
+    Assignment,
+    TableParts,
+    axis_of,
+    foreign_assignments,
+    read_assignments,
+)
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.names import AXES
+from compgen.errors import CompgenWarning
+
+#: Variables of the tables and their switches without ``$``, with the number of their indices (K3-2013, p. 245-249).
+VARIABLES = {
+    "AN_CEC": 2,
+    "AN_CEC_INPUT_AXIS": 1,
+    "AN_CEC_OUTPUT_AXIS": 1,
+    "AN_CEC_STEP": 1,
+    "AN_CEC_MIN": 1,
+    "AN_CEC_MAX": 1,
+    "AN_CEC_DIRECTION": 1,
+    "AN_CEC_MULT_BY_TABLE": 1,
+    "AN_CEC_IS_MODULO": 1,
+    "MA_CEC_ENABLE": 1,
+    "SN_CEC_TABLE_ENABLE": 1,
+    "SN_CEC_TABLE_WEIGHT": 1,
+}
+MODE_OF_A_FILE = (
+    "the file multiplies tables, and the machine file does not say what the control makes of that: state "
+    'mult_mode = "S1", "S2", "S3" or "S4" in the section of the control'
+)
+#: (output, axis) of every table without products.
+ALL_PAIRS = [(output, axis) for output in range(3) for axis in range(3)]
+_AXIS_VALUE = re.compile(r'\(\s*([A-Z0-9_]{1,32})\s*\)|"([A-Z0-9_]{1,32})"')
+#: Every output axis has three ordinary tables and, on every chain, at most three products.
+_ORDINARY_PER_AXIS = _PRODUCTS_PER_AXIS = 3
+#: Factors of a product have 9 decimals and stay below some mm: what their rounding may add up to on one axis.
+_FACTOR_ROUNDING_MM = 1e-8
+
+
+@dataclass(frozen=True)
+class CecTables:
+    """Tables by index, with the numbers as the file has them; ``others`` are the indices of tables of other axes."""
+
+    tables: CecMap
+    others: tuple[int, ...] = field(default=(), compare=False)
+
+
+class SiemensCec(Controller[CecSettings, CecTables]):
+    """SINUMERIK CEC: straightness, squareness, positioning, and angular errors as products of tables."""
+
+    name = "siemens-cec"
+    bidirectional = True
+
+    @classmethod
+    def read_settings(cls, machine: Machine) -> CecSettings:
+        """Check the settings; ``mult_mode`` is mandatory where products are stated."""
+        section = machine.controller_settings(cls.name)
+        settings = take_cec_settings(section, machine)
+        section.finish()
+        return settings
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return nine tables output over axis, and the products with levers that count from the reference point.
+
+        If the control has fewer tables than that takes, those remain that leave the least error over the volume.
+        """
+        return self._choice(errors).kept
+
+    def basis_of(self, errors: ErrorTable, tables: CecTables) -> list[Term]:
+        """Return the terms that the tables hold, if no better set fits into the control."""
+        choice = self._choice(errors)
+        terms = self.terms(errors, ALL_PAIRS)
+        return terms_of_tables(self.machine, errors, terms, self.settings.mult_mode, choice, term_names(tables.tables))
+
+    def terms(self, errors: ErrorTable, pairs: Sequence[tuple[int, int]]) -> list[Term]:
+        """Return the terms of tables output over axis for the pairs, and of the products unless they are forbidden."""
+        machine, settings = self.machine, self.settings
+        nodes = [
+            equidistant_grid(
+                machine,
+                errors,
+                axis,
+                most=settings.max_points,
+                step_mm=settings.step_mm[axis],
+                loss_mm=settings.loss_mm,
+            ).nodes_mm
+            for axis in range(3)
+        ]
+        if not settings.products:
+            return one_dimensional_terms(machine, errors, nodes, pairs)
+        origin = machine.reference_point_mm
+        ordinary = one_dimensional_terms(machine, errors, nodes, pairs, lever_origin_mm=origin)
+        return ordinary + product_terms(machine, errors, nodes, origin)
+
+    def unwritten_products(
+        self, errors: ErrorTable, pairs: Sequence[tuple[int, int]], beside: Sequence[Term] = ()
+    ) -> list[str]:
+        """Return what stays uncorrected because the settings allow no products, in words; nothing if they do."""
+        if self.settings.products:
+            return []
+        everything = SiemensCec(self.machine, replace(self.settings, products=True)).terms(errors, pairs)
+        return without_products(self.machine, errors, everything, beside)
+
+    def left_out(self, errors: ErrorTable) -> list[str]:
+        """Return which tables the control has no room for, which products are not written, and what stays for that."""
+        return self._choice(errors).statements() + self.unwritten_products(errors, ALL_PAIRS)
+
+    def reservations(self, tables: CecTables) -> list[str]:
+        """Return what was inferred (sign), left out (products), or is not known (number of tables)."""
+        return cec_reservations(tables.tables, self.settings)
+
+    def _choice(self, errors: ErrorTable) -> Choice:
+        terms = self.terms(errors, ALL_PAIRS)
+        return chosen_terms(self.machine, errors, terms, self.settings.mult_mode, self.settings.tables_usable)
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> CecTables:
+        """Return the tables with balanced folding, in whole units of the last decimal."""
+        settings = self.settings
+        travel = [axis.range_mm for axis in self.machine.axes]
+        tables = folded_tables(basis, values, flip=settings.subtracts, mode=settings.mult_mode, travel_mm=travel)
+        return CecTables(beside_kept(tables, settings.kept_tables))
+
+    def with_reversal(self, tables: CecTables, reversal: ReversalCurves) -> CecTables:
+        """Return the tables with a pair DIRECTION 1 and -1 for each reversal."""
+        settings = self.settings
+        found = with_reversal_tables(
+            self.machine,
+            tables.tables,
+            reversal,
+            subtracts=settings.subtracts,
+            max_points=settings.max_points,
+            step_mm=settings.step_mm,
+        )
+        return CecTables(beside_kept(found, settings.kept_tables))
+
+    def context(self, tables: CecTables) -> dict[str, Any]:
+        """Return tables, machine data and the sign with a number from the file."""
+        machine, settings = self.machine, self.settings
+        sums = largest_sums(machine, tables.tables, settings.mult_mode)
+        both = {index: entry for index, entry in tables.tables.items() if entry.direction == 0}
+        mean_sums = largest_sums(machine, both, settings.mult_mode) if len(both) < len(tables.tables) else sums
+        names, subtracts = settings.axis_names, settings.subtracts
+        return {
+            "sign_statement": cec_sign_statement(names, subtracts, mean_sums, stated=settings.sign_stated)
+            + reversal_statement(tables.tables, names),
+            "parameters": cec_parameters(machine, names, tables.tables, settings.mult_mode, sums)
+            + backlash_rows(tables.tables, names),
+            "warnings": cec_warnings(machine, names, tables.tables, settings, sums),
+            "sign": settings.sign,
+            "sign_stated": settings.sign_stated,
+            "mult_mode": settings.mult_mode,
+            "container": settings.container.kind,
+            "program_enables": settings.container.enables,
+            "outputs": [names[axis] for axis in sorted({entry.output_axis for entry in tables.tables.values()})],
+            "has_products": any(entry.multiplier for entry in tables.tables.values()),
+            "kept_tables": list(settings.kept_tables),
+            "test_tables": [
+                index for index in range(len(settings.kept_tables) + 2) if index not in settings.kept_tables
+            ],
+            "overwrites": cec_overwrites(tables.tables, settings.kept_tables),
+            "tables": [self._table_context(index, entry) for index, entry in sorted(tables.tables.items())],
+        }
+
+    def _table_context(self, index: int, entry: CecTable) -> dict[str, Any]:
+        return {
+            "index": index,
+            "label": entry.label,
+            "input": self._styled(entry.input_axis),
+            "output": self._styled(entry.output_axis),
+            "step_mm": float(entry.table.step_mm),
+            "minimum_mm": float(entry.table.start_mm),
+            "maximum_mm": float(entry.table.last_mm),
+            "direction": entry.direction,
+            "multiplier": entry.multiplier,
+            "modulo": int(entry.table.modulo),
+            "enabled": int(entry.enabled),
+            "weight": float(entry.weight),
+            "decimals": entry.decimals,
+            "values_mm": [float(value) for value in entry.table.values],
+        }
+
+    def parse(self, files: Sequence[SourceFile]) -> CecTables:
+        """Read the tables; every variable of a table must be there, because the control keeps old values."""
+        return cec_tables_from(read_assignments(files, VARIABLES), files, self.settings)
+
+    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CecTables, list[str]]:
+        """Read an archive or a program of a real control: the tables that act, and what was passed over."""
+        findings = ArchiveFindings()
+        given = foreign_assignments(files, VARIABLES, findings)
+        return foreign_cec_tables(given, self.machine, self.settings, findings), findings.statements()
+
+    def emulate(self, tables: CecTables, points: Points) -> FloatArray:
+        """Return what the control adds: the clipped sum of the tables, subtracted or added as ``sign`` says.
+
+        A table with DIRECTION 1 or -1 acts where the last travel of its input axis (``points.approach``) has that
+        sign. Where that is unknown (0, or no approach at all) it does not act, and a CompgenWarning says so: what a
+        control does before the first motion is not documented.
+        """
+        settings = self.settings
+        outputs = {index: _output(entry, points) for index, entry in tables.tables.items()}
+        totals = sum_into_axes(tables.tables, settings.mult_mode, outputs)
+        total = np.column_stack([np.broadcast_to(part, (len(points),)) for part in totals])
+        if settings.max_sum_mm is not None:
+            total = np.clip(total, -np.array(settings.max_sum_mm), np.array(settings.max_sum_mm))
+        return -total if settings.subtracts else total
+
+    def violations(self, tables: CecTables) -> list[str]:
+        """Return broken rules of the set, and sums above MD32720 or too fast for MD32730 if the file states them."""
+        settings = self.settings
+        found = set_violations(self.machine, tables.tables, settings.max_points, settings.tables_available)
+        found += [
+            f"table {index} belongs to other axes (kept_tables of the machine file) and would be overwritten"
+            for index in sorted(set(tables.tables) & set(settings.kept_tables))
+        ]
+        return found + stated_limit_violations(self.machine, tables.tables, settings)
+
+    def keeping_others(self, tables: CecTables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
+        """Return ``kept_tables`` with the tables of other axes that an archive holds."""
+        kept = sorted({*self.settings.kept_tables, *tables.others})
+        if kept == sorted(self.settings.kept_tables):
+            return {}
+        return {name: {"kept_tables": kept} for name in ("siemens-cec", "siemens-cec-eec")}
+
+    def other_readings(self, tables: CecTables) -> dict[str, Self]:
+        """Return the three other modes of products, where there are any."""
+        if not any(entry.multiplier for entry in tables.tables.values()):
+            return {}
+        return {
+            f"mult_mode {mode}: {words}": type(self)(self.machine, replace(self.settings, mult_mode=mode))
+            for mode, words in MODE_WORDS.items()
+            if mode != self.settings.mult_mode
+        }
+
+    def table_nodes_mm(self, tables: CecTables) -> tuple[FloatArray, ...]:
+        """Return the nodes of all tables by their input axis."""
+        return nodes_by_axis((entry.input_axis, entry.table.nodes_mm) for entry in tables.tables.values())
+
+    def usage(self, tables: CecTables) -> list[Usage]:
+        """Return nodes, tables, sums and their change against the limits; those not stated against usual defaults."""
+        return cec_usage(self.machine, tables.tables, self.settings)
+
+    def resolution_mm(self) -> float:
+        """Half of the last decimal of every ordinary table and of every product that is too small to be written."""
+        ordinary = _ORDINARY_PER_AXIS * 0.5 * 10.0**-MM_DECIMALS
+        return ordinary + self.settings.products * (_PRODUCTS_PER_AXIS * NEGLIGIBLE_PRODUCT_MM + _FACTOR_ROUNDING_MM)
+
+    def _styled(self, axis: int) -> str:
+        name = self.settings.axis_names[axis]
+        return f"({name})" if self.settings.axis_style == "paren" else f'"{name}"'
+
+
+def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], settings: CecSettings) -> CecTables:
+    """Return the tables that assignments make; ``files`` are looked at for the names of the tables in comments."""
+    parts: dict[int, TableParts] = {}
+    switches: dict[tuple[str, int], Assignment] = {}
+    for item in items:
+        if item.variable in PROTECTING:
+            axis_of(item, item.index[-1], settings.axis_names)
+            continue
+        index = item.index_number(0, 999)
+        if item.variable in SWITCHES:
+            switches[item.variable, index] = item
+            continue
+        part = parts.setdefault(index, TableParts(f"table {index}", item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
+    labels = labels_in(files)
+    found = {
+        index: _read_table(part, settings.axis_names, labels.get(index, "")) for index, part in sorted(parts.items())
+    }
+    if not settings.mode_stated:
+        for index in (index for index, entry in found.items() if entry.multiplier):
+            raise (parts[index].scalar("$AN_CEC_MULT_BY_TABLE").fail(MODE_OF_A_FILE))
+    for (variable, index), item in switches.items():
+        if variable == "SN_CEC_TABLE_ENABLE" and index in found:
+            found[index] = replace(found[index], enabled=item.whole(0, 1) == 1)
+        elif index in found:
+            found[index] = replace(found[index], weight=item.number())
+        elif item.number() != 0:
+            raise item.fail(f"the files hold no table {index}")
+    return CecTables(found)
+
+
+def foreign_cec_tables(
+    given: ArchiveAssignments, machine: Machine, settings: CecSettings, findings: ArchiveFindings
+) -> CecTables:
+    """Return the tables that act, from the files of a real control.
+
+    Tables without a step are not in use; those of axes that the machine file lacks are kept apart, and those that machine
+    data or setting data switch off are off. InputError with the line for what could change a table and is not known.
+    """
+    parts: dict[int, TableParts] = {}
+    for item in given.items:
+        if item.variable in SWITCHES:
+            continue
+        index = item.index_number(0, 999)
+        part = parts.setdefault(index, TableParts(f"table {index}", item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
+    found, apart = {}, set()
+    for index, part in sorted(parts.items()):
+        if part.is_zero and part.scalar("$AN_CEC_STEP").number() == 0:
+            findings.count("tables that are not in use (step 0)")
+            continue
+        axes = [_axis_name_of(part.scalar(f"$AN_CEC_{side}_AXIS")) for side in ("INPUT", "OUTPUT")]
+        if set(axes) <= set(settings.axis_names):
+            found[index] = _foreign_table(part, machine, settings, axes, findings)
+        else:
+            apart.add(index)
+            findings.apart.append(f"table {index} ({axes[0]} into {axes[1]}, up to {part.largest})")
+    if missing := sorted(apart - set(settings.kept_tables)):
+        findings.notes.append(
+            "new tables may not take their places: an export with --active keeps them, or one with kept_tables = "
+            f"{missing} in the machine file"
+        )
+    _check_products(parts, set(found), apart, settings)
+    if not found:
+        listed = f"; of other axes: {'; '.join(findings.apart)}" if apart else ""
+        raise next(iter(parts.values())).source.fail(
+            f"holds no table over and into the axes {', '.join(settings.axis_names)} of the machine file{listed}"
+        )
+    return CecTables(_switched(found, given, settings, findings), tuple(sorted(apart)))
+
+
+def _foreign_table(
+    part: TableParts, machine: Machine, settings: CecSettings, axes: Sequence[str], findings: ArchiveFindings
+) -> CecTable:
+    base, output = (settings.axis_names.index(name) for name in axes)
+    table = findings.table(part, "$AN_CEC", machine.axes[base].range_mm)
+    factor = part.scalars.get("$AN_CEC_MULT_BY_TABLE")
+    if factor is None:
+        findings.count("tables without MULT_BY_TABLE (0 taken)")
+    return CecTable(
+        base,
+        output,
+        table,
+        part.scalar("$AN_CEC_DIRECTION").whole(-1, 1),
+        0 if factor is None else factor.whole(0, 1_000_000),
+        decimals=written_decimals(table),
+    )
+
+
+def _check_products(parts: Mapping[int, TableParts], found: set[int], apart: set[int], settings: CecSettings) -> None:
+    """Refuse products that cannot be worked out: with an axis that is not there, or without a stated mode."""
+    for index, part in parts.items():
+        factor = part.scalars.get("$AN_CEC_MULT_BY_TABLE")
+        number = 0 if factor is None else factor.whole(0, 1_000_000)
+        if not number or factor is None:
+            continue
+        if {index, number - 1} & found and {index, number - 1} & apart:
+            raise factor.fail(
+                f"table {index} is multiplied by table {number - 1}, and one of the two belongs to an axis that the "
+                "machine file does not have"
+            )
+        if index in found and not settings.mode_stated:
+            raise factor.fail(MODE_OF_A_FILE)
+
+
+def _switched(
+    found: Mapping[int, CecTable], given: ArchiveAssignments, settings: CecSettings, findings: ArchiveFindings
+) -> dict[int, CecTable]:
+    """Return the tables with SD41300 and SD41310; those into an axis whose MD32710 is 0 in an archive are off."""
+    result = dict(found)
+    own = {(item.variable, item.index): item for item in given.items if item.variable in SWITCHES}
+    for (variable, index), item in {**given.machine_data, **own}.items():
+        number = int(index[0]) if len(index) == 1 and index[0].isdigit() else -1
+        if number not in result:
+            continue
+        if variable == "SN_CEC_TABLE_ENABLE":
+            result[number] = replace(result[number], enabled=item.whole(0, 1) == 1)
+        elif variable == "SN_CEC_TABLE_WEIGHT":
+            result[number] = replace(result[number], weight=item.number())
+    for number, entry in result.items():
+        name = settings.axis_names[entry.output_axis]
+        if entry.enabled and given.switched_off("MA_CEC_ENABLE", (name,)):
+            result[number] = replace(entry, enabled=False)
+            findings.notes.append(f"$MA_CEC_ENABLE[{name}] is 0 in the archive: its tables do not act")
+    off = [str(number) for number, entry in result.items() if not entry.enabled]
+    if off:
+        findings.notes.append(f"table{'s' * (len(off) > 1)} {', '.join(off)} switched off, without effect")
+    return result
+
+
+def _read_table(part: TableParts, axis_names: Sequence[str], label: str) -> CecTable:
+    input_item, output_item = part.scalar("$AN_CEC_INPUT_AXIS"), part.scalar("$AN_CEC_OUTPUT_AXIS")
+    direction = part.scalar("$AN_CEC_DIRECTION").whole(-1_000_000, 1_000_000)
+    multiplier = part.scalar("$AN_CEC_MULT_BY_TABLE").whole(0, 1_000_000)
+    table = part.table("$AN_CEC")
+    return CecTable(
+        _axis_value(input_item, axis_names),
+        _axis_value(output_item, axis_names),
+        table,
+        direction,
+        multiplier,
+        decimals=written_decimals(table),
+        label=label,
+    )
+
+
+def _axis_value(item: Assignment, axis_names: Sequence[str]) -> int:
+    return axis_of(item, _axis_name_of(item), axis_names)
+
+
+def _axis_name_of(item: Assignment) -> str:
+    match = _AXIS_VALUE.fullmatch(item.value)
+    if match is None:
+        raise item.fail(f'{item.value[:40]!r} is not an axis; write (AX1) or "AX1"')
+    return match.group(1) or match.group(2)
+
+
+def _output(entry: CecTable, points: Points) -> FloatArray:
+    """Interpolated value of one table at the points, zero where its direction of travel is not the last one."""
+    value = entry.at(points.position_mm[:, entry.input_axis])
+    if entry.direction == 0:
+        return value
+    travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, entry.input_axis])
+    if np.any(travel == 0):
+        message = (
+            f"a table acts in one direction of {AXES[entry.input_axis]} only, and some points do not say from where "
+            "they were approached: there it is taken as not acting; give approach_x, approach_y, approach_z"
+        )
+        warnings.warn(message, CompgenWarning, stacklevel=3)
+    return np.where(travel == entry.direction, value, 0.0)

@@ -1,0 +1,242 @@
+"""SINUMERIK with both kinds of tables: positioning in the encoder tables (EEC), everything else in the cross tables (CEC).
+
+Sources as in :mod:`compgen.controls.siemens_eec` and :mod:`compgen.controls.siemens_cec`. The encoder tables act on
+the actual position and are zero at the reference point, the cross tables act on the setpoint; the axis makes both
+corrections. No CEC table may hold the positioning of an axis as well: what products fold into the table of an axis over
+itself cancels the direct term of their factor and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage
+from compgen.controls.siemens_cec import VARIABLES as CEC_VARIABLES
+from compgen.controls.siemens_cec import (
+    CecTables,
+    SiemensCec,
+    cec_tables_from,
+    foreign_cec_tables,
+)
+from compgen.controls.siemens_cec_tables import MULT_MODES, Choice, chosen_terms, term_names, terms_of_tables
+from compgen.controls.siemens_eec import VARIABLES as EEC_VARIABLES
+from compgen.controls.siemens_eec import EecTables, SiemensEec, eec_tables_from, eec_terms, foreign_eec_tables
+from compgen.controls.siemens_machine_data import CecSettings, EecSettings, take_cec_settings, take_eec_settings
+from compgen.controls.siemens_text import ArchiveAssignments, ArchiveFindings, foreign_assignments, read_assignments
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.names import MM_PER_UM
+
+#: Sections of the machine file that describe the same control: what the own section does not say is taken from them.
+OTHER_SECTIONS = ("siemens-cec", "siemens-eec")
+#: Keys that both kinds of tables have with a meaning of their own: those of the encoder tables have this prefix.
+PREFIX, OWN_KEYS = "eec_", ("max_points", "step_mm", "decimals")
+#: A CEC table of an axis over itself may leave this much beside what it cancels (rounding), mm.
+ROUNDING_MM = 2e-6
+
+_CROSS = [(output, axis) for output in range(3) for axis in range(3) if output != axis]
+
+
+@dataclass(frozen=True)
+class CecEecSettings:
+    """Settings ``[controllers.siemens-cec-eec]``: those of both kinds of tables."""
+
+    cec: CecSettings
+    eec: EecSettings
+
+
+@dataclass(frozen=True)
+class CecEecTables:
+    """Tables of both kinds, with the numbers as the files have them."""
+
+    cec: CecTables
+    eec: EecTables
+
+
+class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
+    """SINUMERIK EEC and CEC together: positioning, straightness, squareness, angles as products of tables."""
+
+    name = "siemens-cec-eec"
+    bidirectional = True
+
+    def __init__(self, machine: Machine, settings: CecEecSettings | None = None) -> None:
+        super().__init__(machine, settings)
+        self._cec, self._eec = SiemensCec(machine, self.settings.cec), SiemensEec(machine, self.settings.eec)
+
+    @classmethod
+    def read_settings(cls, machine: Machine) -> CecEecSettings:
+        """Check the settings, here and in the sections of both kinds of tables."""
+        section = machine.controller_settings(cls.name)
+        for other in OTHER_SECTIONS:
+            for key, value in machine.controller_settings(other).data.items():
+                own = PREFIX + key if other == "siemens-eec" and key in OWN_KEYS else key
+                section.data.setdefault(own, value)
+        cec = take_cec_settings(section, machine)
+        settings = CecEecSettings(cec, take_eec_settings(section, machine, PREFIX))
+        section.finish()
+        return settings
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return positioning over the axis itself, the six tables over another axis, and the products."""
+        return self._pitch(errors) + self._choice(errors).kept
+
+    def basis_of(self, errors: ErrorTable, tables: CecEecTables) -> list[Term]:
+        """Return positioning, and the terms that the cross tables hold if no better set fits into the control."""
+        choice, mode = self._choice(errors), self.settings.cec.mult_mode
+        terms = self._cec.terms(errors, _CROSS)
+        held = terms_of_tables(self.machine, errors, terms, mode, choice, term_names(tables.cec.tables))
+        return self._pitch(errors) + held
+
+    def left_out(self, errors: ErrorTable) -> list[str]:
+        """Return which CEC tables the control has no room for, which products are not written, and what stays."""
+        pitch = self._pitch(errors)
+        products = self._cec.unwritten_products(errors, _CROSS, pitch)
+        return self._choice(errors).statements() + products
+
+    def reservations(self, tables: CecEecTables) -> list[str]:
+        """Return what the verdict must say of the cross tables."""
+        return self._cec.reservations(tables.cec)
+
+    def _choice(self, errors: ErrorTable) -> Choice:
+        terms = self._cec.terms(errors, _CROSS)
+        pitch = self._pitch(errors)
+        return chosen_terms(
+            self.machine, errors, terms, self.settings.cec.mult_mode, self.settings.cec.tables_usable, pitch
+        )
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> CecEecTables:
+        """Return both kinds of tables, rounded as written."""
+        pitch = [term for term in basis if term.axis == term.carrier[0].output and term.carrier[0].lever is None]
+        cross = [term for term in basis if term not in pitch]
+        cec = self._cec.build(cross, values)
+        return CecEecTables(cec, self._eec.build(pitch, values))
+
+    def with_reversal(self, tables: CecEecTables, reversal: ReversalCurves) -> CecEecTables:
+        """Return the tables with a pair of CEC tables, DIRECTION 1 and -1, for each reversal."""
+        return CecEecTables(self._cec.with_reversal(tables.cec, reversal), tables.eec)
+
+    def context(self, tables: CecEecTables) -> dict[str, Any]:
+        """Return the contexts of both kinds under ``cec`` and ``eec``, and what they say together."""
+        cec = self._cec.context(tables.cec)
+        eec = self._eec.context(tables.eec)
+        return {
+            "sign_statement": f"Encoder tables: {eec['sign_statement']} Cross tables: {cec['sign_statement']}",
+            "parameters": [*eec["parameters"], *cec["parameters"]],
+            "warnings": [*eec["warnings"], *cec["warnings"]],
+            "tables": [*eec["tables"], *cec["tables"]],
+            "container": cec["container"],
+            "overwrites": [*cec["overwrites"], *eec["overwrites"]],
+            "cec": cec,
+            "eec": eec,
+        }
+
+    def parse(self, files: Sequence[SourceFile]) -> CecEecTables:
+        """Read both kinds of tables from files of any order; both must be there."""
+        items = read_assignments(files, {**EEC_VARIABLES, **CEC_VARIABLES})
+        eec_items = [item for item in items if item.variable in EEC_VARIABLES]
+        cec_items = [item for item in items if item.variable in CEC_VARIABLES]
+        for found, array, what in ((eec_items, "AA_ENC_COMP", "encoder"), (cec_items, "AN_CEC", "cross")):
+            if not any(item.variable == array for item in found):
+                raise files[-1].fail(f"the files hold no {what} tables (${array}); give both AX_EEC and NC_CEC")
+        return CecEecTables(
+            cec_tables_from(cec_items, files, self.settings.cec), eec_tables_from(eec_items, self.settings.eec)
+        )
+
+    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CecEecTables, list[str]]:
+        """Read an archive or programs of a real control: the tables of both kinds that act, and what was passed over."""
+        findings = ArchiveFindings()
+        given = foreign_assignments(files, {**EEC_VARIABLES, **CEC_VARIABLES}, findings)
+        cec_part, eec_part = (
+            ArchiveAssignments([item for item in given.items if item.variable in kind], given.machine_data)
+            for kind in (CEC_VARIABLES, EEC_VARIABLES)
+        )
+        for part, array, what in ((cec_part, "AN_CEC", "cross"), (eec_part, "AA_ENC_COMP", "encoder")):
+            if not any(item.variable == array for item in part.items):
+                raise files[-1].fail(f"the files hold no {what} tables (${array}); give all that the control holds")
+        cec = foreign_cec_tables(cec_part, self.machine, self.settings.cec, findings)
+        eec = foreign_eec_tables(eec_part, self.machine, self.settings.eec, findings)
+        return CecEecTables(cec, eec), findings.statements()
+
+    def emulate(self, tables: CecEecTables, points: Points) -> FloatArray:
+        """Return the sum of both corrections."""
+        cec = self._cec.emulate(tables.cec, points)
+        return cec + self._eec.emulate(tables.eec, points)
+
+    def violations(self, tables: CecEecTables) -> list[str]:
+        """Return the broken rules of either kind, and positioning that stands in both."""
+        return [
+            *self._eec.violations(tables.eec),
+            *self._cec.violations(tables.cec),
+            *self._double_positioning(tables),
+        ]
+
+    def keeping_others(self, tables: CecEecTables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
+        """Return ``kept_tables`` with the cross tables of other axes that an archive holds."""
+        return self._cec.keeping_others(tables.cec, files)
+
+    def other_readings(self, tables: CecEecTables) -> dict[str, Self]:
+        """Return the other modes of products of the cross tables."""
+        others = self._cec.other_readings(tables.cec)
+        return {
+            words: type(self)(self.machine, replace(self.settings, cec=cec.settings)) for words, cec in others.items()
+        }
+
+    def table_nodes_mm(self, tables: CecEecTables) -> tuple[FloatArray, ...]:
+        """Return the nodes of all tables by their input axis."""
+        cec = self._cec.table_nodes_mm(tables.cec)
+        eec = self._eec.table_nodes_mm(tables.eec)
+        return tuple(np.union1d(a, b) for a, b in zip(cec, eec, strict=True))
+
+    def usage(self, tables: CecEecTables) -> list[Usage]:
+        """Return how much of each limit either kind uses."""
+        return [
+            *self._eec.usage(tables.eec),
+            *self._cec.usage(tables.cec),
+        ]
+
+    def resolution_mm(self) -> float:
+        """Rounding of both kinds together."""
+        return self._cec.resolution_mm() + self._eec.resolution_mm()
+
+    def _pitch(self, errors: ErrorTable) -> list[Term]:
+        """Terms of the encoder tables; angles count in them with levers from where those of the products begin."""
+        return eec_terms(
+            self.machine,
+            self.settings.eec,
+            errors,
+            self.machine.reference_point_mm if self.settings.cec.products else None,
+        )
+
+    def _double_positioning(self, tables: CecEecTables) -> list[str]:
+        """Name axes whose CEC tables over themselves do not cancel (mean of both directions) beside an encoder table."""
+        settings = self.settings
+        first_stays, multiplier_stays = MULT_MODES[settings.cec.mult_mode]
+        entries = tables.cec.tables
+        multipliers = {entry.multiplier - 1 for entry in entries.values() if entry.multiplier}
+        found = []
+        for axis in sorted({axis for axis, _ in tables.eec.tables}):
+            own = {
+                index: entry
+                for index, entry in entries.items()
+                if entry.input_axis == entry.output_axis == axis
+                and (first_stays or not entry.multiplier)
+                and (multiplier_stays or index not in multipliers)
+            }
+            if not own:
+                continue
+            where = np.unique(np.concatenate([entry.table.nodes_mm for entry in own.values()]))
+            total = sum(entry.at(where) * (0.5 if entry.direction else 1.0) for entry in own.values())
+            largest = float(np.max(np.abs(total)))
+            if largest > ROUNDING_MM:
+                found.append(
+                    f"the positioning of {settings.cec.axis_names[axis]} stands in its encoder table and, with up to "
+                    f"{largest / MM_PER_UM:.3f} um, in the CEC tables {sorted(own)} as well: it would be corrected twice"
+                )
+        return found

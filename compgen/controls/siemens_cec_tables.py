@@ -1,0 +1,649 @@
+"""SINUMERIK CEC tables: what a set adds up to, products of tables, reversal as pairs, and which tables to keep."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from decimal import Decimal
+from itertools import combinations, count
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lstsq
+
+from compgen.controls.shared.base import SourceFile, Term
+from compgen.controls.shared.grids import equidistant_grid
+from compgen.controls.shared.terms import one_dimensional_name, product_name
+from compgen.controls.siemens_text import LinearTable, exact_grid
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, reversal_name
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.kinematics.first_order import tool_of, volumetric_error
+from compgen.kinematics.volume_grid import volume_sample
+
+# SINUMERIK CEC tables: what a set of them adds up to, and angular errors as products of two tables.
+#
+# Sources: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245, 248, 249, 252 (boring mill example).
+# A table whose MULT_BY_TABLE names another one adds the product of both interpolated numbers to its output axis. The
+# readable documents do not say whether the direct terms of the two tables stay; the four readings are the modes S1 to S4.
+#
+# Balanced folding, for e(x) z on one output axis: with a = sqrt(z_max / e_max) the tables A = a e(x) and B = z / a have
+# the product e(x) z and are both as small as they can be; the direct terms that the mode leaves are subtracted in the
+# ordinary tables over x and z, so that only the product remains.
+
+
+IntArray = NDArray[np.int64]
+
+#: Whether (the table that is multiplied, its multiplier) also act directly, by mode.
+MULT_MODES: dict[str, tuple[bool, bool]] = {
+    "S1": (True, True),  # A + B + A B
+    "S2": (False, False),  # A B
+    "S3": (True, False),  # A + A B
+    "S4": (False, True),  # B + A B
+}
+#: The same in words.
+MODE_WORDS = {
+    "S1": "both factors of a product also act directly",
+    "S2": "factors of a product do not act directly",
+    "S3": "the multiplier of a product does not act directly",
+    "S4": "only the multiplier of a product acts directly",
+}
+#: Decimals of tables in mm, and of the factors of a product and the tables that hold their folds.
+MM_DECIMALS, FACTOR_DECIMALS = 6, 9
+#: Angles below this are no angles, and products that stay below half of the last decimal in mm are no products.
+NEGLIGIBLE_RAD = 1e-12
+NEGLIGIBLE_PRODUCT_MM = 0.5 * 10.0**-MM_DECIMALS
+
+_LABEL = re.compile(r"; table (\d{1,6}): ([ -~]{1,300}); MD18342\[\d{1,6}\] = \d")
+_UNITS_PER_MM = 10**FACTOR_DECIMALS
+_UNITS_PER_MM_QUANTUM = 10 ** (FACTOR_DECIMALS - MM_DECIMALS)
+
+
+@dataclass(frozen=True)
+class CecTable:
+    """One table: output over input axis (0..2); ``multiplier`` is the NUMBER (index + 1) of the other factor, or 0.
+
+    ``direction`` is 0 (both), 1 or -1: the travel of the input axis in which the table acts. ``enabled`` is SD41300,
+    ``weight`` SD41310. ``decimals`` and ``label`` are for writing only.
+    """
+
+    input_axis: int
+    output_axis: int
+    table: LinearTable
+    direction: int = 0
+    multiplier: int = 0
+    enabled: bool = True
+    weight: Decimal = Decimal(1)
+    decimals: int = field(default=MM_DECIMALS, compare=False)
+    label: str = field(default="", compare=False)
+
+    def at(self, position_mm: FloatArray) -> FloatArray:
+        """Weighted interpolated value at positions of any shape, 0 if the table is switched off."""
+        if not self.enabled:
+            return np.zeros(np.shape(position_mm))
+        return self.table.at(position_mm) * float(self.weight)
+
+
+CecMap = Mapping[int, CecTable]
+
+
+def sum_into_axes(tables: CecMap, mode: str, outputs: Mapping[int, FloatArray]) -> list[FloatArray]:
+    """Return the total of each axis: direct terms as the mode leaves them, plus products.
+
+    Parameters
+    ----------
+    tables : by index.
+    mode : a key of :data:`MULT_MODES`.
+    outputs : interpolated value of every table (0 where it does not act), of shapes that broadcast.
+    """
+    first_stays, multiplier_stays = MULT_MODES[mode]
+    multipliers = {table.multiplier - 1 for table in tables.values() if table.multiplier}
+    totals: list[FloatArray] = [np.zeros(())] * 3
+    for index, table in tables.items():
+        own = outputs[index]
+        parts = []
+        if (first_stays or not table.multiplier) and (multiplier_stays or index not in multipliers):
+            parts.append(own)
+        if table.multiplier - 1 in tables:
+            parts.append(own * outputs[table.multiplier - 1])
+        for part in parts:
+            totals[table.output_axis] = totals[table.output_axis] + part
+    return totals
+
+
+def beside_kept(tables: CecMap, kept: Collection[int]) -> dict[int, CecTable]:
+    """Return the tables with other indices, so that none of the ``kept`` ones is used; multipliers follow."""
+    free = (index for index in count() if index not in kept)
+    place = {old: next(free) for old in sorted(tables)}
+    return {
+        place[old]: replace(entry, multiplier=place[entry.multiplier - 1] + 1 if entry.multiplier else 0)
+        for old, entry in sorted(tables.items())
+    }
+
+
+def term_names(tables: CecMap) -> set[str]:
+    """Return the names of the terms that a set of tables holds: ordinary ones by axes, products by angle and lever."""
+    factors = {entry.multiplier - 1 for entry in tables.values() if entry.multiplier}
+    names = set()
+    for index, entry in tables.items():
+        if entry.multiplier - 1 in tables:
+            names.add(product_name(entry.output_axis, entry.input_axis, tables[entry.multiplier - 1].input_axis))
+        elif entry.direction == 0 and index not in factors:
+            names.add(one_dimensional_name(entry.output_axis, entry.input_axis))
+    return names
+
+
+def balanced_scale(largest_rad: float, largest_lever_mm: float) -> float:
+    """Return a = sqrt(z_max / e_max) in mm: with it a e and z / a have the same largest value, sqrt(e_max z_max)."""
+    return math.sqrt(largest_lever_mm / largest_rad)
+
+
+def balanced_factors(angle_rad: FloatArray, lever_mm: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Return a, the scaled angles a e (n,) and the scaled lever z / a (m,), in mm, for one product e z."""
+    scale = balanced_scale(float(np.max(np.abs(angle_rad))), float(np.max(np.abs(lever_mm))))
+    return scale, scale * np.asarray(angle_rad), np.asarray(lever_mm) / scale
+
+
+@dataclass
+class _Set:
+    """Tables under construction, in whole units of the last decimal (1e-9 mm), by (output, axis[, lever])."""
+
+    ordinary: dict[tuple[int, int], IntArray] = field(default_factory=dict)
+    folds: dict[tuple[int, int], list[str]] = field(default_factory=dict)
+    angles: dict[tuple[int, int, int], IntArray] = field(default_factory=dict)
+    levers: dict[tuple[int, int], IntArray] = field(default_factory=dict)
+
+    def fold(self, key: tuple[int, int], units: IntArray, what: str) -> None:
+        """Subtract the direct term of a factor in the ordinary table."""
+        self.ordinary[key] = self.ordinary.get(key, np.zeros(len(units), dtype=np.int64)) - units
+        self.folds.setdefault(key, []).append(what)
+
+
+def folded_tables(
+    terms: Sequence[Term],
+    values: Mapping[str, FloatArray],
+    *,
+    flip: bool,
+    mode: str,
+    travel_mm: Sequence[tuple[float, float]] = (),
+) -> dict[int, CecTable]:
+    """Return the tables of a set of terms, numbered: ordinary ones, scaled angles, scaled levers.
+
+    Parameters
+    ----------
+    terms : one-dimensional terms and products (function of one axis times lever); all of one axis share their nodes.
+    values : corrections by term name, mm and rad.
+    flip : True if the control subtracts its total: the ordinary terms and the angles change sign, the levers do not.
+    mode : which direct terms are folded away, a key of :data:`MULT_MODES`.
+    travel_mm : ends of the travel of X, Y, Z: the nodes of a lever over whose axis there is no term.
+
+    Ordinary tables that are zero in every decimal, and products that stay below half of the last decimal in mm, are
+    left out; if all are, the first ordinary table remains.
+    """
+    sign = -1 if flip else 1
+    nodes = {axis: np.array(ends, dtype=np.float64) for axis, ends in enumerate(travel_mm)}
+    nodes |= {term.axis: term.nodes_mm for term in terms if term.axis is not None}
+    work = _Set()
+    products: dict[tuple[int, int], list[Term]] = {}
+    for term in terms:
+        if term.axis is None:
+            raise ValueError(f"{term.name}: a CEC table is a function of an axis")
+        part = term.carrier[0]
+        if part.lever is None:
+            counts = np.rint(sign * part.sign * np.asarray(values[term.name]) * 10**MM_DECIMALS).astype(np.int64)
+            work.ordinary[part.output, term.axis] = counts * _UNITS_PER_MM_QUANTUM
+        elif _matters(values[term.name], nodes[part.lever] - part.origin_mm):
+            products.setdefault((part.output, part.lever), []).append(term)
+    for (output, lever), group in sorted(products.items()):
+        _add_products(work, nodes[lever], output, lever, [(term, sign * values[term.name]) for term in group], mode)
+    return _numbered(work, nodes)
+
+
+def _matters(angle_rad: FloatArray, lever_mm: FloatArray) -> bool:
+    largest = float(np.max(np.abs(angle_rad)))
+    return largest >= NEGLIGIBLE_RAD and largest * float(np.max(np.abs(lever_mm))) >= NEGLIGIBLE_PRODUCT_MM
+
+
+def _add_products(
+    work: _Set,
+    lever_nodes_mm: FloatArray,
+    output: int,
+    lever: int,
+    angles: Sequence[tuple[Term, FloatArray]],
+    mode: str,
+) -> None:
+    """Add all products of one output axis with one lever; they share the lever's table."""
+    first_stays, multiplier_stays = MULT_MODES[mode]
+    part = angles[0][0].carrier[0]
+    ends_mm = lever_nodes_mm[[0, -1]] - part.origin_mm
+    scale, _, scaled_ends = balanced_factors(np.concatenate([value for _, value in angles]), ends_mm)
+    ends = np.rint(scaled_ends * _UNITS_PER_MM).astype(np.int64)
+    for term, value in angles:
+        axis = int(term.axis or 0)
+        units = np.rint(term.carrier[0].sign * scale * value * _UNITS_PER_MM).astype(np.int64)
+        work.angles[output, axis, lever] = units
+        if first_stays:
+            work.fold((output, axis), units, f"the scaled angle of {product_name(output, axis, lever)}")
+    work.levers[output, lever] = ends
+    if multiplier_stays:
+        line = _line(ends, len(lever_nodes_mm))
+        work.fold((output, lever), line, f"the scaled lever {AXES[lever].lower()} of {AXES[output]}")
+
+
+def _line(ends: IntArray, count: int) -> IntArray:
+    """Whole numbers nearest to the straight line between two whole numbers, at ``count`` equidistant nodes."""
+    intervals = count - 1
+    rise = int(ends[1]) - int(ends[0])
+    return np.array(
+        [int(ends[0]) + (2 * rise * n + intervals) // (2 * intervals) for n in range(count)], dtype=np.int64
+    )
+
+
+def _numbered(work: _Set, nodes: Mapping[int, FloatArray]) -> dict[int, CecTable]:
+    ordinary = {key: units for key, units in sorted(work.ordinary.items()) if np.any(units)}
+    if not ordinary and not work.angles:
+        ordinary = dict(sorted(work.ordinary.items())[:1])
+    tables = [_ordinary_table(work, key, units, nodes[key[1]]) for key, units in ordinary.items()]
+    first_lever = len(tables) + len(work.angles)
+    number_of = {key: first_lever + n + 1 for n, key in enumerate(sorted(work.levers))}
+    for (output, axis, lever), units in sorted(work.angles.items()):
+        grid = exact_grid(nodes[axis])
+        label = f"{product_name(output, axis, lever)}: scaled angle over {AXES[axis]}"
+        table = LinearTable(*grid, values=_scaled_decimals(units, FACTOR_DECIMALS))
+        number = number_of[output, lever]
+        tables.append(CecTable(axis, output, table, 0, number, decimals=FACTOR_DECIMALS, label=label))
+    for (output, lever), ends in sorted(work.levers.items()):
+        start, _, last = exact_grid(nodes[lever])
+        label = f"scaled lever {AXES[lever].lower()} of {AXES[output]}"
+        table = LinearTable(start, last - start, last, _scaled_decimals(ends, FACTOR_DECIMALS))
+        tables.append(CecTable(lever, output, table, decimals=FACTOR_DECIMALS, label=label))
+    return dict(enumerate(tables))
+
+
+def _ordinary_table(work: _Set, key: tuple[int, int], units: IntArray, nodes_mm: FloatArray) -> CecTable:
+    output, axis = key
+    folds = work.folds.get(key, [])
+    decimals = FACTOR_DECIMALS if folds else MM_DECIMALS
+    label = one_dimensional_name(output, axis) + (f", less {' and '.join(folds)}" if folds else "")
+    values = _scaled_decimals(units // 10 ** (FACTOR_DECIMALS - decimals), decimals)
+    table = LinearTable(*exact_grid(nodes_mm), values=values)
+    return CecTable(axis, output, table, decimals=decimals, label=label)
+
+
+def _scaled_decimals(units: IntArray, decimals: int) -> tuple[Decimal, ...]:
+    return tuple(Decimal(int(count)).scaleb(-decimals) for count in units)
+
+
+def written_decimals(table: LinearTable) -> int:
+    """Return with how many decimals the values of a table stand in its text, at least those of a table in mm."""
+    places = [len(f"{value:f}".partition(".")[2]) for value in table.values]
+    return min(max([MM_DECIMALS, *places]), FACTOR_DECIMALS)
+
+
+def labels_in(files: Sequence[SourceFile]) -> dict[int, str]:
+    """Return what the comments of an exported file call its tables, by index; they matter for nothing but writing."""
+    found = {}
+    for source in files:
+        for line in source.text.splitlines():
+            match = _LABEL.match(line[:400])
+            if match:
+                found[int(match.group(1))] = match.group(2)
+    return found
+
+
+# Reversal as pairs of SINUMERIK CEC tables: one acts after positive travel of its base axis, one after negative.
+#
+# Source: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 249 (DIRECTION), 264 (example of a pair).
+# With the reversal B (position reached in positive minus in negative direction) the tool stands at +B/2 after positive
+# travel, so the correction is -B/2 in the table with DIRECTION 1 and +B/2 in the one with DIRECTION -1.
+
+
+def with_reversal_tables(
+    machine: Machine,
+    tables: CecMap,
+    reversal: ReversalCurves,
+    *,
+    subtracts: bool,
+    max_points: int,
+    step_mm: tuple[float | None, ...],
+) -> dict[int, CecTable]:
+    """Return the tables with a pair behind them for each reversal that is worth one.
+
+    Parameters
+    ----------
+    machine, tables : what is there already; its indices stay.
+    reversal : values in mm.
+    subtracts : whether the control subtracts the sum of the tables.
+    max_points : nodes that the control takes per table.
+    step_mm : node distances that the user asks for, or None.
+    """
+    found = dict(tables)
+    for (axis, component), curve in sorted(reversal.curves.items()):
+        if np.max(np.abs(curve.value)) < WORTH_MM:
+            continue
+        nodes_mm = _nodes_mm(machine, axis, curve, max_points, step_mm[axis])
+        half = 0.5 * curve.at(nodes_mm) * (1.0 if subtracts else -1.0)
+        for direction in (1, -1):
+            words = "positive" if direction > 0 else "negative"
+            label = f"{reversal_name(axis, component)}, after {words} travel of {AXES[axis]}"
+            table = LinearTable(*exact_grid(nodes_mm), values=_rounded_decimals(direction * half))
+            found[max(found, default=-1) + 1] = CecTable(axis, component, table, direction, label=label)
+    return found
+
+
+def _nodes_mm(machine: Machine, axis: int, curve: Curve, max_points: int, step_mm: float | None) -> FloatArray:
+    if len(curve.position_mm) == 1:
+        return np.array(machine.axes[axis].range_mm)
+    inside = replace(curve, u=np.full(len(curve.value), np.nan))
+    as_errors = ErrorTable({f"E{AXES[axis]}{AXES[axis]}": inside})
+    return equidistant_grid(machine, as_errors, axis, most=max_points, step_mm=step_mm).nodes_mm
+
+
+def _rounded_decimals(values_mm: FloatArray) -> tuple[Decimal, ...]:
+    return tuple(Decimal(int(count)).scaleb(-MM_DECIMALS) for count in np.rint(values_mm * 10**MM_DECIMALS))
+
+
+def reversal_statement(tables: CecMap, names: tuple[str, ...]) -> str:
+    """Return what the tables of one direction do, with a number from the file; empty if there are none."""
+    for index, entry in sorted(tables.items()):
+        if entry.direction == 1:
+            value = float(max(entry.table.values, key=abs))
+            base, output = names[entry.input_axis], names[entry.output_axis]
+            return (
+                f" Direction: table {index} acts after positive travel of {base} only; it puts {value:+.6f} mm into the "
+                f"sum of {output} there, its partner with DIRECTION -1 the opposite after negative travel."
+            )
+    return ""
+
+
+def backlash_rows(tables: CecMap, names: tuple[str, ...]) -> list[dict[str, str]]:
+    """Return the machine data that must be zero because tables of one direction hold the same effect."""
+    axes = sorted({entry.input_axis for entry in tables.values() if entry.direction})
+    return [
+        {
+            "name": f"MD32450 $MA_BACKLASH[{names[axis]}]",
+            "value": "0",
+            "meaning": "the tables with DIRECTION 1 and -1 hold the reversal; with both it would be corrected twice",
+        }
+        for axis in axes
+    ]
+
+
+def plain_backlash_rows(
+    reversal: ReversalCurves, names: tuple[str, ...], encoders: Sequence[Sequence[int]]
+) -> list[dict[str, str]]:
+    """Return MD32450 for the mean reversal of each axis along itself: positive where the tool stops short.
+
+    Source: MD32450 is positive if the encoder leads the machine part (SINUMERIK parameter manuals), the usual case;
+    then the position reached in positive direction is the smaller one, and the reversal value B is negative.
+    """
+    return [
+        {
+            "name": f"MD32450 $MA_BACKLASH[{encoder},{names[axis]}]",
+            "value": f"{-reversal.mean_mm(axis):.4f} mm",
+            "meaning": f"minus the mean reversal value of {AXES[axis]}; these tables act in both directions alike. If a "
+            "value was active while the machine was measured, add this one to it",
+        }
+        for axis in range(3)
+        for encoder in encoders[axis]
+        if abs(reversal.mean_mm(axis)) >= WORTH_MM
+    ]
+
+
+# Which CEC tables to keep where a control has too few: those that leave the least error over the volume.
+#
+# Every table moves one axis only, so that the axes can be looked at one by one: for each set of terms of an axis the number
+# of tables that it takes and the squares that it takes out of the wanted correction (least squares over the volume). The
+# best sets of the three axes together within the number of tables are found exactly.
+
+
+#: Points over the volume at which sets of tables are compared.
+_MOST_POINTS = 6000
+#: Directions of the normal matrix (unit diagonal) below this are not determined.
+_UNDETERMINED = 1e-9
+#: Terms whose natural values move the tool by less than this are no tables.
+_NOTHING_MM = 0.5e-6
+#: Tables of another set than the best one are as good if no more than this share above its error stays.
+_AS_GOOD = 1.1
+#: What stays uncorrected by less than this is not worth a word.
+_NAMED_FROM_MM = 0.01 * MM_PER_UM
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Terms that the tables can hold, and the others.
+
+    Parameters
+    ----------
+    kept : terms in their order.
+    dropped : (name, mm): for each term that has no room what it would take out (rms over the volume) beside the kept.
+    tables, allowed : tables that the kept terms take, and that there are (None: not limited).
+    wanted : tables that all terms would take.
+    left_mm : rms over the volume that all terms would take out and the kept ones do not.
+    beside : terms of tables of another kind, which are there in any case.
+    """
+
+    kept: list[Term]
+    dropped: tuple[tuple[str, float], ...]
+    tables: int
+    allowed: int | None
+    wanted: int
+    left_mm: float
+    beside: tuple[Term, ...] = ()
+
+    def statements(self) -> list[str]:
+        """Say what is left out, largest first; nothing if everything has room."""
+        if not self.dropped:
+            return []
+        return [
+            f"{self.wanted} tables would be needed, {self.allowed} may be used: not corrected are "
+            f"{_named(self.dropped) or 'tables of less than 0.01 um'}; together they leave "
+            f"{self.left_mm / MM_PER_UM:.2f} um rms over the volume (first order)"
+        ]
+
+
+def table_count(terms: Sequence[Term], mode: str) -> int:
+    """Return how many tables a set of terms takes: ordinary ones, those that only hold folds, angles, levers."""
+    first_stays, multiplier_stays = MULT_MODES[mode]
+    ordinary, levers, angles = set(), set(), 0
+    for term in terms:
+        part = term.carrier[0]
+        if part.lever is None:
+            ordinary.add((part.output, term.axis))
+            continue
+        angles += 1
+        levers.add((part.output, part.lever))
+        ordinary |= {(part.output, term.axis)} if first_stays else set()
+        ordinary |= {(part.output, part.lever)} if multiplier_stays else set()
+    return len(ordinary) + len(levers) + angles
+
+
+def chosen_terms(
+    machine: Machine,
+    errors: ErrorTable,
+    terms: Sequence[Term],
+    mode: str,
+    allowed: int | None,
+    beside: Sequence[Term] = (),
+) -> Choice:
+    """Return the terms that ``allowed`` tables can hold and that leave the least error.
+
+    Parameters
+    ----------
+    machine, errors : what is to be corrected; its work zone counts more.
+    terms : everything that the control could hold.
+    mode : reading of products, a key of ``MULT_MODES``.
+    allowed : number of tables, None: all of them.
+    beside : terms that tables of another kind hold in any case.
+    """
+    wanted = table_count(terms, mode)
+    if allowed is None or wanted <= allowed:
+        return Choice(list(terms), (), wanted, allowed, wanted, 0.0)
+    gains = [_Gains.of(machine, errors, terms, beside, output) for output in range(3)]
+    picked = _best_sets(gains, mode, allowed)
+    names = {term.name for part in picked for term in part} or {terms[0].name}
+    kept = [term for term in terms if term.name in names]
+    left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, picked, strict=True))
+    dropped = [item for gain, part in zip(gains, picked, strict=True) for item in gain.missed(part)]
+    return Choice(
+        kept, tuple(dropped), table_count(kept, mode), allowed, wanted, float(np.sqrt(max(left, 0.0))), tuple(beside)
+    )
+
+
+def without_products(
+    machine: Machine, errors: ErrorTable, terms: Sequence[Term], beside: Sequence[Term] = ()
+) -> list[str]:
+    """Say what stays uncorrected because no products are written: their names, and the rms over the volume.
+
+    ``terms`` are the ordinary ones and the products, ``beside`` as in :func:`chosen_terms`. Nothing if it is nothing.
+    """
+    ordinary = [term for term in terms if term.carrier[0].lever is None]
+    gains = [_Gains.of(machine, errors, terms, beside, output) for output in range(3)]
+    own = [[term for term in gain.terms if term in ordinary] for gain in gains]
+    left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, own, strict=True))
+    missed = [item for gain, part in zip(gains, own, strict=True) for item in gain.missed(part)]
+    named = _named(missed)
+    if not named:
+        return []
+    return [
+        f"no products of tables are written: not corrected are {named}; together they leave "
+        f"{np.sqrt(max(left, 0.0)) / MM_PER_UM:.2f} um rms over the volume (first order)"
+    ]
+
+
+def _named(missed: Sequence[tuple[str, float]]) -> str:
+    """Names with their rms in um, the largest first; what is below 0.01 um is left out."""
+    return ", ".join(
+        f"{name} ({size / MM_PER_UM:.2f} um rms)"
+        for name, size in sorted(missed, key=lambda item: -item[1])
+        if size >= _NAMED_FROM_MM
+    )
+
+
+def terms_of_tables(
+    machine: Machine, errors: ErrorTable, terms: Sequence[Term], mode: str, choice: Choice, names: set[str]
+) -> list[Term]:
+    """Return the terms ``names`` that given tables hold if they are as good as the chosen ones, else the chosen ones.
+
+    Two sets may leave nearly the same error, so that slightly different errors prefer another one.
+    """
+    own = [term for term in terms if term.name in names]
+    if not choice.dropped or not own or table_count(own, mode) > (choice.allowed or 0):
+        return choice.kept
+    gains = [_Gains.of(machine, errors, terms, choice.beside, output) for output in range(3)]
+    left = [
+        sum(
+            gain.wanted - gain.taken([term for term in part if term.carrier[0].output == k])
+            for k, gain in enumerate(gains)
+        )
+        for part in (own, choice.kept)
+    ]
+    return own if left[0] <= _AS_GOOD**2 * left[1] else choice.kept
+
+
+@dataclass(frozen=True)
+class _Gains:
+    """Least squares of the terms of one output axis; ``taken`` is in mm^2, the mean over the volume.
+
+    ``beside`` are terms that are there in any case and take no table; ``wanted`` is the square of what is to be taken out.
+    """
+
+    terms: tuple[Term, ...]
+    beside: tuple[Term, ...]
+    normal: FloatArray
+    right: FloatArray
+    wanted: float
+    columns: Mapping[str, IntArray]
+
+    @classmethod
+    def of(
+        cls, machine: Machine, errors: ErrorTable, terms: Sequence[Term], beside: Sequence[Term], output: int
+    ) -> _Gains:
+        nodes = tuple(
+            np.unique(
+                np.concatenate(
+                    [machine.axes[axis].nodes_mm, *(t.nodes_mm for t in [*terms, *beside] if t.axis == axis)]
+                )
+            )
+            for axis in range(3)
+        )
+        sample = volume_sample(machine, nodes, _MOST_POINTS, machine.emphasis)
+        tool_mm, weight = tool_of(machine, None), sample.weight / np.sum(sample.weight)
+        wanted = -volumetric_error(machine, errors, sample.position_mm)[:, output]
+        own = [term for term in terms if term.carrier[0].output == output]
+        own = [term for term in own if _moves(machine, term)]
+        given = [term for term in beside if term.carrier[0].output == output]
+        parts: list[FloatArray] = []
+        columns: dict[str, IntArray] = {}
+        first = 0
+        for term in [*own, *given]:
+            carrier = term.carrier_field(sample.position_mm, tool_mm)[:, output]
+            parts.append(term.curve_matrix(sample.position_mm) * carrier[:, None])
+            columns[term.name] = np.arange(first, first + len(term.nodes_mm))
+            first += len(term.nodes_mm)
+        design = np.hstack(parts) if parts else np.zeros((len(wanted), 0))
+        scale = 1.0 / np.maximum(np.sqrt(np.sum(weight[:, None] * design**2, axis=0)), 1e-12)
+        design = design * scale
+        normal, right = design.T @ (weight[:, None] * design), design.T @ (weight * wanted)
+        return cls(tuple(own), tuple(given), normal, right, float(weight @ wanted**2), columns)
+
+    @property
+    def of_all(self) -> float:
+        """What all terms take out, mm^2."""
+        return self.taken(self.terms)
+
+    def taken(self, terms: Sequence[Term]) -> float:
+        """Squares that a set of terms takes out, mm^2."""
+        held = [term for term in (*terms, *self.beside) if term.name in self.columns]
+        if not held:
+            return 0.0
+        where = np.concatenate([self.columns[term.name] for term in held])
+        solution = lstsq(self.normal[np.ix_(where, where)], self.right[where], cond=_UNDETERMINED)[0]
+        return float(self.right[where] @ solution)
+
+    def missed(self, kept: Sequence[Term]) -> list[tuple[str, float]]:
+        """Return (name, rms mm) of the terms beside the kept ones: what each would take out in addition."""
+        own = self.taken(kept)
+        return [
+            (term.name, float(np.sqrt(max(self.taken([*kept, term]) - own, 0.0))))
+            for term in self.terms
+            if term not in kept
+        ]
+
+    def by_count(self, mode: str, allowed: int) -> dict[int, tuple[float, tuple[Term, ...]]]:
+        """Return the best set for every number of tables: (mm^2, terms)."""
+        best: dict[int, tuple[float, tuple[Term, ...]]] = {0: (self.taken(()), ())}
+        for size in range(1, len(self.terms) + 1):
+            for part in combinations(self.terms, size):
+                count = table_count(part, mode)
+                if count > allowed:
+                    continue
+                gain = self.taken(part)
+                if count not in best or gain > best[count][0]:
+                    best[count] = gain, part
+        return best
+
+
+def _moves(machine: Machine, term: Term) -> bool:
+    """Whether the natural values of a term are more than the last decimal."""
+    lever = term.carrier[0].lever
+    span = 1.0 if lever is None else machine.axes[lever].length_mm
+    return float(np.max(np.abs(term.start), initial=0.0)) * span > _NOTHING_MM
+
+
+def _best_sets(gains: Sequence[_Gains], mode: str, allowed: int) -> list[tuple[Term, ...]]:
+    """Return the best set of each axis such that all together take no more than ``allowed`` tables; one at least."""
+    best: dict[int, tuple[float, list[tuple[Term, ...]]]] = {0: (0.0, [])}
+    for gain in gains:
+        options = gain.by_count(mode, allowed)
+        joined: dict[int, tuple[float, list[tuple[Term, ...]]]] = {}
+        for used, (so_far, parts) in best.items():
+            for number, (value, part) in options.items():
+                total = used + number
+                if total <= allowed and (total not in joined or so_far + value > joined[total][0]):
+                    joined[total] = so_far + value, [*parts, part]
+        best = joined
+    return max(best.values(), key=lambda item: item[0])[1]

@@ -1,0 +1,321 @@
+"""SINUMERIK leadscrew and measuring-system error compensation (LEC, MSEC, EEC): one table per axis.
+
+Sources: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 237-239, 242; 808D Function Manual p. 106.
+The control adds the table value to the ACTUAL position, so that a positive value moves the axis in the negative
+direction (p. 238): the table holds the measured error, actual minus nominal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controls.shared.grids import equidistant_grid
+from compgen.controls.shared.terms import one_dimensional_terms
+from compgen.controls.siemens_cec_tables import plain_backlash_rows
+from compgen.controls.siemens_machine_data import PROFILES, EecSettings, take_eec_settings
+from compgen.controls.siemens_text import (
+    SWITCHES,
+    ArchiveAssignments,
+    ArchiveFindings,
+    Assignment,
+    LinearTable,
+    TableParts,
+    axis_of,
+    exact_grid,
+    foreign_assignments,
+    read_assignments,
+    table_violations,
+)
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.names import AXES
+
+#: Variables of the table without ``$``, with the number of their indices (K3-2013, p. 242).
+VARIABLES = {
+    "AA_ENC_COMP": 3,
+    "AA_ENC_COMP_STEP": 2,
+    "AA_ENC_COMP_MIN": 2,
+    "AA_ENC_COMP_MAX": 2,
+    "AA_ENC_COMP_IS_MODULO": 2,
+    "MA_ENC_COMP_ENABLE": 2,
+}
+BYTES_PER_VALUE = 8
+
+
+@dataclass(frozen=True)
+class EecTables:
+    """Tables by (axis 0..2, encoder); the values are errors in mm (actual minus nominal), as the file has them."""
+
+    tables: Mapping[tuple[int, int], LinearTable]
+
+
+class SiemensEec(Controller[EecSettings, EecTables]):
+    """SINUMERIK measuring-system and leadscrew error compensation: positioning of X, Y, Z."""
+
+    name = "siemens-eec"
+    anchored = True
+
+    @classmethod
+    def read_settings(cls, machine: Machine) -> EecSettings:
+        """Check the settings; all have defaults."""
+        section = machine.controller_settings(cls.name)
+        settings = take_eec_settings(section, machine)
+        section.finish()
+        return settings
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node."""
+        return eec_terms(self.machine, self.settings, errors)
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> EecTables:
+        """Return the tables: minus the correction, rounded to the decimals of the file."""
+        tables = {}
+        for term in basis:
+            start, step, last = exact_grid(term.nodes_mm)
+            quantum = 10**self.settings.decimals
+            counts = np.rint(-np.asarray(values[term.name]) * quantum).astype(np.int64)
+            numbers = tuple(Decimal(int(count)).scaleb(-self.settings.decimals) for count in counts)
+            axis = term.carrier[0].output
+            for encoder in self.settings.encoders[axis]:
+                tables[axis, encoder] = LinearTable(start, step, last, numbers)
+        return EecTables(tables)
+
+    def context(self, tables: EecTables) -> dict[str, Any]:
+        """Return tables, machine data and the sign with a number from the file."""
+        settings = self.settings
+        return {
+            "sign_statement": self._sign_statement(tables),
+            "parameters": self._parameters(tables),
+            "warnings": self._warnings(tables),
+            "container": settings.container.kind,
+            "program_enables": settings.container.enables,
+            "active": [
+                f"{name}: {encoder + 1}" for name, encoder in zip(settings.axis_names, settings.active, strict=True)
+            ],
+            "decimals": settings.decimals,
+            "overwrites": [
+                "Encoder tables ($AA_ENC_COMP) of other axes: none.",
+                *(
+                    f"The encoder table of {settings.axis_names[axis]}, measuring system {encoder + 1}, whatever it holds now."
+                    for axis, encoder in sorted(tables.tables)
+                ),
+            ],
+            "tables": [
+                {
+                    "letter": AXES[axis],
+                    "axis": settings.axis_names[axis],
+                    "encoder": encoder,
+                    "minimum_mm": float(table.start_mm),
+                    "maximum_mm": float(table.last_mm),
+                    "step_mm": float(table.step_mm),
+                    "modulo": int(table.modulo),
+                    "values_mm": [float(value) for value in table.values],
+                }
+                for (axis, encoder), table in sorted(tables.tables.items())
+            ],
+        }
+
+    def _sign_statement(self, tables: EecTables) -> str:
+        settings = self.settings
+        (axis, _), table = max(tables.tables.items(), key=lambda item: float(np.max(np.abs(item[1].numbers))))
+        node = int(np.argmax(np.abs(table.numbers)))
+        value = float(table.values[node])
+        return (
+            "A table value is the measured error, actual minus nominal, in mm. The control adds it to the ACTUAL "
+            f"position, so a positive value moves the axis in the negative direction. Here: at {AXES[axis]} = "
+            f"{table.nodes_mm[node]:.3f} mm the table holds {value:+.6f} mm, the axis {settings.axis_names[axis]} is "
+            f"moved by {-value:+.6f} mm."
+        )
+
+    def _parameters(self, tables: EecTables) -> list[dict[str, str]]:
+        rows = []
+        for (axis, encoder), table in sorted(tables.tables.items()):
+            name, count = self.settings.axis_names[axis], len(table.values)
+            rows.append(
+                {
+                    "name": f"MD38000 $MA_MM_ENC_COMP_MAX_POINTS[{encoder},{name}]",
+                    "value": f">= {count}",
+                    "meaning": f"reserved nodes; {count * BYTES_PER_VALUE} bytes of static memory, which the change "
+                    "re-formats: save all data first",
+                }
+            )
+            rows.append(
+                {
+                    "name": f"MD32700 $MA_ENC_COMP_ENABLE[{encoder}] of {name}",
+                    "value": "0, then 1",
+                    "meaning": "0 while the file is loaded; 1 makes the table act and write-protects it",
+                }
+            )
+        return rows
+
+    def _warnings(self, tables: EecTables) -> list[str]:
+        settings = self.settings
+        found, small = [], PROFILES["808D"].eec_nodes
+        for (axis, encoder), table in sorted(tables.tables.items()):
+            name = settings.axis_names[axis]
+            at_reference = float(table.at(np.array([self.machine.reference_point_mm[axis]]))[0])
+            if abs(at_reference) > self.resolution_mm():
+                found.append(
+                    f"{name}: the table holds {at_reference:+.6f} mm at the reference point; the axis jumps by it when "
+                    "the compensation is enabled"
+                )
+            if len(table.values) > small and settings.max_points > small:
+                found.append(f"{name}: {len(table.values)} nodes; a SINUMERIK 808D holds {small}")
+            if encoder != settings.active[axis]:
+                found.append(
+                    f"{name}: the table of measuring system {encoder + 1} holds the same errors as that of measuring "
+                    f"system {settings.active[axis] + 1}; it is right only if they were measured with either, or the "
+                    "errors are those of the guideway"
+                )
+        if not settings.max_points_known:
+            found.append(
+                f"how many nodes this model holds is not documented; {settings.max_points} are taken as the limit, the "
+                "smallest number documented for any model: state max_points"
+            )
+        return found
+
+    def parse(self, files: Sequence[SourceFile]) -> EecTables:
+        """Read the tables of the machine's axes; an axis without any assignment has no table."""
+        return eec_tables_from(read_assignments(files, VARIABLES), self.settings)
+
+    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[EecTables, list[str]]:
+        """Read an archive or a program of a real control: the tables that act, and what was passed over."""
+        findings = ArchiveFindings()
+        given = foreign_assignments(files, VARIABLES, findings)
+        return foreign_eec_tables(given, self.machine, self.settings, findings), findings.statements()
+
+    def emulate(self, tables: EecTables, points: Points) -> FloatArray:
+        """Return minus the interpolated values of the active measuring system: the actual position is corrected by it."""
+        correction = np.zeros((len(points), 3))
+        for (axis, encoder), table in tables.tables.items():
+            if encoder == self.settings.active[axis]:
+                correction[:, axis] = -table.at(points.position_mm[:, axis])
+        return correction
+
+    def violations(self, tables: EecTables) -> list[str]:
+        """Return broken rules of the tables: whole number of steps, node count, travel, a missing measuring system."""
+        settings = self.settings
+        found: list[str] = []
+        for (axis, encoder), table in sorted(tables.tables.items()):
+            what = f"the table of {settings.axis_names[axis]}"
+            what += f", measuring system {encoder + 1}" if len(settings.encoders[axis]) > 1 else ""
+            found += table_violations(self.machine, axis, table, settings.max_points, what)
+        for axis in sorted({axis for axis, _ in tables.tables}):
+            found += [
+                f"{settings.axis_names[axis]} has no table for measuring system {encoder + 1}"
+                for encoder in settings.encoders[axis]
+                if (axis, encoder) not in tables.tables
+            ]
+        return found
+
+    def table_nodes_mm(self, tables: EecTables) -> tuple[FloatArray, ...]:
+        """Return the nodes of each axis."""
+        return nodes_by_axis((axis, table.nodes_mm) for (axis, _), table in tables.tables.items())
+
+    def backlash_parameters(self, reversal: ReversalCurves) -> list[dict[str, str]]:
+        """Return MD32450 of each axis with a reversal along itself."""
+        return plain_backlash_rows(reversal, self.settings.axis_names, self.settings.encoders)
+
+    def usage(self, tables: EecTables) -> list[Usage]:
+        """Return the nodes of each axis against what the control can hold."""
+        settings = self.settings
+        return [
+            Usage(f"nodes of {settings.axis_names[axis]}", len(table.values), settings.max_points, "nodes")
+            for (axis, _), table in sorted(tables.tables.items())
+        ]
+
+    def resolution_mm(self) -> float:
+        """Half of the last decimal."""
+        return 0.5 * 10.0**-self.settings.decimals
+
+
+def eec_terms(
+    machine: Machine, settings: EecSettings, errors: ErrorTable, lever_origin_mm: Sequence[float] | None = None
+) -> list[Term]:
+    """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node of their grids.
+
+    ``lever_origin_mm`` as in :func:`compgen.controls.shared.terms.one_dimensional_terms`.
+    """
+    nodes = [
+        equidistant_grid(
+            machine,
+            errors,
+            axis,
+            most=settings.max_points,
+            step_mm=settings.step_mm[axis],
+            anchor=True,
+            loss_mm=settings.loss_mm,
+            output=axis,
+        ).nodes_mm
+        for axis in range(3)
+    ]
+    pairs = [(axis, axis) for axis in range(3)]
+    return one_dimensional_terms(machine, errors, nodes, pairs, anchored=True, lever_origin_mm=lever_origin_mm)
+
+
+def foreign_eec_tables(
+    given: ArchiveAssignments, machine: Machine, settings: EecSettings, findings: ArchiveFindings
+) -> EecTables:
+    """Return the tables that act, from the files of a real control.
+
+    Kept apart are tables of axes that the machine file lacks, tables that the archive's machine data switch off, and
+    tables of zeros; a table that acts in another measuring system than the machine file's is refused with its line.
+    """
+    parts: dict[tuple[str, int], TableParts] = {}
+    for item in given.items:
+        if item.variable in SWITCHES:
+            continue
+        encoder, name = item.index_number(0, 1), item.index[-1]
+        part = parts.setdefault((name, encoder), TableParts(f"table of {name}, encoder {encoder}", item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AA_ENC_COMP" else None)
+    tables = {}
+    for (name, encoder), part in sorted(parts.items()):
+        axis = settings.axis_names.index(name) if name in settings.axis_names else None
+        own = axis is not None and encoder in settings.encoders[axis]
+        if part.is_zero and (not own or part.scalar("$AA_ENC_COMP_STEP").number() == 0):
+            findings.count("encoder tables of zeros, of other axes or measuring systems")
+        elif axis is None:
+            findings.apart.append(f"encoder table of {name} (encoder {encoder}, up to {part.largest})")
+        elif given.switched_off("MA_ENC_COMP_ENABLE", (str(encoder), name)):
+            findings.notes.append(f"$MA_ENC_COMP_ENABLE[{encoder},{name}] is 0 in the archive: its table does not act")
+        elif not own:
+            raise part.scalar("$AA_ENC_COMP_STEP").fail(
+                f"the control holds a table of up to {part.largest} for encoder {encoder} of {name}; the machine "
+                f"file has encoder = {list(settings.encoders[axis])}: state the one that is in use, e.g. encoder = "
+                f"{{ {AXES[axis]} = {encoder} }}"
+            )
+        else:
+            tables[axis, encoder] = findings.table(part, "$AA_ENC_COMP", machine.axes[axis].range_mm)
+    if not tables:
+        said = [*findings.apart, *findings.notes]
+        raise next(iter(parts.values())).source.fail(
+            f"holds no table that acts for the axes {', '.join(settings.axis_names)} and measuring systems of the machine "
+            f"file{': ' if said else ''}{'; '.join(said)}"
+        )
+    return EecTables(dict(sorted(tables.items())))
+
+
+def eec_tables_from(items: Sequence[Assignment], settings: EecSettings) -> EecTables:
+    """Return the tables that assignments make; InputError for an encoder that the settings do not have."""
+    parts: dict[tuple[int, int], TableParts] = {}
+    for item in items:
+        encoder = item.index_number(0, 1)
+        axis = axis_of(item, item.index[-1], settings.axis_names)
+        own = settings.encoders[axis]
+        if encoder not in own:
+            stated = own[0] if len(own) == 1 else list(own)
+            raise item.fail(f"belongs to encoder {encoder}; the machine file has encoder = {stated}")
+        if item.variable in SWITCHES:
+            continue
+        what = f"table of {settings.axis_names[axis]}" + (f", encoder {encoder}" if len(own) > 1 else "")
+        part = parts.setdefault((axis, encoder), TableParts(what, item.source))
+        part.add(item, item.index_number(1, 999_999) if item.variable == "AA_ENC_COMP" else None)
+    return EecTables({key: part.table("$AA_ENC_COMP") for key, part in sorted(parts.items())})

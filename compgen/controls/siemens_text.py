@@ -1,0 +1,699 @@
+"""SINUMERIK tables as text: the strict reader of our own files, and the reader of start-up archives."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from fractions import Fraction
+
+import numpy as np
+
+from compgen.controls.shared.base import SourceFile, coverage_violations
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
+from compgen.data.messages import nearest, one_line
+from compgen.errors import CompgenWarning, InputError
+
+# What both kinds of SINUMERIK tables share: reading assignments from text, and equidistant tables.
+#
+# Lexical grammar (SINUMERIK 840D sl / 828D Extended Functions K3, 03/2013, p. 242; 802D sl Function Manual, p. 222)::
+#
+#     file       = [ "%_N_" name "_INI" ] [ "CHANDATA(" int ")" ] { assignment | "NEWCONF" | ";" comment } "M17"
+#     assignment = "$" variable "[" index { "," index } "]" "=" value [ ";" comment ]
+#     value      = number without exponent | "(" axis name ")" | axis name in quotation marks
+#
+# The same assignments may stand in a sub-program (name ``..._SPF``) that switches the function off before them, makes
+# that effective by NEWCONF, and may switch it on again behind them.
+
+
+#: Positions of nodes are written in whole multiples of this.
+POSITION_QUANTUM_MM = Decimal("0.000001")
+POSITION_DIGITS = 6
+
+#: Switches that may stand among the tables, without ``$``, with the number of their indices (K3-2013, p. 239, 245).
+SWITCHES = {
+    "MA_ENC_COMP_ENABLE": 2,
+    "MA_CEC_ENABLE": 1,
+    "SN_CEC_TABLE_ENABLE": 1,
+    "SN_CEC_TABLE_WEIGHT": 1,
+}
+#: Switches that write-protect the tables while they are 1 (MD32700, MD32710).
+PROTECTING = ("MA_ENC_COMP_ENABLE", "MA_CEC_ENABLE")
+MAKE_EFFECTIVE = "NEWCONF"
+
+#: A step that was rounded misses MAX by less than this share of itself: 39 steps of 19.7436 mm are 770.0004 mm.
+_ROUNDED = Decimal("0.01")
+_LONGEST_LINE = 1000
+_MOST_LINES = 200_000
+_MOST_CHARACTERS = 20_000_000
+_HEADER = re.compile(r"%_N_[A-Z0-9_]{1,80}_(?:INI|SPF|MPF)")
+_CHANNEL = re.compile(r"CHANDATA ?\( ?\d{1,3} ?\)")
+_ASSIGNMENT = re.compile(r"\$([A-Z0-9_]{1,60})\s*\[([^\[\]=]{1,100})\]\s*=\s*(\S.*)")
+_NUMBER = re.compile(r"[+-]?(?:\d{1,12}(?:\.\d{0,15})?|\.\d{1,15})")
+_EXPONENT = re.compile(r"[+-]?[\d.]{1,30} ?EX?[ +-]{0,2}\d{1,10}")
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """One assignment to a system variable: ``variable`` without ``$``, its indices and its value as text."""
+
+    variable: str
+    index: tuple[str, ...]
+    value: str
+    source: SourceFile
+    line: int
+
+    @property
+    def label(self) -> str:
+        """The left-hand side, e.g. ``$AN_CEC[0,3]``."""
+        return f"${self.variable}[{','.join(self.index)}]"
+
+    def fail(self, message: str) -> InputError:
+        """Return the error that points at this line."""
+        return self.source.fail(f"{self.label}: {message}", self.line)
+
+    def number(self) -> Decimal:
+        """Return the value as an exact decimal number."""
+        if _NUMBER.fullmatch(self.value):
+            return Decimal(self.value)
+        shown = one_line(self.value)[:40]
+        if _EXPONENT.fullmatch(self.value):
+            raise self.fail(f"{shown!r} has an exponent; the control reads fixed-point numbers, e.g. 0.000010")
+        if "," in self.value:
+            raise self.fail(f"{shown!r} has a comma; the decimal mark is '.'")
+        raise self.fail(f"{shown!r} is not a number; expected a fixed-point number such as -0.012000")
+
+    def whole(self, minimum: int, maximum: int) -> int:
+        """Return the value as a whole number within limits."""
+        value = self.number()
+        if value != value.to_integral_value() or not minimum <= value <= maximum:
+            raise self.fail(f"{self.value} is not a whole number from {minimum} to {maximum}")
+        return int(value)
+
+    def index_number(self, place: int, maximum: int) -> int:
+        """Return one of the indices as a whole number from 0 to ``maximum``."""
+        text = self.index[place]
+        if not text.isdigit() or len(text) > 9 or int(text) > maximum:
+            raise self.fail(f"index {one_line(text)[:20]!r} is not a whole number from 0 to {maximum}")
+        return int(text)
+
+
+def read_assignments(files: Sequence[SourceFile], index_counts: Mapping[str, int]) -> list[Assignment]:
+    """Return every assignment of the files in their order.
+
+    Parameters
+    ----------
+    files : the texts; each ends with ``M17``.
+    index_counts : the known variables, without ``$``, and how many indices each has. Those of :data:`SWITCHES` may
+        be assigned several times; the last assignment is returned.
+
+    Raises
+    ------
+    InputError
+        with file and line for an unknown variable, a wrong number of indices, a second assignment to one variable,
+        text that is no assignment, a table that is written while its function is on, a file that does not end with
+        M17.
+    """
+    seen: dict[tuple[str, tuple[str, ...]], Assignment] = {}
+    for source in files:
+        for item in _unprotected(_assignments(source, index_counts)):
+            if item.variable in SWITCHES:
+                seen[item.variable, item.index] = item
+                continue
+            first = seen.setdefault((item.variable, item.index), item)
+            if first is not item:
+                where = (
+                    f"{first.source.path}, line {first.line}" if first.source is not source else f"line {first.line}"
+                )
+                raise item.fail(f"is assigned a second time; the first is in {where}")
+    if not any(item.variable not in SWITCHES for item in seen.values()):
+        raise files[0].fail("holds no table") if files else InputError("no file was given")
+    return list(seen.values())
+
+
+def _unprotected(items: Iterator[Assignment]) -> Iterator[Assignment]:
+    """Pass the assignments on; a table that is written while the file itself has switched its function on is an error."""
+    on: dict[tuple[str, tuple[str, ...]], Assignment] = {}
+    for item in items:
+        if item.variable in PROTECTING:
+            on.pop((item.variable, item.index), None)
+            if item.whole(0, 1):
+                on[item.variable, item.index] = item
+        elif item.variable not in SWITCHES and on:
+            switch = next(iter(on.values()))
+            raise item.fail(
+                f"is written while {switch.label} is 1 (line {switch.line}): the control write-protects its tables then"
+            )
+        yield item
+
+
+def _code_lines(source: SourceFile) -> Iterator[tuple[int, str]]:
+    """Lines without comments, upper-cased, with their numbers."""
+    text = source.text.replace("\r\n", "\n").replace("\r", "\n")
+    if len(text) > _MOST_CHARACTERS or text.count("\n") > _MOST_LINES:
+        raise source.fail(f"has more than {_MOST_LINES} lines or {_MOST_CHARACTERS} characters; no set of tables has")
+    strange = re.search(r"[^\t\n -~]", text)
+    if strange:
+        place = text.count("\n", 0, strange.start()) + 1
+        raise source.fail(f"holds the character {ascii(strange.group())}; the file is plain ASCII text", place)
+    for number, line in enumerate(text.split("\n"), start=1):
+        code = line.partition(";")[0].strip()
+        if len(code) > _LONGEST_LINE:
+            raise source.fail(f"the line has {len(code)} characters; expected one assignment", number)
+        if code:
+            yield number, code.upper()
+
+
+def _assignments(source: SourceFile, index_counts: Mapping[str, int]) -> Iterator[Assignment]:
+    ended, started, number, dotted = False, False, 1, False
+    for number, code in _code_lines(source):
+        if ended:
+            raise source.fail(f"{code[:40]!r} stands after the end mark M17", number)
+        if code == "M17":
+            ended = True
+        elif code == MAKE_EFFECTIVE or not started and (_HEADER.fullmatch(code) or _CHANNEL.fullmatch(code)):
+            continue
+        else:
+            started = True
+            item = _assignment(source, number, code, index_counts)
+            dotted = dotted or "." in code.partition("]")[0]
+            yield item
+    if not ended:
+        raise source.fail("the end mark M17 is missing: the file is truncated", number)
+    if dotted:
+        message = f"{source.path}: indices are separated by '.'; read as ',' (write a comma: the control needs it)"
+        warnings.warn(message, CompgenWarning, stacklevel=4)
+
+
+def _assignment(source: SourceFile, number: int, code: str, index_counts: Mapping[str, int]) -> Assignment:
+    match = _ASSIGNMENT.fullmatch(code)
+    if match is None:
+        raise source.fail(f"{code[:60]!r} is not an assignment; expected e.g. $AN_CEC[0,1]=0.005000", number)
+    variable, index_text, value = match.groups()
+    if variable not in index_counts:
+        known = [f"${name}" for name in index_counts]
+        raise source.fail(f"${variable} is not a variable of these tables; {nearest('$' + variable, known)}", number)
+    index = tuple(_plain_index(part.strip()) for part in re.split(r"[,.]", index_text))
+    if len(index) != index_counts[variable] or not all(index):
+        raise source.fail(f"${variable} has {index_counts[variable]} indices; got [{index_text}]", number)
+    return Assignment(variable, index, value.strip(), source, number)
+
+
+def _plain_index(text: str) -> str:
+    """An index without leading zeros, so that [0,01] and [0,1] are one."""
+    return str(int(text)) if text.isdigit() and len(text) < 10 else text
+
+
+@dataclass(frozen=True)
+class LinearTable:
+    """An equidistant table in exact decimal numbers (mm): nodes ``start + n step`` up to ``last``.
+
+    ``values`` has one number per node; between nodes the control interpolates linearly, outside the end values hold,
+    a ``modulo`` table repeats with the period ``last - start`` (K3-2013, p. 237, 242, 248).
+    """
+
+    start_mm: Decimal
+    step_mm: Decimal
+    last_mm: Decimal
+    values: tuple[Decimal, ...]
+    modulo: bool = False
+
+    @property
+    def intervals(self) -> Fraction:
+        """Number of steps from the first to the last node, exact; a whole number in a proper table."""
+        return (Fraction(self.last_mm) - Fraction(self.start_mm)) / Fraction(self.step_mm)
+
+    @property
+    def nodes_mm(self) -> FloatArray:
+        """Node positions, shape (n,)."""
+        return np.array([float(self.start_mm + n * self.step_mm) for n in range(len(self.values))])
+
+    @property
+    def numbers(self) -> FloatArray:
+        """Values, shape (n,)."""
+        return np.array([float(value) for value in self.values])
+
+    def at(self, position_mm: FloatArray) -> FloatArray:
+        """Interpolated value at positions of any shape; what lies beyond ``last_mm`` has the value there.
+
+        The last node stands at ``last_mm``, or beyond it where that is no whole number of steps.
+        """
+        start, last = float(self.start_mm), float(self.last_mm)
+        position = start + np.mod(position_mm - start, last - start) if self.modulo else np.minimum(position_mm, last)
+        return np.interp(position, self.nodes_mm, self.numbers)
+
+
+def exact_grid(nodes_mm: FloatArray) -> tuple[Decimal, Decimal, Decimal]:
+    """Return start, step and last node of equidistant positions as exact decimal numbers; start + k step is last."""
+    start, second = (Decimal(repr(float(node))).quantize(POSITION_QUANTUM_MM) for node in nodes_mm[:2])
+    step = second - start
+    last = start + (len(nodes_mm) - 1) * step
+    if step <= 0 or abs(float(last) - float(nodes_mm[-1])) > 1e-3:
+        raise ValueError("the nodes of a SINUMERIK table must be equidistant and ascending")
+    return start, step, last
+
+
+@dataclass
+class TableParts:
+    """The assignments that make one table, collected in any order; ``what`` names the table in messages."""
+
+    what: str
+    source: SourceFile
+    scalars: dict[str, Assignment] = field(default_factory=dict)
+    nodes: dict[int, Assignment] = field(default_factory=dict)
+
+    def add(self, item: Assignment, node: int | None) -> None:
+        """Take one assignment: the value of a node, or (None) a scalar variable of the table."""
+        if node is None:
+            self.scalars[f"${item.variable}"] = item
+        else:
+            self.nodes[node] = item
+
+    def scalar(self, name: str) -> Assignment:
+        """Return the assignment of one scalar variable; InputError if the files do not have it."""
+        if name not in self.scalars:
+            raise self.source.fail(
+                f"{self.what}: {name} is missing (the control would keep an older value): is the file truncated?"
+            )
+        return self.scalars[name]
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether every node is zero: whatever is not known of such a table does not matter."""
+        return all(item.number() == 0 for item in self.nodes.values())
+
+    @property
+    def largest(self) -> str:
+        """Largest value of a node in size, as people read it; of a rotary axis it is in degrees."""
+        return f"{max((abs(float(item.number())) for item in self.nodes.values()), default=0.0):g} mm or degrees"
+
+    def foreign_table(self, prefix: str) -> tuple[LinearTable, int, float]:
+        """Return a table as a real control may hold it, how many reserved nodes lie beyond MAX, and a doubt in um.
+
+        Where MAX is no whole number of steps from MIN, the node behind it ends the last, shorter interval; whether the
+        control interpolates to it or holds the node before is not documented, and the doubt is what that can matter.
+        """
+        first, last, step = (self.scalar(f"{prefix}_{key}") for key in ("MIN", "MAX", "STEP"))
+        start_mm, last_mm, step_mm = first.number(), last.number(), step.number()
+        if step_mm <= 0:
+            raise step.fail(f"{step.value} is not above zero, and the table holds values")
+        if last_mm <= start_mm:
+            raise last.fail(f"{last.value} is not above the position {first.value} of the first node")
+        whole, part = divmod(last_mm - start_mm, step_mm)
+        count = int(whole) + (2 if part else 1)
+        if part and int(whole) + 1 not in self.nodes:
+            count -= 1
+        missing = next((n for n in range(count) if n not in self.nodes), None)
+        if missing is not None:
+            raise self.source.fail(
+                f"{self.what}: node {missing} of 0 ... {count - 1} is missing: is the file truncated?", first.line
+            )
+        values = tuple(self.nodes[n].number() for n in range(count))
+        modulo = f"{prefix}_IS_MODULO" in self.scalars and self.scalars[f"{prefix}_IS_MODULO"].whole(-1, 1) == 1
+        odd = _ROUNDED < part / step_mm < 1 - _ROUNDED and count > 1
+        doubt = abs(float((values[-1] - values[-2]) * part / step_mm)) if odd else 0.0
+        surplus = sum(1 for n in self.nodes if n >= count)
+        return LinearTable(start_mm, step_mm, last_mm, values, modulo), surplus, 1000.0 * doubt
+
+    def table(self, prefix: str) -> LinearTable:
+        """Return the complete table; ``prefix`` is ``$AN_CEC`` or ``$AA_ENC_COMP``."""
+        first, last, step = (self.scalar(f"{prefix}_{key}") for key in ("MIN", "MAX", "STEP"))
+        start_mm, last_mm, step_mm = first.number(), last.number(), step.number()
+        if step_mm <= 0:
+            raise step.fail(f"{step.value} is not above zero")
+        if last_mm <= start_mm:
+            raise last.fail(f"{last.value} is not above the position {first.value} of the first node")
+        modulo = self.scalar(f"{prefix}_IS_MODULO").whole(0, 1) == 1
+        count = self._count(round((Fraction(last_mm) - Fraction(start_mm)) / Fraction(step_mm)))
+        values = tuple(self.nodes[n].number() for n in range(count))
+        return LinearTable(start_mm, step_mm, last_mm, values, modulo)
+
+    def _count(self, intervals: int) -> int:
+        count = max(intervals, 1) + 1
+        surplus = next((node for n, node in self.nodes.items() if n >= count), None)
+        if surplus is not None:
+            raise surplus.fail(
+                f"MIN, MAX and STEP of {self.what} give the nodes 0 ... {count - 1}; this one is too many"
+            )
+        missing = next((n for n in range(count) if n not in self.nodes), None)
+        if missing is not None:
+            raise self.source.fail(
+                f"{self.what}: node {missing} of 0 ... {count - 1} is missing (the control would keep an older value): "
+                f"is the file truncated?"
+            )
+        return count
+
+
+def table_violations(machine: Machine, axis: int, table: LinearTable, most: int, what: str) -> list[str]:
+    """Return the rules of a single table that are broken: whole number of steps, node count, cycle, travel."""
+    found = []
+    if table.intervals.denominator != 1:
+        found.append(
+            f"{what}: MIN + k STEP never meets MAX ({table.start_mm} + k {table.step_mm}, {table.last_mm} mm); the "
+            f"control's behaviour is not documented"
+        )
+    if len(table.values) > most:
+        found.append(f"{what} has {len(table.values)} nodes, the control takes {most}")
+    if table.modulo:
+        if table.values[0] != table.values[-1]:
+            found.append(f"{what} is cyclic, but its first and last value differ")
+        return found
+    return found + coverage_violations(machine, axis, float(table.start_mm), float(table.last_mm), what)
+
+
+def axis_of(item: Assignment, name: str, axis_names: Sequence[str]) -> int:
+    """Return the axis, 0..2, that has this name on the control; InputError if none has."""
+    if name not in axis_names:
+        raise item.fail(f"no axis of the machine file is named {one_line(name)[:32]!r}; axis_names has {axis_names}")
+    return list(axis_names).index(name)
+
+
+# What a SINUMERIK really holds: start-up archives, punched files and sub-programs that this program did not write.
+#
+# An archive is a chain of files. In the binary form (``.arc``) NUL bytes with the name ``_N_NC_CEC_INI`` stand before each,
+# in the text form a line ``%_N_NC_CEC_INI``. The tables are those of its initialisation files; part programs that
+# write the same variables are no part of what acts, and are passed over. Where a file holds one part only, that part is
+# read, program or not.
+#
+# Nothing that could change a table is passed over: a line of tables that is not understood is an error with its number.
+# Everything else is counted, and said in one line.
+
+
+#: What is not known of a table of a real control is said from here on, um.
+WORTH_SAYING_UM = 0.1
+#: Kinds of files whose assignments are data of the control, by the last word of their name.
+DATA_KINDS = ("INI", "TEA", "SEA", "EEC", "CEC")
+#: Machine data and variables beside the tables that do not change what a table holds; None: any value.
+HARMLESS: Mapping[str, tuple[str, ...] | None] = {
+    "MN_MM_CEC_MAX_POINTS": None,
+    "MA_MM_ENC_COMP_MAX_POINTS": None,
+    "MA_CEC_MAX_SUM": None,
+    "MA_CEC_MAX_VELO": None,
+    "MA_CEC_SCALING_SYSTEM_METRIC": ("1", "TRUE"),
+    "MN_SCALING_SYSTEM_IS_METRIC": ("1", "TRUE"),
+    "AN_CEC_INPUT_NCU": ("0", "1"),
+    "AN_CEC_OUTPUT_NCU": ("0", "1"),
+    "AN_CEC_TYPE": ("0",),
+}
+#: Cylinder error compensation has the same three letters; where it is zero it does nothing.
+_OTHER_CEC = re.compile(r"SN_CEC_(?:\d|BAS|COMP|CALC)[A-Z0-9_]*")
+#: Words of a program that have no bearing on a table: units, path and display modes, dwells, messages, labels (what jumps
+#: to them is refused), declarations without a table in them.
+_MODE = r"(?:G(?!70|700)\d{1,3}|D0|SUPA|DISPLOF|DISPLON|SBLOF|SBLON)"
+_IDLE_WORD = re.compile(
+    r"METRIC|NEWCONF|STOPRE|M0?[01]|MSG ?\(.*\)|G0?4 ?[FS] ?=?[\d.]+|CHANDATA ?\( ?\d{1,3} ?\)|"
+    rf"PROC [A-Z0-9_]+.*|REDEF .*|%|{_MODE}(?: {_MODE})*|[A-Z_][A-Z0-9_]{{1,31}}:|"
+    r"DEF (?:INT|REAL|BOOL|CHAR|AXIS|STRING ?\[\d{1,3}\]) [A-Z0-9_, ]+|EXTERN [A-Z0-9_]+(?: ?\([A-Z, ]*\))?"
+)
+_END_WORD = re.compile(r"M17|M30|M0?2|RET")
+_INCH_WORD = re.compile(r"INCH|G70|G700")
+_NAME = re.compile(r"(?<!/)_N_([A-Z0-9_]{1,80})_([A-Z0-9]{2,4})(?![A-Z0-9_])")
+_TEXT_HEADER = re.compile(r"%_N_([A-Z0-9_]{1,80})_([A-Z0-9]{2,4})(?![A-Z0-9_])")
+_ARCHIVE_ASSIGNMENT = re.compile(r"\$ ?([A-Z0-9_]{1,60}) ?(?:\[([^\[\]=]{0,100})\])? ?= ?(.*)")
+_BLOCK_NUMBER = re.compile(r"N ?\d{1,8}\s+")
+_COMMA_NUMBER = re.compile(r"[+-]?\d{1,12},\d{1,15}")
+_ARCHIVE_EXPONENT = re.compile(r"([+-]?(?:\d{1,12}\.?\d{0,15}|\.\d{1,15})) ?EX?([+-]?\d{1,3})")
+_LONGEST_EXPONENT = 12
+_MENTIONS_TABLE = re.compile(r"A[NA]_(?:CEC|ENC_COMP)")
+_WRITES_TABLE = re.compile(r"\s*(?:N\d{1,8}\s+)?\$(?:AN_CEC|AA_ENC_COMP)\s*\[")
+_TRUTH = {"TRUE": "1", "FALSE": "0"}
+
+
+@dataclass
+class ArchiveFindings:
+    """What was read beside the tables, for one line of summary.
+
+    ``counts`` are by what was passed over, ``apart`` the tables of axes that the machine file lacks, ``notes`` what the
+    user should know in words of their own.
+    """
+
+    counts: dict[str, int] = field(default_factory=dict)
+    apart: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def count(self, what: str, number: int = 1) -> None:
+        """Count something that was passed over or filled in."""
+        self.counts[what] = self.counts.get(what, 0) + number
+
+    def table(self, part: TableParts, prefix: str, travel_mm: tuple[float, float]) -> LinearTable:
+        """Return the table of a real control, and note what is unusual about it; ``travel_mm`` of its input axis."""
+        table, surplus, doubt_um = part.foreign_table(prefix)
+        modulo = part.scalars.get(f"{prefix}_IS_MODULO")
+        if modulo is None:
+            self.count("tables without IS_MODULO (0 taken)")
+        elif modulo.number() == -1:
+            inside = float(table.start_mm) <= travel_mm[0] and travel_mm[1] <= float(table.last_mm)
+            if not (inside or part.is_zero):
+                raise modulo.fail(
+                    f"-1 is neither 0 nor 1, and the travel {travel_mm[0]:g} ... {travel_mm[1]:g} mm leaves the table, so "
+                    "that it matters: write what the control has"
+                )
+            self.count("times IS_MODULO = -1 (taken as 0)")
+        if surplus:
+            self.count("reserved nodes beyond MAX", surplus)
+        if doubt_um >= WORTH_SAYING_UM:
+            self.notes.append(
+                f"{part.what}: MIN + k STEP does not meet MAX; between the last node before MAX and MAX the control may do "
+                f"up to {doubt_um:.1f} um else than the straight line taken here"
+            )
+        return table
+
+    def statements(self) -> list[str]:
+        """Return the summary in at most one line of each kind."""
+        found = []
+        if self.counts:
+            found.append(
+                "passed over or filled in: " + ", ".join(f"{what} ({number})" for what, number in self.counts.items())
+            )
+        if self.apart:
+            found.append("tables of axes that the machine file does not have, kept apart: " + "; ".join(self.apart))
+        return found + list(dict.fromkeys(self.notes))
+
+
+@dataclass(frozen=True)
+class _ArchivePart:
+    """One file of an archive: its name, its kind (``INI``, ``SPF``; empty: not said), and its numbered lines."""
+
+    name: str
+    kind: str
+    lines: tuple[tuple[int, str], ...]
+
+    @property
+    def has_end(self) -> bool:
+        """Whether some line is an end mark."""
+        return any(_END_WORD.fullmatch(line.partition(";")[0].strip().upper()) for _, line in self.lines)
+
+    @property
+    def writes_tables(self) -> bool:
+        """Whether some line, comments aside, gives a table a value."""
+        return any(_WRITES_TABLE.match(line.upper()) for _, line in self.lines)
+
+
+@dataclass(frozen=True)
+class ArchiveAssignments:
+    """Assignments of a real file: those of the tables, and switches that stand elsewhere in an archive."""
+
+    items: list[Assignment]
+    machine_data: dict[tuple[str, tuple[str, ...]], Assignment]
+
+    def switched_off(self, variable: str, index: tuple[str, ...]) -> bool:
+        """Whether the machine data of an archive say 0 for a switch; False where they do not say it."""
+        item = self.machine_data.get((variable, index))
+        return item is not None and item.number() == 0
+
+
+def foreign_assignments(
+    files: Sequence[SourceFile], tables: Mapping[str, int], findings: ArchiveFindings
+) -> ArchiveAssignments:
+    """Return the assignments of tables and switches of real files; InputError with the line for what is not understood.
+
+    Parameters
+    ----------
+    files : archives, punched files, sub-programs; text as it was decoded, NUL bytes included.
+    tables : the variables that are wanted, without ``$``, and how many indices each has.
+    findings : gets what is passed over.
+    """
+    items: dict[tuple[str, tuple[str, ...]], Assignment] = {}
+    machine_data: dict[tuple[str, tuple[str, ...]], Assignment] = {}
+    for source in files:
+        parts = _parts(source)
+        archive = len(parts) > 1
+        for part in _with_data(source, parts, findings):
+            beside = archive and not part.writes_tables
+            if archive and part is parts[-1] and part.kind == "INI" and not part.has_end:
+                message = (
+                    f"the archive ends within {part.name}.{part.kind}: it was cut, and its switches are not all there"
+                )
+                raise source.fail(message, part.lines[-1][0])
+            for item in _assignments_of_part(source, part, tables, findings, archive=archive):
+                key = item.variable, item.index
+                if item.variable in SWITCHES:
+                    (machine_data if beside else items)[key] = item
+                    continue
+                first = items.setdefault(key, item)
+                if first is not item and first.value != item.value:
+                    raise item.fail(
+                        f"is given a second value; the first is in {first.source.path.name}, line {first.line}"
+                    )
+    if not any(item.variable not in SWITCHES for item in items.values()):
+        wanted = " or ".join(f"${name}" for name in tables if name in ("AN_CEC", "AA_ENC_COMP"))
+        raise files[0].fail(f"holds no table ({wanted})")
+    return ArchiveAssignments(list(items.values()), machine_data)
+
+
+def _with_data(source: SourceFile, parts: list[_ArchivePart], findings: ArchiveFindings) -> list[_ArchivePart]:
+    """The parts to be read: the only one, or the initialisation files of an archive; the others are counted."""
+    if len(parts) == 1:
+        return parts
+    chosen = [part for part in parts if part.kind in DATA_KINDS]
+    others = [part for part in parts if part.kind not in DATA_KINDS]
+    writing = [f"{part.name}.{part.kind}" for part in others if part.writes_tables]
+    if writing and not any(part.writes_tables for part in chosen):
+        raise source.fail(f"tables stand in programs only ({_few(writing)}): give such a program as a file of its own")
+    if others := [part for part in others if part.name]:
+        named = f" (programs that write tables, not run here: {_few(writing)})" if writing else ""
+        findings.count(f"other files of the archive{named}", len(others))
+    return chosen
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _parts(source: SourceFile) -> list[_ArchivePart]:
+    """The files that a text holds, split where NUL bytes or ``%_N_..`` lines name the next one."""
+    found: list[_ArchivePart] = []
+    name, kind = "", ""
+    lines: list[tuple[int, str]] = []
+    text = source.text.replace("\r\n", "\n").replace("\r", "\n")
+    for number, line in enumerate(text.split("\n"), start=1):
+        head, nul, rest = line.rpartition("\0")
+        names = _NAME.findall(head) if nul else _TEXT_HEADER.findall(line.upper()[:120])
+        if names or nul:  # NUL bytes without a name stand before what is no file of the control's memory (drives)
+            found.append(_ArchivePart(name, kind, tuple(lines)))
+            (name, kind), lines = names[-1] if names else ("", ""), []
+        if nul or not names:
+            code = rest if nul else line
+            if code.strip():
+                lines.append((number, code))
+    found.append(_ArchivePart(name, kind, tuple(lines)))
+    return [part for part in found if any(not code.lstrip().startswith(";") for _, code in part.lines)]
+
+
+def _assignments_of_part(
+    source: SourceFile, part: _ArchivePart, tables: Mapping[str, int], findings: ArchiveFindings, *, archive: bool
+) -> Iterator[Assignment]:
+    """Assignments of one part that matter; the others are counted, what is not understood is refused."""
+    ended, any_table, number = False, False, 0
+    for number, line in part.lines:
+        code = _BLOCK_NUMBER.sub("", line.partition(";")[0].strip().upper(), count=1)
+        if not code or _TEXT_HEADER.match(code):
+            continue
+        if _END_WORD.fullmatch(code):
+            ended = True
+            continue
+        match = _ARCHIVE_ASSIGNMENT.fullmatch(" ".join(code.split())) if code.startswith("$") else None
+        if match is None:
+            _check_word(source, number, code, archive=archive)
+            if archive:
+                findings.count("other lines")
+            continue
+        item = _item(source, number, match, tables, findings)
+        if item is not None:
+            if item.variable not in SWITCHES:
+                any_table, ended = True, False
+            yield item
+    if any_table and not ended:
+        raise source.fail("the end mark (M17, M30) behind the tables is missing: the file is truncated", number)
+
+
+def _check_word(source: SourceFile, number: int, code: str, *, archive: bool) -> None:
+    """Refuse what is no assignment and could change a table: inch, jumps, calculations, anything with a table in it."""
+    if _INCH_WORD.fullmatch(code):
+        raise source.fail(f"{code!r}: the file is in inch; tables are read in mm only", number)
+    if _IDLE_WORD.fullmatch(code):
+        return
+    if not archive or _MENTIONS_TABLE.search(code):
+        raise source.fail(
+            f"{one_line(code)[:60]!r} is not understood, and it could change a table; give the archive of the control, or "
+            "its NC_CEC.INI or AX_EEC.INI, or take the line out if it has no bearing on the tables",
+            number,
+        )
+
+
+def _item(
+    source: SourceFile, number: int, match: re.Match[str], tables: Mapping[str, int], findings: ArchiveFindings
+) -> Assignment | None:
+    """One assignment if it is of the wanted tables; None for what is passed over."""
+    variable, index_text, value = match.group(1), match.group(2) or "", match.group(3).strip()
+    index = tuple(_plain(word) for word in re.split(r"[,.]", index_text)) if index_text.strip() else ()
+    item = Assignment(variable, index, _plain_value(value)[0], source, number)
+    if variable in tables or variable in SWITCHES:
+        count = tables.get(variable) or SWITCHES[variable]
+        if len(index) != count or not all(index):
+            raise source.fail(f"${variable} has {count} indices; got [{one_line(index_text)[:40]}]", number)
+        if variable in tables:
+            if what := _plain_value(value)[1]:
+                findings.count(what)
+            return item
+        findings.count("switches of other tables")
+        return None
+    if variable in HARMLESS:
+        allowed = HARMLESS[variable]
+        if allowed is not None and item.value not in allowed and value not in allowed:
+            raise item.fail(f"{one_line(value)[:30]!r} is not understood; {' or '.join(allowed[:1])} is")
+        findings.count("machine data beside the tables")
+        return None
+    if _OTHER_CEC.fullmatch(variable) and item.value in ("0", "0.0", "FALSE"):
+        findings.count("machine data beside the tables")
+        return None
+    other_table = variable.startswith(("AN_CEC", "AA_ENC_COMP"))
+    if other_table and _is_table(variable):
+        findings.count("values of tables of the other kind (CEC, EEC)")
+        return None
+    if "CEC" in variable or "ENC_COMP" in variable:
+        raise item.fail("is not known here, and it could change a table")
+    if variable.startswith("MA_BACKLASH"):
+        findings.count("lines of $MA_BACKLASH, which is no table and is not taken out")
+        return None
+    findings.count("other machine data")
+    return None
+
+
+_TABLE_VARIABLES = (
+    "",
+    "_STEP",
+    "_MIN",
+    "_MAX",
+    "_IS_MODULO",
+    "_INPUT_AXIS",
+    "_OUTPUT_AXIS",
+    "_DIRECTION",
+    "_MULT_BY_TABLE",
+)
+
+
+def _is_table(variable: str) -> bool:
+    """Whether a variable is one of the tables of either kind."""
+    return any(variable == head + tail for head in ("AN_CEC", "AA_ENC_COMP") for tail in _TABLE_VARIABLES)
+
+
+def _plain(word: str) -> str:
+    """An index without blanks and leading zeros."""
+    text = word.strip()
+    return str(int(text)) if text.isdigit() and len(text) < 10 else text
+
+
+def _plain_value(value: str) -> tuple[str, str]:
+    """A value as the control writes it (1 for TRUE, a point, no exponent), and what was unusual about it."""
+    if value in _TRUTH:
+        return _TRUTH[value], ""
+    if _COMMA_NUMBER.fullmatch(value):
+        return value.replace(",", "."), "decimal commas"
+    exponent = _ARCHIVE_EXPONENT.fullmatch(value)
+    if exponent and abs(int(exponent.group(2))) <= _LONGEST_EXPONENT:
+        return f"{Decimal(exponent.group(1)).scaleb(int(exponent.group(2))):f}", "numbers with an exponent"
+    return value, ""

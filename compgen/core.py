@@ -1,0 +1,15 @@
+"""Former home of the reader of settings: import :mod:`compgen.data.toml_files`. Goes with the next minor version."""
+
+import sys
+import warnings
+
+from compgen.data import toml_files as tomlio
+
+__all__ = ["tomlio"]
+
+warnings.warn(
+    "compgen.core.tomlio is now compgen.data.toml_files; the old name goes with the next minor version",
+    DeprecationWarning,
+    stacklevel=2,
+)
+sys.modules[f"{__name__}.tomlio"] = tomlio

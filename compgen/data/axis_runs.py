@@ -1,0 +1,247 @@
+"""Positioning runs along single axes (ISO 230-2) and along diagonals (ISO 230-6): records, readers, writers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import CsvTable, FloatArray
+from compgen.data.messages import repeated
+from compgen.data.names import AXES
+from compgen.data.records import AXIS, DIRECTION, POSITION, RUN, RUN_DEVIATION, Field, Schema, fail_at
+from compgen.errors import InputError
+
+# Positioning runs along single axes (ISO 230-2): ``*.axis.csv``.
+
+
+@dataclass(frozen=True)
+class AxisRuns:
+    """Actual minus target position along the axis that moves, n readings.
+
+    Parameters
+    ----------
+    axis : axis of each reading, 0, 1, 2 for X, Y, Z, shape (n,).
+    position_mm : target positions, shape (n,).
+    direction : direction of approach, +1 or -1, shape (n,).
+    run : number of the run; the two ways of a cycle may have the same, shape (n,).
+    deviation_mm : actual minus target, shape (n,).
+    covariates : further numbers by column name (time_s, temp_..._c), each of shape (n,); nan where a file lacks one.
+    metadata : comments ``key = value`` of the file.
+    origin : (file, line) of each row, for messages.
+    """
+
+    axis: NDArray[np.int64]
+    position_mm: FloatArray
+    direction: NDArray[np.int64]
+    run: NDArray[np.int64]
+    deviation_mm: FloatArray
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    origin: Sequence[tuple[str, int]] = ()
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.position_mm)
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """Axes that were measured, ascending."""
+        return tuple(int(axis) for axis in np.unique(self.axis))
+
+
+_AXIS_RUNS = Schema(
+    (
+        AXIS,
+        Field("position_mm", ("position_mm",)),
+        DIRECTION,
+        RUN,
+        RUN_DEVIATION,
+        # time, number of the reading in the order of time, time at rest before it, speed on the way to it
+        Field("covariates", ("time_s", "order", "dwell_s", "feed_mm_min"), presence="covariates"),
+    )
+)
+
+
+def read_axis_runs(files: str | Path | Sequence[str | Path]) -> AxisRuns:
+    """Read one or more ``*.axis.csv`` files into one :class:`AxisRuns`, um to mm.
+
+    Raises
+    ------
+    InputError
+        for an axis that is not X, Y, Z, a direction that is not 1 or -1, a reading that comes twice.
+    """
+    return join_axis_runs([AxisRuns(**_AXIS_RUNS.values(table)) for table in _AXIS_RUNS.read_tables(files)])
+
+
+def join_axis_runs(parts: Sequence[AxisRuns]) -> AxisRuns:
+    """Return several records as one; InputError for a reading that comes twice."""
+    runs = _AXIS_RUNS.joined(parts)
+    check_single(runs)
+    return runs
+
+
+def check_single(runs: AxisRuns) -> None:
+    """One axis has one reading for each target, direction and run; InputError that names the second one."""
+    keys = list(
+        zip(runs.axis.tolist(), runs.position_mm.tolist(), runs.direction.tolist(), runs.run.tolist(), strict=True)
+    )
+    found = repeated(keys)
+    if found is not None:
+        axis, at, direction, run = keys[found[1]]
+        raise _second(runs, found, f"{AXES[axis]} at {at:g} mm, direction {direction}, run {run}")
+
+
+def _second(runs: AxisRuns | Diagonals, rows: tuple[int, int], what: str, field: str | None = None) -> InputError:
+    """The error about a reading that came before, with both places."""
+    first, row = rows
+    where = f"{runs.origin[first][0]}:{runs.origin[first][1]}" if runs.origin else "an earlier row"
+    return fail_at(runs.origin, row, f"{what} already appears in {where}; number the runs", field)
+
+
+def format_axis_runs(runs: AxisRuns) -> str:
+    """Return the text of an ``*.axis.csv`` file: positions with 6 decimals (1 nm), deviations in um with 4."""
+    return _AXIS_RUNS.format(runs, runs.metadata)
+
+
+# Measured diagonals of the working volume (ISO 230-6): ``*.diagonals.csv``.
+
+
+#: Body diagonals, and face diagonals with 0 for the axis that stands: directions of X, Y, Z from start to end.
+BODY_DIAGONALS = {"PPP": (1, 1, 1), "NPP": (-1, 1, 1), "PNP": (1, -1, 1), "NNP": (-1, -1, 1)}
+FACE_DIAGONALS = {
+    "PP0": (1, 1, 0),
+    "NP0": (-1, 1, 0),
+    "P0P": (1, 0, 1),
+    "N0P": (-1, 0, 1),
+    "0PP": (0, 1, 1),
+    "0NP": (0, -1, 1),
+}
+DIAGONALS = {**BODY_DIAGONALS, **FACE_DIAGONALS}
+#: How far from the line between its ends a commanded position may lie, mm.
+OFF_LINE_MM = 0.01
+
+
+@dataclass(frozen=True)
+class Diagonals:
+    """Measured minus commanded distance along diagonals, n readings.
+
+    Parameters
+    ----------
+    name : diagonal of each reading (PPP ... NNP, PP0 ...), n long.
+    position_mm : commanded positions, shape (n, 3).
+    direction : +1 from the start of the diagonal to its end as its name says, -1 back, shape (n,).
+    run : number of the run; the two ways of a cycle may have the same, shape (n,).
+    deviation_mm : measured minus commanded distance; a constant for each diagonal does not count, shape (n,).
+    covariates : further numbers by column name (time_s, temp_..._c), each of shape (n,); nan where a file lacks one.
+    metadata : comments ``key = value`` of the file.
+    origin : (file, line) of each row, for messages.
+    """
+
+    name: tuple[str, ...]
+    position_mm: FloatArray
+    direction: NDArray[np.int64]
+    run: NDArray[np.int64]
+    deviation_mm: FloatArray
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    origin: Sequence[tuple[str, int]] = ()
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.position_mm)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Diagonals that were measured, the body diagonals first."""
+        return tuple(name for name in DIAGONALS if name in set(self.name))
+
+    def rows(self, name: str) -> NDArray[np.int64]:
+        """Return the rows of one diagonal."""
+        return np.flatnonzero(np.array(self.name) == name)
+
+
+def _names(table: CsvTable, column: str) -> list[str]:
+    names = table.text(column)
+    for row, name in enumerate(names):
+        if name not in DIAGONALS:
+            known = f"{', '.join(BODY_DIAGONALS)}; of faces {', '.join(FACE_DIAGONALS)}"
+            raise table.fail(row, column, f"{name!r} is not a diagonal; use {known}")
+    return names
+
+
+_DIAGONALS = Schema(
+    (
+        Field("name", ("diagonal",), _names),
+        POSITION,
+        DIRECTION,
+        RUN,
+        RUN_DEVIATION,
+        Field("covariates", ("time_s",), presence="covariates"),
+    )
+)
+
+
+def read_diagonals(files: str | Path | Sequence[str | Path]) -> Diagonals:
+    """Read one or more ``*.diagonals.csv`` files into one :class:`Diagonals`, um to mm.
+
+    Raises
+    ------
+    InputError
+        for an unknown diagonal, a direction that is not 1 or -1, a reading that comes twice, positions that do not lie on
+        a line in the direction that the name of the diagonal says.
+    """
+    found = _DIAGONALS.joined([Diagonals(**_DIAGONALS.values(table)) for table in _DIAGONALS.read_tables(files)])
+    found = replace(found, name=tuple(found.name))
+    check_lines(found)
+    places = map(tuple, np.round(found.position_mm, 3).tolist())
+    twice = repeated(zip(found.name, places, found.direction.tolist(), found.run.tolist(), strict=True))
+    if twice is not None:
+        k = twice[1]
+        what = f"{found.name[k]} at {_place(found.position_mm[k])}, direction {found.direction[k]}, run {found.run[k]}"
+        raise _second(found, twice, what, "column diagonal")
+    return found
+
+
+def along_mm(position_mm: FloatArray, name: str) -> FloatArray:
+    """Distance (n,) of positions (n, 3) on a diagonal from its start: the one that comes first in the name's direction."""
+    signs = np.array(DIAGONALS[name], dtype=np.float64)
+    start = position_mm[int(np.argmin(position_mm @ signs))]
+    return np.asarray(np.linalg.norm(position_mm - start, axis=1))
+
+
+def edges_mm(position_mm: FloatArray) -> FloatArray:
+    """Extent (3,) of the positions of a diagonal in X, Y, Z: the edges of its box."""
+    return np.asarray(np.ptp(position_mm, axis=0))
+
+
+def check_lines(diagonals: Diagonals) -> None:
+    """Every diagonal lies on a line in the direction of its name; InputError that names the first position that does not."""
+    for name in diagonals.names:
+        rows = diagonals.rows(name)
+        points, signs = diagonals.position_mm[rows], np.array(DIAGONALS[name], dtype=np.float64)
+        order = np.argsort(points @ signs, kind="stable")
+        way = points[order[-1]] - points[order[0]]
+        if np.any(np.sign(np.where(np.abs(way) <= OFF_LINE_MM, 0.0, way)) != signs):
+            ends = " to ".join(_place(points[order[k]]) for k in (0, -1))
+            text = f"{name} goes from {ends}; its letters say the directions of X, Y, Z (P up, N down, 0 does not move)"
+            raise fail_at(diagonals.origin, int(rows[order[-1]]), text, "column diagonal")
+        unit = way / np.linalg.norm(way)
+        apart = points - points[order[0]]
+        off = np.linalg.norm(apart - np.outer(apart @ unit, unit), axis=1)
+        if off.max() > OFF_LINE_MM:
+            row = int(np.argmax(off))
+            text = f"{_place(points[row])} lies {off[row]:.3g} mm off the line between the ends of {name}"
+            raise fail_at(diagonals.origin, int(rows[row]), text, "column diagonal")
+
+
+def _place(point: FloatArray) -> str:
+    return f"({', '.join(f'{value:g}' for value in point)}) mm"
+
+
+def format_diagonals(diagonals: Diagonals) -> str:
+    """Return the text of a ``*.diagonals.csv`` file: positions with 6 decimals (1 nm), deviations in um with 4."""
+    return _DIAGONALS.format(diagonals, diagonals.metadata)

@@ -1,0 +1,389 @@
+"""The CSV dialect of native files: comma, a header, ``# key = value`` comments, strict numbers.
+
+A text is split into fields (:func:`parse_plain` for files as programs write them, :func:`parse_any` for all others),
+becomes a :class:`CsvTable` whose columns are checked as they are asked for, and :func:`format_csv` writes the same dialect.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.files import read_text
+from compgen.data.messages import doubled, nearest, visible_line
+from compgen.data.names import LARGEST, SMALLEST
+from compgen.errors import CompgenWarning, InputError
+
+#: Quotes, comments and all white space of ASCII but the line feed.
+_NOT_PLAIN = '"#\0\r\t\v\f \x1c\x1d\x1e\x1f'
+
+
+@dataclass(frozen=True)
+class CsvFile:
+    """The contents of a file: its header, and the fields either by row or, one after the other, in ``flat``."""
+
+    header_line: int
+    header: list[str]
+    lines: Sequence[int]
+    metadata: dict[str, str]
+    rows: list[list[str]] | None = None
+    flat: list[str] = field(default_factory=list)
+
+    def column(self, k: int) -> list[str]:
+        """Return the fields of one column."""
+        if self.rows is None:
+            return self.flat[k :: len(self.header)]
+        return [row[k].strip() for row in self.rows]
+
+
+def parse_plain(content: str) -> CsvFile | None:
+    """Read a file as programs write it, several times faster than :func:`parse_any`; None if it is not one.
+
+    Such a file is ASCII without quotes or spaces below its header, has at least two columns, the
+    same number in each row, no comment between rows, and ends with a line end.
+    """
+    unix = content.replace("\r\n", "\n")
+    metadata: dict[str, str] = {}
+    start = number = 0
+    header = ""
+    while not header:
+        end = unix.find("\n", start)
+        if end < 0:
+            return None
+        line, start, number = unix[start:end].strip(), end + 1, number + 1
+        if not _note_metadata(line, metadata):
+            header = line
+    names, body = [name.strip() for name in header.split(",")], unix[start:]
+    if any(mark in unix[:start] for mark in "\r\0") or '"' in header or any(mark in body for mark in _NOT_PLAIN):
+        return None
+    count = _even_rows(body, len(names)) if body.isascii() and body.endswith("\n") else None
+    if count is None or len(names) < 2:
+        return None
+    flat = body[:-1].replace("\n", ",").split(",")
+    return CsvFile(number, names, range(number + 1, number + 1 + count), metadata, flat=flat)
+
+
+def _even_rows(body: str, width: int) -> int | None:
+    """Number of rows if every row of ``body`` has ``width`` fields of a reasonable length, else None."""
+    text = np.frombuffer(body.encode("ascii"), dtype=np.uint8)
+    ends = np.flatnonzero((text == ord(",")) | (text == ord("\n")))
+    if len(ends) % width or np.diff(ends, prepend=-1).max() > csv.field_size_limit():
+        return None
+    is_line_end = text[ends].reshape(-1, width) == ord("\n")
+    return len(is_line_end) if is_line_end[:, -1].all() and not is_line_end[:, :-1].any() else None
+
+
+def _note_metadata(line: str, metadata: dict[str, str]) -> bool:
+    """Whether a stripped line is a comment or empty; a comment ``# key = value`` goes to ``metadata``."""
+    if line.startswith("#"):
+        key, equals, value = line.lstrip("#").partition("=")
+        if equals and value.strip():  # a date that nobody filled in is not a date
+            metadata[key.strip()] = value.strip()
+        return True
+    return not line
+
+
+def parse_any(source: Path, content: str) -> CsvFile:
+    """Read any file of the dialect, line by line."""
+    metadata: dict[str, str] = {}
+    numbers: list[int] = []
+    data: list[str] = []
+    for number, line in enumerate(re.split(r"\r\n|\r|\n", content), start=1):
+        if not _note_metadata(line.strip(), metadata):
+            numbers.append(number)
+            data.append(line)
+    if not data:
+        return CsvFile(0, [], [], metadata, rows=[])
+    if "\0" in content:
+        raise InputError("holds NUL bytes; it is not a text file", file=source)
+    reader = csv.reader(data, strict=True, skipinitialspace=True)
+    try:
+        parsed = list(reader)
+    except csv.Error as error:
+        line_number = numbers[max(reader.line_num, 1) - 1]
+        raise InputError(f"is not readable as CSV: {error}", file=source, line=line_number) from error
+    if len(parsed) != len(data):
+        raise InputError("a quoted field runs over a line end; write each row on one line", file=source)
+    header = [name.strip() for name in parsed[0]]
+    return CsvFile(numbers[0], header, numbers[1:], metadata, rows=parsed[1:])
+
+
+# The CSV dialect of the contract: comma, header, ``#`` comments with ``key = value`` metadata, strict numbers.
+
+
+FloatArray = NDArray[np.float64]
+_LARGEST_LABEL = 2.0**53
+_ROWS_AT_ONCE = 10_000
+#: A spreadsheet takes a cell that begins so for a formula, and in a comment what follows a comma.
+_FORMULA = re.compile(r"'*[=+\-@]")
+_IN_COMMENT = re.compile(r"(?<=[,;])(?=[=+\-@])")
+#: Columns that a header may have; characters of it that a message shows; columns left out that are named each.
+MOST_COLUMNS, _SHOWN, _NAMED = 10_000, 200, 20
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """The rows of one CSV file as columns of text; numbers are converted, and checked, on request.
+
+    ``lines`` holds the line number of each row, ``metadata`` the ``# key = value`` comments.
+    """
+
+    path: Path
+    columns: Mapping[str, Sequence[str]]
+    lines: Sequence[int]
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.lines)
+
+    def fail(self, row: int, column: str, message: str) -> InputError:
+        """Return the error that points at one cell."""
+        return InputError(message, file=self.path, line=self.lines[row], field=f"column {column}")
+
+    def text(self, column: str) -> list[str]:
+        """Return a column of labels, as :func:`format_csv` was given them; an empty cell is an error."""
+        cells = self.columns[column]
+        for row, cell in enumerate(cells):
+            if not cell:
+                raise self.fail(row, column, "is empty; every row needs a label here")
+        return [cell[1:] if cell[0] == "'" and _FORMULA.match(cell) else cell for cell in cells]
+
+    def names(self, column: str) -> list[str]:
+        """Return a column of names of stations: labels without "=", which separates a name from its value elsewhere."""
+        found = self.text(column)
+        if "=" in "".join(found):
+            row = next(k for k, name in enumerate(found) if "=" in name)
+            raise self.fail(
+                row, column, f"{visible_line(found[row])[:40]!r} is not a name: '=' is not allowed; leave it out"
+            )
+        return found
+
+    def numbers(self, column: str, *, empty: float | None = None, most: float = LARGEST) -> FloatArray:
+        """Return a column as finite numbers up to ``most``, shape (rows,); empty cells become ``empty`` if it is given."""
+        cells = self.columns[column]
+        filled = list(cells) if empty is None else [cell or repr(empty) for cell in cells]
+        try:
+            values = np.array(filled, dtype=np.float64)
+        except ValueError:
+            raise self._bad_number(column, filled) from None
+        together = "".join(filled)
+        if "_" in together or not together.isascii():  # Python reads 1_000 and digits of other scripts; a file may not
+            raise self._bad_number(column, filled)
+        if not (np.abs(values) <= most).all():
+            row = next((k for k in range(len(cells)) if cells[k] and not abs(values[k]) <= most), None)
+            if row is not None:
+                finite = math.isfinite(values[row])
+                what = (
+                    f"is larger than {most:g}, the largest number that is read" if finite else "is not a finite number"
+                )
+                raise self.fail(row, column, f"{cells[row]!r} {what}")
+        values[np.abs(values) < SMALLEST] = 0.0  # nobody measured that, and its square would be no number
+        return values
+
+    def _bad_number(self, column: str, cells: Sequence[str]) -> InputError:
+        for row, cell in enumerate(cells):
+            if not _is_number(cell):
+                what = "is empty" if not cell else f"{visible_line(cell)[:40]!r} is not a number"
+                return self.fail(row, column, f"{what}; expected a number with '.' as decimal point")
+        return InputError("holds text; expected numbers", file=self.path, field=f"column {column}")
+
+    def labels(self, column: str) -> NDArray[np.int64]:
+        """Return a column of whole-number labels, shape (rows,)."""
+        values = self.numbers(column, most=np.finfo(np.float64).max)
+        wrong = np.flatnonzero((values != np.round(values)) | (np.abs(values) > _LARGEST_LABEL))
+        if wrong.size:
+            row = int(wrong[0])
+            raise self.fail(row, column, f"{self.columns[column][row]!r} is not a whole number below 2^53")
+        return values.astype(np.int64)
+
+    def signs(self, column: str) -> FloatArray:
+        """Return a column of directions of travel, +1, -1 or 0 (unknown), shape (rows,)."""
+        values = self.numbers(column)
+        wrong = np.flatnonzero(~np.isin(values, (-1.0, 0.0, 1.0)))
+        if wrong.size:
+            row = int(wrong[0])
+            raise self.fail(row, column, f"{self.columns[column][row]!r} is not a direction; expected 1, -1 or 0")
+        return values
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return cell.isascii() and "_" not in cell
+
+
+def names_in_header(text: str) -> set[str]:
+    """Return the names in the first line of a text that is not a comment; empty without one."""
+    lines = (line.strip() for line in text.splitlines())
+    header = next((line for line in lines if line and not line.startswith("#")), "")
+    return {name.strip().strip('"') for name in header.split(",")}
+
+
+def read_csv(
+    path: str | Path, required: Iterable[str], optional: Iterable[str] = (), prefixes: Iterable[str] = ()
+) -> CsvTable:
+    """Read a CSV file strictly.
+
+    Parameters
+    ----------
+    path : the file.
+    required, optional : column names; others are left out with a warning.
+    prefixes : further allowed columns begin with one of these (e.g. ``temp_``), or match one that holds a ``*``.
+
+    Raises
+    ------
+    InputError
+        for an empty file, a missing or doubled column, a row with too few or too many fields, a truncated last line.
+    """
+    return csv_table(Path(path), read_text(path), required, optional, prefixes)
+
+
+def csv_table(
+    source: Path, content: str, required: Iterable[str], optional: Iterable[str] = (), prefixes: Iterable[str] = ()
+) -> CsvTable:
+    """Read the text ``content`` of the file ``source`` as :func:`read_csv` does."""
+    required, prefixes = list(required), tuple(prefixes)
+    known = {*required, *optional}
+    file = parse_plain(content) or parse_any(source, content)
+    if not file.header:
+        raise InputError(f"is empty; expected a header line with {', '.join(required)}", file=source)
+    _check_header(source, file.header_line, file.header, required)
+    if not file.lines:
+        raise InputError("has a header but no rows", file=source, line=file.header_line)
+    if file.rows is not None:
+        for row, line in zip(file.rows, file.lines, strict=True):
+            if len(row) != len(file.header):
+                last = " (the last line: is the file truncated?)" if line == file.lines[-1] else ""
+                message = f"has {len(row)} fields, the header has {len(file.header)}{last}"
+                raise InputError(message, file=source, line=line)
+    _check_complete(source, content, file)
+    _warn_left_out(
+        f"{source}:{file.header_line}", [name for name in file.header if not _is_allowed(name, known, prefixes)], known
+    )
+    kept = {k: name for k, name in enumerate(file.header) if _is_allowed(name, known, prefixes)}
+    return CsvTable(source, {name: file.column(k) for k, name in kept.items()}, file.lines, file.metadata)
+
+
+def _warn_left_out(place: str, names: list[str], known: set[str]) -> None:
+    for name in names[:_NAMED]:
+        message = f"column {_shown(name)!r} is unknown and ignored; {nearest(name[:_SHOWN], known)}"
+        warnings.warn(f"{place}: {message}", CompgenWarning, stacklevel=5)
+    if len(names) > _NAMED:
+        warnings.warn(f"{place}: {len(names) - _NAMED} more columns are ignored", CompgenWarning, stacklevel=5)
+
+
+def _shown(text: str) -> str:
+    """Return the beginning of a user's text on one line: a message does not repeat megabytes."""
+    return visible_line(text[: 2 * _SHOWN])[:_SHOWN] + (" ..." if len(text) > _SHOWN else "")
+
+
+def _is_allowed(name: str, known: set[str], patterns: tuple[str, ...]) -> bool:
+    return name in known or any(fnmatchcase(name, p if "*" in p else f"{p}*") for p in patterns)
+
+
+def _check_header(source: Path, line: int, header: list[str], required: list[str]) -> None:
+    if len(header) > MOST_COLUMNS:
+        message = f"the header has {len(header)} columns; at most {MOST_COLUMNS} are read: is this a table?"
+        raise InputError(message, file=source, line=line)
+    twice = doubled(header)
+    if twice is not None:
+        raise InputError(f"the header names {_shown(twice)!r} twice", file=source, line=line)
+    missing = [name for name in required if name not in header]
+    if missing:
+        needed, present = ", ".join(required), _shown(", ".join(header))
+        hint = "; separate columns by commas" if len(header) == 1 and re.search(r"[;\t]", header[0]) else ""
+        message = f"column {missing[0]!r} is missing; needed are {needed}; the header has {present}{hint}"
+        raise InputError(message, file=source, line=line)
+
+
+def _check_complete(source: Path, content: str, file: CsvFile) -> None:
+    """A file that was cut is refused: by what it declares, or by a shorter last number without line end.
+
+    A file that declares its rows was written by a program and ends with a line end; one that does not may lack it.
+    """
+    declared, count, last_line = file.metadata.get("rows"), len(file.lines), file.lines[-1]
+    if declared is not None and declared != str(count):
+        raise InputError(f"declares {visible_line(declared)} rows but holds {count}: is it truncated?", file=source)
+    if content.endswith(("\n", "\r")):
+        return
+    if declared is not None:
+        message = "the last line has no line end: the file is truncated; if it is complete, end the line"
+        raise InputError(message, file=source, line=last_line)
+    *before, last = [len(cell.partition(".")[2]) for cell in file.column(len(file.header) - 1)]
+    if len(before) > 1 and last < min(before):
+        message = "the last line has no line end and fewer decimals than the others: the file is truncated"
+        raise InputError(message, file=source, line=last_line)
+
+
+def format_csv(
+    columns: Mapping[str, Sequence[str] | FloatArray],
+    metadata: Mapping[str, object] | None = None,
+    decimals: Mapping[str, int] | None = None,
+) -> str:
+    """Return CSV text with ``# key = value`` comments, the number of rows among them, and a final line end.
+
+    Numbers are written with ``decimals`` digits after the point (6 if not given), text as it is; but a label that a
+    spreadsheet would take for a formula gets an apostrophe before it, which :meth:`CsvTable.text` takes off again.
+    """
+    digits = decimals or {}
+    parts = [_template(values, digits.get(name, 6)) for name, values in columns.items()]
+    rows = max((len(cells) for _, cells in parts), default=0)
+    if any(len(cells) != rows for _, cells in parts):
+        raise ValueError(f"columns differ in length: {', '.join(f'{k} {len(v)}' for k, v in columns.items())}")
+    facts = {**(metadata or {}), "rows": rows}
+    noted = [f"# {visible_line(key)} = {visible_line(value)}" for key, value in facts.items()]
+    comments = [_IN_COMMENT.sub(" ", line) for line in noted]
+    row = ",".join(template for template, _ in parts) + "\n"
+    text = ["\n".join([*comments, ",".join(columns)]), "\n"]
+    for start in range(0, rows, _ROWS_AT_ONCE):
+        block = [cells[start : start + _ROWS_AT_ONCE] for _, cells in parts]
+        text.append(row * len(block[0]) % tuple(chain.from_iterable(zip(*block, strict=True))))
+    return "".join(text)
+
+
+def _template(values: Sequence[str] | FloatArray, digits: int) -> tuple[str, Sequence[str] | Sequence[float]]:
+    """Conversion of a column for the ``%`` operator, and what it converts."""
+    if not isinstance(values, np.ndarray):
+        return "%s", [_quoted(str(value)) for value in values]
+    numbers = np.array(values, dtype=np.float64)
+    if not np.isfinite(numbers).all():
+        return "%s", [fixed(value, digits) for value in numbers.tolist()]
+    for k in np.flatnonzero(np.signbit(numbers) & (numbers > -(10.0**-digits))):
+        if float(fixed(float(numbers[k]), digits)) == 0.0:
+            numbers[k] = 0.0  # no negative zero
+    return f"%.{digits}f", numbers.tolist()
+
+
+def _quoted(cell: str) -> str:
+    """Return a label as a cell: one line, in quotes where it needs them, and never a formula for a spreadsheet."""
+    flat = " ".join(cell.split())
+    if _FORMULA.match(flat) and flat not in ("+", "-") and not _is_number(flat):
+        flat = f"'{flat}"
+    return '"' + flat.replace('"', '""') + '"' if any(char in flat for char in ',"#') else flat
+
+
+def fixed(value: float, digits: int) -> str:
+    """Return ``value`` in fixed-point notation without exponent and without a negative zero.
+
+    >>> fixed(-0.0000001, 3), fixed(12.5, 2), fixed(float("nan"), 2)
+    ('0.000', '12.50', '')
+    """
+    if math.isnan(value):
+        return ""
+    if math.isinf(value):
+        raise ValueError("an infinite number cannot be written to a table")
+    text = f"{value:.{digits}f}"
+    return text[1:] if text.startswith("-") and not text.strip("-0.") else text

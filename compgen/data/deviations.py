@@ -1,0 +1,308 @@
+"""Positions measured against commanded ones: deviations, and features of parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import CsvTable, FloatArray
+from compgen.data.display import Displayed, Overview, ranges_of
+from compgen.data.names import MM_PER_UM
+from compgen.data.records import (
+    APPROACH,
+    COVARIATES,
+    DEVIATION_COLUMNS,
+    LABELS,
+    MEASURED_COLUMNS,
+    POSITION,
+    POSITION_COLUMNS,
+    TOOL,
+    Field,
+    Schema,
+    deviations_um,
+    uncertainties,
+)
+from compgen.errors import InputError
+
+__all__ = [
+    "DEVIATION_COLUMNS",
+    "PART",
+    "Deviations",
+    "RoughPose",
+    "aligned",
+    "format_deviations",
+    "read_deviations",
+    "read_parts",
+    "setups_of",
+]
+
+# Positions measured against commanded ones: ``*.deviations.csv``.
+
+
+@dataclass(frozen=True)
+class RoughPose:
+    """Where a frame lies in another: measured - ``measured_mm`` = ``rotation`` (nominal - ``nominal_mm``), (3,), (3, 3)."""
+
+    nominal_mm: FloatArray
+    measured_mm: FloatArray
+    rotation: FloatArray
+
+
+@dataclass(frozen=True, repr=False)
+class Deviations(Displayed):
+    """Actual minus commanded position of the tool tip, at n positions.
+
+    Parameters
+    ----------
+    position_mm : commanded positions, shape (n, 3).
+    deviation_mm : actual tip minus (position + tool offset), shape (n, 3); nan for a component that was not measured.
+    u_mm : standard uncertainty of each component, shape (n, 3), or None if it is not known.
+    tool_mm : tool offset of each row, shape (n, 3), or None for the machine's own.
+    approach : last direction of travel of each axis (+1, -1, 0 unknown), shape (n, 3), or None.
+    labels : whole-number labels by column name (run, line, repeat, block, setup, pose), each of shape (n,).
+    covariates : further numbers by column name (``time_s``, ``temp_...``, ...), each of shape (n,).
+    metadata : comments ``key = value`` of the file.
+    origin : (file, line) of each row, for messages.
+    poses : by set-up, the pose that was taken out of the coordinates of a part; empty for deviations as they were measured.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> deviations = compgen.Deviations(np.zeros((1, 3)), np.array([[2e-3, np.nan, 0.0]]))  # dy was not measured
+    >>> deviations
+    <Deviations: 1 positions with dx, dz>
+    """
+
+    position_mm: FloatArray
+    deviation_mm: FloatArray
+    u_mm: FloatArray | None = None
+    tool_mm: FloatArray | None = None
+    approach: FloatArray | None = None
+    labels: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    origin: Sequence[tuple[str, int]] = ()
+    poses: Mapping[int, RoughPose] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Return the number of positions."""
+        return len(self.position_mm)
+
+    def overview(self) -> Overview:
+        """Number of the positions, the components that were measured, and the box that holds them."""
+        found = [
+            f"d{letter}"
+            for letter, column in zip("xyz", self.deviation_mm.T, strict=True)
+            if not np.isnan(column).all()
+        ]
+        title = f"{len(self)} positions with {', '.join(found)}"
+        return Overview(title, ("axis", "from (mm)", "to (mm)"), ranges_of(self.position_mm))
+
+
+_DEVIATIONS = Schema(
+    (
+        POSITION,
+        Field("deviation_mm", DEVIATION_COLUMNS, deviations_um, MM_PER_UM, digits=4, presence="filled"),
+        Field("u_mm", ("u_dx_um", "u_dy_um", "u_dz_um"), uncertainties, MM_PER_UM, digits=4, presence="optional"),
+        LABELS,
+        APPROACH,
+        TOOL,
+        COVARIATES,
+    ),
+    keys=POSITION_COLUMNS,
+)
+
+
+def read_deviations(files: str | Path | Sequence[str | Path]) -> Deviations:
+    r"""Read one or more ``*.deviations.csv`` files into one :class:`Deviations`, um to mm.
+
+    Files may measure different components; labels that only some of the files carry are 0 in the others.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import compgen
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "mill.deviations.csv"
+    ...     with path.open("w") as file:
+    ...         print("x_mm,y_mm,z_mm,dx_um", "0,0,0,2.0", "100,0,0,3.5", sep="\n", file=file)
+    ...     deviations = compgen.read_deviations(path)
+    >>> deviations.deviation_mm[:, 0].tolist()
+    [0.002, 0.0035]
+    """
+    tables = _DEVIATIONS.read_tables(files)
+    for table in tables:
+        _check_components(table, *_DEVIATIONS.fields[1:3])
+    return join_deviations([Deviations(**_DEVIATIONS.values(table)) for table in tables])
+
+
+def _check_components(table: CsvTable, measured: Field, u: Field) -> list[str]:
+    """At least one component is measured, and the uncertainty is given of all of them or of none."""
+    found = [name for name in measured.columns if name in table.columns]
+    if not found:
+        raise InputError(f"has none of {', '.join(measured.columns)}; at least one is needed", file=table.path)
+    given = [name for name in u.columns if name in table.columns]
+    needed = [u_name for name, u_name in zip(measured.columns, u.columns, strict=True) if name in found]
+    if given and given != needed:
+        message = f"has {', '.join(given)}; give an uncertainty for each of {', '.join(needed)}"
+        raise InputError(message, file=table.path)
+    return found
+
+
+def join_deviations(parts: Sequence[Deviations]) -> Deviations:
+    """Return several records as one; InputError if only some have uncertainties."""
+    return _DEVIATIONS.joined(parts)
+
+
+def format_deviations(deviations: Deviations) -> str:
+    """Return the text of a ``*.deviations.csv`` file: positions with 6 decimals (1 nm), deviations in um with 4.
+
+    A component must be measured everywhere or nowhere.
+    """
+    return _DEVIATIONS.format(deviations, deviations.metadata)
+
+
+# Features of parts that the machine made, measured elsewhere: ``*.part.csv`` (nominal and measured coordinates).
+
+
+#: Coordinates further from their nominal ones than this, rms after the best pose, belong to something else.
+FAR_MM = 1.0
+#: What :attr:`Deviations.metadata` says under ``measured`` where the positions are features of a part.
+PART = "part"
+_PARTS = Schema(
+    (
+        Field("xy_mm", POSITION_COLUMNS[:2]),
+        Field("z_mm", POSITION_COLUMNS[2:], presence="filled", fill=0.0),
+        Field("measured_mm", MEASURED_COLUMNS, presence="filled"),
+        Field("u_mm", ("u_mx_um", "u_my_um", "u_mz_um"), uncertainties, MM_PER_UM, presence="filled"),
+        TOOL,
+        replace(LABELS, columns=("setup",)),
+        replace(COVARIATES, columns=()),
+    )
+)
+
+
+def read_parts(files: str | Path | Sequence[str | Path]) -> Deviations:
+    """Read one or more ``*.part.csv`` files: measured minus nominal coordinates, each set-up in a frame of its own.
+
+    A feature lies where the tool stood when it was made, so that its deviation is the error of the machine at the
+    nominal position, seen from the unknown pose of the part. The nominal coordinates are those of the machine; a comment
+    ``# origin_mm = X, Y, Z`` says where the part's origin was in them. Without ``z_mm`` all features lie at one height:
+    that of the origin.
+
+    Returns
+    -------
+    Deviations
+        aligned: see :func:`aligned`; nan for what was not measured.
+
+    Raises
+    ------
+    InputError
+        for a file without a measured coordinate, uncertainties for other coordinates than are measured, features that do
+        not lie where they should.
+    """
+    tables = _PARTS.read_tables(files)
+    for table in tables:
+        _check_alike(table, _check_components(table, *_PARTS.fields[2:4]))
+    found = join_deviations([_part(table) for table in tables])
+    unknown = found.u_mm is None or bool(np.isnan(found.u_mm).all())
+    return aligned(replace(found, u_mm=None if unknown else found.u_mm))
+
+
+def _part(table: CsvTable) -> Deviations:
+    """Measured minus nominal coordinates of one file at the nominal positions in the machine."""
+    values = _PARTS.values(table)
+    nominal_mm = np.column_stack([values.pop("xy_mm"), values.pop("z_mm")])
+    values["metadata"]["measured"] = PART
+    return Deviations(nominal_mm + _origin(table), values.pop("measured_mm") - nominal_mm, **values)
+
+
+def _check_alike(table: CsvTable, measured: Sequence[str]) -> None:
+    """Nominal and measured coordinates must be of one size, however the part was turned: an inch or a metre shows here."""
+    nominal = [table.numbers(f"{name[1]}_mm") for name in measured if f"{name[1]}_mm" in table.columns]
+    spans = [float(np.linalg.norm([np.ptp(column) for column in columns], axis=0))
+             for columns in (nominal, [table.numbers(name) for name in measured]) if len(columns) > 1]  # fmt: skip
+    if len(spans) == 2 and not 0.5 < (spans[1] + 1e-9) / (spans[0] + 1e-9) < 2.0:
+        text = (
+            f"the nominal features span {spans[0]:g}, the measured ones {spans[1]:g}; both are in mm: check the units"
+        )
+        raise InputError(text, file=table.path, field=f"columns {', '.join(measured)}")
+
+
+def _origin(table: CsvTable) -> FloatArray:
+    """The part's origin in machine coordinates, mm, from the comment ``origin_mm``; zeros without it."""
+    text = table.metadata.get("origin_mm", "0, 0, 0")
+    try:
+        values = np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError:
+        values = np.zeros(0)
+    if values.shape != (3,) or not np.isfinite(values).all():
+        raise InputError(f"the comment origin_mm = {text!r} is not three numbers X, Y, Z in mm", file=table.path)
+    return values
+
+
+def setups_of(deviations: Deviations) -> NDArray[np.int64]:
+    """Return the number of the set-up of every position, (n,); 0 without the label."""
+    return np.asarray(deviations.labels.get("setup", np.zeros(len(deviations), dtype=np.int64)))
+
+
+def aligned(deviations: Deviations) -> Deviations:
+    """Take the pose that fits best out of every set-up, so that what is left is small; in the plane for two components.
+
+    Raises
+    ------
+    InputError
+        where what is left is no error of a machine (axes exchanged or mirrored, features in another order).
+    """
+    setups, turned = setups_of(deviations), deviations.deviation_mm.copy()
+    poses = {}
+    for setup in np.unique(setups).tolist():
+        own = setups == setup
+        nominal = deviations.position_mm[own]
+        actual = nominal + deviations.deviation_mm[own]
+        rotation = _best_rotation(nominal, actual)
+        seen = np.isfinite(actual)
+        middle, there = _centres(nominal, actual)
+        poses[setup] = RoughPose(middle, there, rotation)
+        back = np.where(seen, actual - there, 0.0) @ rotation
+        turned[own] = np.where(seen, back + middle - nominal, np.nan)
+        rms_mm = float(np.sqrt(np.nanmean(turned[own] ** 2)))
+        if rms_mm > FAR_MM:
+            raise InputError(
+                f"set-up {setup}: after the best pose the coordinates are {rms_mm:.3g} mm rms from their nominal ones; are two "
+                "axes exchanged, one mirrored, the unit wrong, or the features numbered otherwise?",
+                file=deviations.origin[0][0] if deviations.origin else None,
+            )
+    return replace(deviations, deviation_mm=turned, poses=poses)
+
+
+def _centres(nominal_mm: FloatArray, actual_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means (3,) of the nominal and the measured coordinates over what was measured; 0 for a component that was not."""
+    seen = np.isfinite(actual_mm)
+    count = np.maximum(seen.sum(axis=0), 1)
+    return np.where(seen, nominal_mm, 0.0).sum(axis=0) / count, np.where(seen, actual_mm, 0.0).sum(axis=0) / count
+
+
+def _best_rotation(nominal_mm: FloatArray, actual_mm: FloatArray) -> FloatArray:
+    """The proper rotation from nominal to measured coordinates (Kabsch), in the plane or the space that was measured."""
+    rows = np.isfinite(actual_mm)
+    components = np.flatnonzero(rows.any(axis=0))
+    complete = rows[:, components].all(axis=1)
+    if len(components) < 2 or np.count_nonzero(complete) < len(components):
+        return np.eye(3)
+    first, second = nominal_mm[complete][:, components], actual_mm[complete][:, components]
+    moment = (second - second.mean(axis=0)).T @ (first - first.mean(axis=0))
+    left, size, right = np.linalg.svd(moment)
+    if size[-2] < 1e-9 * max(size[0], 1e-9):  # all on one line: its rotation about itself is not seen
+        return np.eye(3)
+    guard = np.ones(len(components))
+    guard[-1] = np.sign(np.linalg.det(left @ right))  # a reflection would fit data with a sign error, silently
+    matrix = np.eye(3)
+    matrix[np.ix_(components, components)] = (left * guard) @ right
+    return matrix

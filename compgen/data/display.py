@@ -1,0 +1,177 @@
+"""How results show themselves: one line in a session, a table in a notebook, a picture by ``plot()``.
+
+A class that inherits :class:`Displayed` says what there is to see (``overview``, ``panels``);
+how it looks is decided here, once for all of them. Figures are in the units of reports: um, urad, mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Colours that people with any kind of colour vision tell apart (Okabe and Ito 2008).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+PANELS_ACROSS = 3
+PANEL_SIZE_INCH = (4.2, 3.0)
+CELL = "padding:0.15em 0.8em;text-align:{side};border:none"
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Overview:
+    """What a result says at a glance.
+
+    Parameters
+    ----------
+    title : one line without a full stop.
+    header, rows : a table; cells are texts, the first column holds names.
+    notes : lines below the table.
+    """
+
+    title: str
+    header: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PlottedLine:
+    """Values over a coordinate, both of shape (n,); ``u`` is the standard uncertainty, drawn as a band of two of them."""
+
+    label: str
+    x: Values
+    y: Values
+    u: Values | None = None
+
+
+@dataclass(frozen=True)
+class Bars:
+    """One value for each name; several ``Bars`` in a panel stand side by side."""
+
+    label: str
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture: lines over a coordinate, or bars by name."""
+
+    title: str
+    y_label: str
+    lines: tuple[PlottedLine, ...] = ()
+    bars: tuple[Bars, ...] = ()
+    x_label: str = ""
+    x_scale: Literal["linear", "log"] = "linear"
+
+
+class Displayed:
+    """Something that people look at in a session or a notebook."""
+
+    def overview(self) -> Overview:
+        """Return what there is to say; its title is the line of ``repr``."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.overview().title}>"
+
+    def _repr_html_(self) -> str:
+        """Return the table that a notebook shows."""
+        return html_of(self.overview())
+
+
+class Drawable(Displayed):
+    """A result that has a picture as well."""
+
+    def panels(self) -> Sequence[Panel]:
+        """Return what there is to draw."""
+        raise NotImplementedError
+
+    def plot(self, figure: Figure | None = None) -> Figure:
+        """Draw this result, into ``figure`` or a new one, and return the figure.
+
+        Raises
+        ------
+        ValueError
+            if there is nothing to draw.
+        """
+        return drawn(self.panels(), self.overview().title, figure)
+
+
+def html_of(overview: Overview) -> str:
+    """Return an overview as HTML without scripts and style sheets; every text is escaped."""
+    parts = [f"<p><b>{escape(overview.title)}</b></p>"]
+    if overview.rows:
+        head = _row(overview.header, "th") if overview.header else ""
+        parts.append(f"<table>{head}{''.join(_row(row, 'td') for row in overview.rows)}</table>")
+    parts += [f"<p>{escape(note)}</p>" for note in overview.notes]
+    return "".join(parts)
+
+
+def _row(cells: Sequence[str], tag: str) -> str:
+    """One row: names to the left, figures to the right."""
+    sides = ("left", *["right"] * (len(cells) - 1))
+    return "<tr>{}</tr>".format(
+        "".join(
+            f'<{tag} style="{CELL.format(side=side)}">{escape(cell)}</{tag}>'
+            for side, cell in zip(sides, cells, strict=True)
+        )
+    )
+
+
+def drawn(panels: Sequence[Panel], title: str, figure: Figure | None = None) -> Figure:
+    """Draw panels side by side, three in a row, and return the figure."""
+    if not panels:
+        raise ValueError(f"there is nothing to draw: {title}")
+    across = min(PANELS_ACROSS, len(panels))
+    down = -(-len(panels) // across)
+    if figure is None:
+        import matplotlib.pyplot as plt  # imported here: slow to load, and only pictures need it
+
+        figure = plt.figure(figsize=(across * PANEL_SIZE_INCH[0], down * PANEL_SIZE_INCH[1]), layout="constrained")
+    for place, panel in enumerate(panels, start=1):
+        _draw(figure.add_subplot(down, across, place), panel)
+    figure.suptitle(title, fontsize="medium", wrap=True)
+    return figure
+
+
+def _draw(axes: Axes, panel: Panel) -> None:
+    """Draw one panel."""
+    for line, colour in zip(panel.lines, COLOURS * len(panel.lines), strict=False):
+        axes.plot(line.x, line.y, color=colour, label=line.label, linewidth=1.4, marker="." if len(line.x) < 60 else "")
+        if line.u is not None and np.isfinite(line.u).all():
+            axes.fill_between(line.x, line.y - 2 * line.u, line.y + 2 * line.u, color=colour, alpha=0.18, linewidth=0)
+    width = 0.8 / max(1, len(panel.bars))
+    for k, (item, colour) in enumerate(zip(panel.bars, COLOURS, strict=False)):
+        at = np.arange(len(item.names)) + (k - 0.5 * (len(panel.bars) - 1)) * width
+        axes.bar(at, item.values, width, color=colour, label=item.label)
+        axes.set_xticks(range(len(item.names)), item.names)
+    axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label, xscale=panel.x_scale)
+    axes.grid(visible=True, axis="both" if panel.lines else "y", alpha=0.3)
+    axes.set_axisbelow(True)
+    if any([*(line.label for line in panel.lines), *(item.label for item in panel.bars)]):
+        axes.legend(fontsize="small", frameon=False)
+
+
+def shortened(names: Sequence[str], most: int = 6) -> str:
+    """Return names as one text: the first few, and how many more there are."""
+    if len(names) <= most:
+        return ", ".join(names)
+    return f"{', '.join(names[:most])} and {len(names) - most} more"
+
+
+def ranges_of(position_mm: Values) -> tuple[tuple[str, str, str], ...]:
+    """Return rows of an overview: the range of positions (n, 3) along each axis, mm; none without positions."""
+    if not len(position_mm):
+        return ()
+    low, high = position_mm.min(axis=0), position_mm.max(axis=0)
+    return tuple((letter, f"{low[k]:g}", f"{high[k]:g}") for k, letter in enumerate("XYZ"))

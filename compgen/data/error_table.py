@@ -1,0 +1,471 @@
+"""Geometric errors and reversal as curves over the axis position, read and written.
+
+:class:`ErrorTable` is what identification, fit and export hand on: 18 curves and 3 squareness errors in mm and rad. Files
+hold um and urad (``*.errors.csv``). :class:`ReversalCurves` adds what differs between both directions of travel
+(``*.reversal.csv``).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import CsvTable, FloatArray, csv_table, format_csv, read_csv
+from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
+from compgen.data.files import read_text
+from compgen.data.messages import nearest, repeated
+from compgen.data.names import AXES, CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.data.records import axes_of, within
+from compgen.errors import CompgenWarning, InputError
+
+K = TypeVar("K", bound=Hashable)
+
+# Geometric errors as tables over the axis position: the object that identify, fit and export hand on.
+
+
+#: Columns that an ``*.errors.csv`` file must have.
+ERROR_COLUMNS = ("error", "position_mm", "value")
+
+
+@dataclass(frozen=True, repr=False)
+class Curve(Displayed):
+    """One error over its axis: ``position_mm`` ascending, ``value`` and standard uncertainty ``u`` in mm or rad.
+
+    All three have shape (n,); ``u`` is nan where it is not known. Linear between positions, constant outside.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> curve = compgen.Curve(np.array([0.0, 100.0]), np.array([0.0, 5e-3]), np.array([0.0, 1e-4]))
+    >>> curve.at(np.array([50.0, 200.0])).tolist()
+    [0.0025, 0.005]
+    """
+
+    position_mm: FloatArray
+    value: FloatArray
+    u: FloatArray
+
+    def __post_init__(self) -> None:
+        if not len(self.position_mm) == len(self.value) == len(self.u) > 0:
+            raise ValueError(f"lengths differ: {len(self.position_mm)}, {len(self.value)}, {len(self.u)}")
+        ascending = self.position_mm[1:] > self.position_mm[:-1]
+        if not (ascending.all() and np.isfinite(self.position_mm).all()):
+            raise ValueError("positions of a curve must be finite and ascend")
+
+    def at(self, position_mm: FloatArray) -> FloatArray:
+        """Value at the given positions, same shape."""
+        return np.interp(position_mm, self.position_mm, self.value)
+
+    def overview(self) -> Overview:
+        """Range and number of the positions; the unit of the values, mm or rad, is not part of a curve."""
+        ends = f"{self.position_mm[0]:g} to {self.position_mm[-1]:g} mm"
+        largest = float(np.max(np.abs(self.value)))
+        return Overview(f"{len(self.position_mm)} positions from {ends}, largest size {largest:.4g} (mm or rad)")
+
+
+def _line(name: str, curve: Curve) -> PlottedLine:
+    """A curve in um or urad."""
+    unit = error_named(name).si_per_unit
+    return PlottedLine(name, curve.position_mm, curve.value / unit, curve.u / unit)
+
+
+@dataclass(frozen=True, repr=False)
+class ErrorTable(Drawable):
+    """Some or all of the 21 errors of a machine, in mm and rad; an error that is absent is zero.
+
+    ``curves`` holds the 18 functions by name, ``squareness`` the constants by name as (value, uncertainty).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> positioning = compgen.Curve(np.array([0.0, 100.0]), np.array([0.0, 5e-3]), np.array([0.0, 1e-4]))
+    >>> errors = compgen.ErrorTable({"EXX": positioning}, {"EC0Y": (30e-6, 1e-6)})
+    >>> errors
+    <ErrorTable: 2 errors: EXX, EC0Y>
+    >>> errors.only("EC0Y").names
+    ('EC0Y',)
+    """
+
+    curves: Mapping[str, Curve] = field(default_factory=dict)
+    squareness: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for names, allowed, what in (
+            (self.curves, CURVE_NAMES, "18 errors that are functions"),
+            (self.squareness, SQUARENESS_NAMES, "3 squareness errors"),
+        ):
+            for name in names:
+                if name not in allowed:
+                    raise ValueError(f"{name!r} is not one of the {what}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the errors that are present, in the order of the columns of C."""
+        return tuple(name for name in ERROR_NAMES if name in self.curves or name in self.squareness)
+
+    def at(self, position_mm: FloatArray) -> FloatArray:
+        """All 21 errors P at axis positions of shape (n, 3): shape (n, 21), mm and rad, absent ones zero."""
+        position_mm = np.asarray(position_mm, dtype=np.float64)
+        values = np.zeros((len(position_mm), len(ERROR_NAMES)))
+        for name, curve in self.curves.items():
+            values[:, ERROR_INDEX[name]] = curve.at(position_mm[:, error_named(name).axis])
+        for name, (value, _) in self.squareness.items():
+            values[:, ERROR_INDEX[name]] = value
+        return values
+
+    def warn_outside(self, position_mm: FloatArray) -> None:
+        """Warn when positions of shape (n, 3) leave the range of a curve, whose end value is then used."""
+        for name, curve in self.curves.items():
+            along = position_mm[:, error_named(name).axis]
+            low, high = curve.position_mm[0], curve.position_mm[-1]
+            if len(curve.position_mm) > 1 and (along.min() < low - 1e-6 or along.max() > high + 1e-6):
+                warnings.warn(
+                    f"{name} is known from {low:g} to {high:g} mm, but positions go from {along.min():g} to "
+                    f"{along.max():g} mm; its end values are used outside",
+                    CompgenWarning,
+                    stacklevel=3,
+                )
+                return
+
+    def only(self, *names: str) -> ErrorTable:
+        """Return a table with just the errors ``names``; the others are zero."""
+        return ErrorTable(
+            {name: curve for name, curve in self.curves.items() if name in names},
+            {name: value for name, value in self.squareness.items() if name in names},
+            self.metadata,
+        )
+
+    def values(self) -> FloatArray:
+        """All values in the order of the names, (k,), mm and rad; a squareness counts as one value."""
+        return self._stacked(
+            [(self.squareness[n][0],) if n in self.squareness else self.curves[n].value for n in self.names]
+        )
+
+    def uncertainties(self) -> FloatArray:
+        """Standard uncertainties in the order of :meth:`values`, (k,), mm and rad; nan where one is not known."""
+        return self._stacked(
+            [(self.squareness[n][1],) if n in self.squareness else self.curves[n].u for n in self.names]
+        )
+
+    @staticmethod
+    def _stacked(parts: Sequence[Sequence[float] | FloatArray]) -> FloatArray:
+        return np.concatenate([np.zeros(0), *(np.asarray(part) for part in parts)])
+
+    def with_values(self, values: FloatArray | None = None, u: FloatArray | None = None) -> ErrorTable:
+        """Return the table with other values or uncertainties (k,), in the order of :meth:`values`."""
+        values = self.values() if values is None else values
+        u = self.uncertainties() if u is None else u
+        curves, squareness, first = {}, {}, 0
+        for name in self.names:
+            if name in self.squareness:
+                squareness[name] = (float(values[first]), float(u[first]))
+                first += 1
+            else:
+                old = self.curves[name]
+                rows = slice(first, first + len(old.value))
+                curves[name] = Curve(old.position_mm, values[rows], u[rows])
+                first = rows.stop
+        return ErrorTable(curves, squareness, self.metadata)
+
+    def replace(
+        self,
+        *,
+        curves: Mapping[str, Curve] | None = None,
+        squareness: Mapping[str, tuple[float, float]] | None = None,
+        metadata: Mapping[str, str] | None = None,
+    ) -> ErrorTable:
+        """Return a copy with what is given replaced."""
+        return ErrorTable(
+            self.curves if curves is None else curves,
+            self.squareness if squareness is None else squareness,
+            self.metadata if metadata is None else metadata,
+        )
+
+    def overview(self) -> Overview:
+        """Largest value of each error with its position, and its largest standard uncertainty."""
+        machine = f" of {self.metadata['machine']}" if "machine" in self.metadata else ""
+        title = f"{len(self.names)} errors{machine}: {shortened(self.names)}" if self.names else "no errors"
+        rows = tuple(self._row(name) for name in self.names)
+        return Overview(title, ("error", "largest", "at (mm)", "u (k = 1)", "unit"), rows)
+
+    def _row(self, name: str) -> tuple[str, str, str, str, str]:
+        error = error_named(name)
+        if name in self.squareness:
+            largest, u = self.squareness[name]
+            place = ""
+        else:
+            curve = self.curves[name]
+            k = int(np.argmax(np.abs(curve.value)))
+            largest, u, place = float(curve.value[k]), float(np.max(curve.u)), f"{curve.position_mm[k]:g}"
+        known = "" if np.isnan(u) else f"{u / error.si_per_unit:.3f}"
+        return name, f"{largest / error.si_per_unit:+.3f}", place, known, error.unit
+
+    def panels(self) -> Sequence[Panel]:
+        """Translations and rotations of each axis over its position; squareness errors are constants and not drawn."""
+        panels = []
+        for axis, letter in enumerate(AXES):
+            for unit in ("um", "urad"):
+                names = [name for name in self.names if name in self.curves and error_named(name).axis == axis]
+                lines = tuple(_line(name, self.curves[name]) for name in names if error_named(name).unit == unit)
+                if lines:
+                    panels.append(Panel(f"errors of {letter}", f"error ({unit})", lines, x_label=f"{letter} (mm)"))
+        return panels
+
+
+def read_errors(path: str | Path) -> ErrorTable:
+    """Read an ``*.errors.csv`` file of the contract (um and urad) into an :class:`ErrorTable` (mm and rad).
+
+    Examples
+    --------
+    >>> import compgen
+    >>> errors = compgen.read_errors("examples/zha-gantry.truth.errors.csv")
+    >>> len(errors.names), round(1e6 * errors.squareness["EC0Y"][0], 3)
+    (17, 2903.269)
+    """
+    return parse_errors(read_text(path), Path(path))
+
+
+def parse_errors(text: str, source: Path) -> ErrorTable:
+    """Read the text of an ``*.errors.csv`` file as :func:`read_errors` does; ``source`` is what messages name."""
+    return errors_of_table(csv_table(source, text, required=ERROR_COLUMNS, optional=("u_value",)))
+
+
+def errors_of_table(table: CsvTable) -> ErrorTable:
+    """Return the errors (mm and rad) of a CSV table with the columns of an ``*.errors.csv`` file (um and urad)."""
+    names = table.text("error")
+    values = table.numbers("value")
+    u_values = _uncertainties(table, "u_value")
+    positions_mm = table.numbers("position_mm", empty=np.nan)
+    curves: dict[str, Curve] = {}
+    squareness: dict[str, tuple[float, float]] = {}
+    for row, name in enumerate(names):
+        if name not in ERROR_INDEX:
+            raise table.fail(row, "error", f"{name!r} is not an error of ISO 230-1 here; {nearest(name, ERROR_NAMES)}")
+    for name, rows in _grouped(names).items():
+        unit = error_named(name).si_per_unit
+        if name in SQUARENESS_NAMES:
+            if len(rows) > 1:
+                first = f"first in line {table.lines[rows[0]]}"
+                raise table.fail(rows[1], "error", f"{name} appears a second time ({first})")
+            if table.columns["position_mm"][rows[0]]:
+                raise table.fail(rows[0], "position_mm", f"{name} is a constant; leave its position empty")
+            squareness[name] = (float(values[rows[0]]) * unit, float(u_values[rows[0]]) * unit)
+        else:
+            for row in rows[np.isnan(positions_mm[rows])]:
+                raise table.fail(row, "position_mm", f"is empty; {name} is a function and needs a position in mm")
+            picked = _ascending(table, name, rows, positions_mm)
+            curves[name] = Curve(positions_mm[picked], values[picked] * unit, u_values[picked] * unit)
+    return ErrorTable(curves, squareness, {key: value for key, value in table.metadata.items() if key != "rows"})
+
+
+def _grouped(keys: Iterable[K]) -> dict[K, NDArray[np.int64]]:
+    """The rows of each key, in the order of their first rows."""
+    rows: dict[K, list[int]] = {}
+    for row, key in enumerate(keys):
+        rows.setdefault(key, []).append(row)
+    return {key: np.array(found) for key, found in rows.items()}
+
+
+def _ascending(table: CsvTable, name: str, rows: NDArray[np.int64], positions_mm: FloatArray) -> NDArray[np.int64]:
+    """The rows of a curve in the order of their positions, each of which comes once."""
+    twice = repeated(positions_mm[rows].tolist())
+    if twice is not None:
+        first, row = rows[list(twice)]
+        message = f"{name} has a value at {positions_mm[row]:g} mm already in line {table.lines[first]}"
+        raise table.fail(row, "position_mm", message)
+    return rows[np.argsort(positions_mm[rows])]
+
+
+def _uncertainties(table: CsvTable, column: str) -> FloatArray:
+    """An optional column of standard uncertainties, nan where it is empty."""
+    if column not in table.columns:
+        return np.full(len(table), np.nan)
+    values = table.numbers(column, empty=np.nan)
+    for row in np.flatnonzero(values < 0)[:1]:
+        raise table.fail(int(row), column, f"{values[row]:g} is negative; a standard uncertainty is not")
+    return values
+
+
+def format_errors(errors: ErrorTable, metadata: Mapping[str, object] | None = None) -> str:
+    """Return the text of an ``*.errors.csv`` file; values in um and urad with 9 decimals.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> text = compgen.format_errors(compgen.ErrorTable(squareness={"EC0Y": (30e-6, 1e-6)}))
+    >>> print(text.splitlines()[-1])
+    EC0Y,,30.000000000,1.000000000
+    """
+    names: list[str] = []
+    positions: list[float] = []
+    values: list[float] = []
+    u_values: list[float] = []
+    for name in errors.names:
+        unit = error_named(name).si_per_unit
+        if name in errors.squareness:
+            rows: Iterable[tuple[float, float, float]] = [(np.nan, *errors.squareness[name])]
+        else:
+            curve = errors.curves[name]
+            rows = zip(curve.position_mm, curve.value, curve.u, strict=True)
+        for position, value, u_value in rows:
+            names.append(name)
+            positions.append(position)
+            values.append(value / unit)
+            u_values.append(u_value / unit)
+    columns: dict[str, Sequence[str] | FloatArray] = {
+        "error": names,
+        "position_mm": np.array(positions),
+        "value": np.array(values),
+        "u_value": np.array(u_values),
+    }
+    digits = {"position_mm": 6, "value": 9, "u_value": 9}
+    return format_csv(columns, {**errors.metadata, **(metadata or {})}, digits)
+
+
+# Reversal of each axis over its position: ``*.reversal.csv``, what a control needs beside the two-way mean errors.
+#
+# The reversal value B is that of ISO 230-2: the position reached moving in positive direction minus the one reached moving
+# in negative direction. The error curves are the means of both, so the tool stands at +B/2 after positive travel and at
+# -B/2 after negative travel, beside what the curves say.
+
+
+#: A reversal beyond this is taken for a slip of unit, um.
+LARGEST_UM = 1000.0
+#: A reversal whose largest value stays below this is not worth a table, mm.
+WORTH_MM = 0.1 * MM_PER_UM
+
+
+@dataclass(frozen=True, repr=False)
+class ReversalCurves(Displayed):
+    """Reversal values in mm by (axis that travels, component of the tip's displacement), both 0..2.
+
+    A curve with one position is constant over the travel. What is absent is zero.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> backlash = compgen.Curve(np.zeros(1), np.array([-8e-3]), np.zeros(1))  # X stops 8 um short: constant, negative
+    >>> reversal = compgen.ReversalCurves({(0, 0): backlash})
+    >>> reversal.displacement(np.zeros((2, 3)), np.array([[1, 0, 0], [-1, 0, 0]]))[:, 0].tolist()
+    [-0.004, 0.004]
+    """
+
+    curves: Mapping[tuple[int, int], Curve]
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+    def displacement(self, position_mm: FloatArray, approach: FloatArray) -> FloatArray:
+        """Displacement of the tip against the mean of both directions, shape (n, 3), mm.
+
+        Parameters
+        ----------
+        position_mm : commanded positions, shape (n, 3).
+        approach : last direction of travel of each axis, shape (n, 3): +1, -1, or 0 (unknown: the mean).
+        """
+        moved = np.zeros((len(position_mm), 3))
+        for (axis, component), curve in self.curves.items():
+            moved[:, component] += 0.5 * np.sign(approach[:, axis]) * curve.at(position_mm[:, axis])
+        return moved
+
+    def mean_mm(self, axis: int) -> float:
+        """Mean over its positions of an axis' reversal along itself, 0 if there is none."""
+        curve = self.curves.get((axis, axis))
+        return 0.0 if curve is None else float(np.mean(curve.value))
+
+    def without(self, other: ReversalCurves) -> ReversalCurves:
+        """Return the curves that are not in ``other``."""
+        return ReversalCurves({key: curve for key, curve in self.curves.items() if key not in other.curves})
+
+    @property
+    def largest_mm(self) -> dict[tuple[int, int], float]:
+        """Largest reversal in size of each curve, with its sign."""
+        return {key: float(curve.value[np.argmax(np.abs(curve.value))]) for key, curve in self.curves.items()}
+
+    def overview(self) -> Overview:
+        """Range of the reversal value of each axis and component."""
+        rows = tuple(
+            (
+                AXES[axis],
+                AXES[component],
+                f"{curve.value.min() / MM_PER_UM:+.3f} ... {curve.value.max() / MM_PER_UM:+.3f}",
+            )
+            for (axis, component), curve in self.curves.items()
+        )
+        found = [f"{AXES[axis]}{'' if axis == component else AXES[component]}" for axis, component in self.curves]
+        return Overview(f"reversal of {', '.join(found) or 'no axis'}", ("axis", "component", "reversal (um)"), rows)
+
+
+def reversal_name(axis: int, component: int) -> str:
+    """Name in messages, e.g. ``reversal X`` or ``reversal X in y`` for the displacement across.
+
+    >>> reversal_name(0, 0), reversal_name(0, 1)
+    ('reversal X', 'reversal X in Y')
+    """
+    return f"reversal {AXES[axis]}" + ("" if axis == component else f" in {AXES[component]}")
+
+
+def read_reversal(path: str | Path) -> ReversalCurves:
+    r"""Read a ``*.reversal.csv`` file (um) into :class:`ReversalCurves` (mm).
+
+    Columns ``axis``, ``position_mm`` (empty: constant over the travel), ``value_um``; optional ``u_value_um`` and
+    ``component`` (X, Y, Z; default the axis itself).
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import compgen
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "x.reversal.csv"
+    ...     with path.open("w") as file:
+    ...         print("axis,position_mm,value_um", "X,,-8", sep="\n", file=file)
+    ...     reversal = compgen.read_reversal(path)
+    >>> reversal.mean_mm(0)
+    -0.008
+    """
+    table = read_csv(path, ("axis", "position_mm", "value_um"), ("u_value_um", "component"))
+    axes = axes_of(table, "axis")
+    components = axes_of(table, "component") if "component" in table.columns else axes
+    position_mm = table.numbers("position_mm", empty=np.nan)
+    value_um = within(LARGEST_UM, "um", f"not a reversal of a machine tool; expected um, at most {LARGEST_UM:g}")(
+        table, "value_um"
+    )
+    u_um = _uncertainties(table, "u_value_um")
+    curves = {}
+    for key, rows in _grouped(zip(axes.tolist(), components.tolist(), strict=True)).items():
+        name = reversal_name(*key)
+        for row in rows[np.isnan(position_mm[rows])] if len(rows) > 1 else ():
+            what = f"is empty, and {name} has {len(rows)} rows; a constant has one row, a function a position in each"
+            raise table.fail(row, "position_mm", what)
+        picked = _ascending(table, name, rows, position_mm)
+        curves[key] = Curve(np.nan_to_num(position_mm[picked]), value_um[picked] * MM_PER_UM, u_um[picked] * MM_PER_UM)
+    return ReversalCurves(curves, {key: value for key, value in table.metadata.items() if key != "rows"})
+
+
+def format_reversal(reversal: ReversalCurves, metadata: Mapping[str, object] | None = None) -> str:
+    """Return the text of a ``*.reversal.csv`` file; values in um with 6 decimals, constants without a position."""
+    rows: list[tuple[int, int, float, float, float]] = []
+    for (axis, component), curve in sorted(reversal.curves.items()):
+        constant = len(curve.position_mm) == 1
+        for position, value, u in zip(curve.position_mm, curve.value, curve.u, strict=True):
+            rows.append((axis, component, np.nan if constant else position, value / MM_PER_UM, u / MM_PER_UM))
+    if not rows:
+        raise InputError("there is no reversal to write")
+    axes, components, positions, values, u_values = zip(*rows, strict=True)
+    columns: dict[str, Sequence[str] | FloatArray] = {
+        "axis": [AXES[axis] for axis in axes],
+        "component": [AXES[component] for component in components],
+        "position_mm": np.array(positions),
+        "value_um": np.array(values),
+        "u_value_um": np.array(u_values),
+    }
+    return format_csv(columns, {**reversal.metadata, **(metadata or {})})

@@ -1,0 +1,295 @@
+"""Output files: written to a temporary name and renamed, all files of a step or none.
+
+Temporary files and folders are locked by the process that made them, so that the next one can tell what a killed process
+left behind and remove it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import filecmp
+import hashlib
+import itertools
+import json
+import math
+import os
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from compgen.errors import InputError
+
+TEMPORARY = ".tmp"
+#: How temporary folders of the program begin, and the file by whose lock one sees that its process still runs.
+FOLDERS, LOCK = "compgen-", ".lock"
+#: What is newer may be about to be locked, s.
+NEW_S = 2.0
+#: Temporary files of this process, each with the open file that keeps its lock.
+_locks: dict[Path, int] = {}
+
+
+def sha256_of(content: bytes) -> str:
+    """Return the SHA-256 of ``content`` as hexadecimal text."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def json_values(value: Any) -> Any:
+    """Return ``value`` as JSON knows it: keys are texts, and a number that is not known (nan) or not finite is None."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): json_values(item) for key, item in value.items()}
+    return [json_values(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def json_text(value: Any) -> str:
+    """Return the text of a JSON file, see :func:`json_values`; objects that JSON does not know are written as text."""
+    return json.dumps(json_values(value), indent=2, default=str, allow_nan=False) + "\n"
+
+
+class OutputFolder:
+    """A folder that receives a set of files together.
+
+    ``add`` keeps the contents in memory; ``commit`` writes every one to a temporary name beside its target and
+    only then renames them, so that an error leaves neither half a file nor half a set of new ones. ``set_aside`` names a
+    file of the folder that ``commit`` renames to ``PREVIOUS-...`` before the new ones take their names: a process that is
+    killed in between leaves no old file that looks like one of the new set.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self._contents: dict[str, bytes] = {}
+        self._aside: list[str] = []
+        try:
+            existing = self.folder
+            while not existing.exists() and existing != existing.parent:
+                existing = existing.parent
+            if existing.exists() and not existing.is_dir():
+                raise InputError("is a file; --out needs a folder", file=existing)
+            if existing.is_dir() and (
+                not existing.stat().st_mode & 0o222 or not os.access(existing, os.W_OK | os.X_OK)
+            ):
+                raise InputError(
+                    "the output folder is read-only; choose another --out or make it writable", file=existing
+                )
+        except OSError as error:
+            raise InputError(f"cannot be used: {error.strerror or error}", file=self.folder) from error
+
+    @property
+    def contents(self) -> Mapping[str, bytes]:
+        """What has been added, by name."""
+        return self._contents
+
+    def add(self, name: str, content: str | bytes) -> None:
+        """Remember ``content`` (text is encoded as UTF-8, line ends kept) for the file ``name``."""
+        self._contents[name] = content.encode("utf-8") if isinstance(content, str) else content
+
+    def set_aside(self, name: str) -> Path:
+        """Keep the existing file ``name`` under the name that is returned, one that loses no other file."""
+        self._aside.append(name)
+        return _previous(self.folder / name)
+
+    def commit(self) -> dict[str, Path]:
+        """Write everything and return the path of each file by name."""
+        paths = {name: self.folder / name for name in self._contents}
+        aside = [(self.folder / name, _previous(self.folder / name)) for name in dict.fromkeys(self._aside)]
+        temporary: dict[str, Path] = {}
+        # folders that have to be made for the targets, the innermost first
+        missing = {folder for target in paths.values() for folder in target.parents if not folder.exists()}
+        made = sorted(missing, key=lambda folder: len(folder.parts), reverse=True)
+        try:
+            _remove_abandoned_files(paths.values())
+            for path in paths.values():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if path.is_dir():
+                    raise IsADirectoryError(21, f"{path.name} is a folder")
+            for name, content in self._contents.items():
+                temporary[name] = _write_temporary(paths[name], content)
+            _replace_all([*aside, *((temporary[name], paths[name]) for name in paths)])
+        except OSError as error:
+            _remove([*temporary.values()], made)
+            raise InputError(
+                f"cannot write: {error.strerror or error}; nothing was written", file=self.folder
+            ) from error
+        except BaseException:
+            _remove([*temporary.values()], made)
+            raise
+        finally:
+            for path in temporary.values():
+                _unlock(path)
+        return paths
+
+
+def _previous(path: Path) -> Path:
+    """A name with ``PREVIOUS-`` that is free, or that a file with the same contents has."""
+    for count in itertools.count(1):
+        free = path.with_name(f"PREVIOUS-{'' if count == 1 else f'{count}-'}{path.name}")
+        if not free.exists() or (free.is_file() and path.is_file() and filecmp.cmp(free, path, shallow=False)):
+            return free
+    raise AssertionError("itertools.count never ends")
+
+
+def _remove(files: Iterable[Path], folders: Iterable[Path]) -> None:
+    """Remove temporary files, then the folders made for them as far as they are empty."""
+    for path in files:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def _replace_all(moves: Sequence[tuple[Path, Path]]) -> None:
+    """Rename each first path to the second; if one fails, put back all files as they were, the last first."""
+    done: list[tuple[Path, Path, bytes | None]] = []
+    try:
+        for source, target in moves:
+            before = target.read_bytes() if target.exists() else None
+            os.replace(source, target)
+            done.append((source, target, before))
+    except BaseException:
+        for source, target, before in reversed(done):
+            with contextlib.suppress(OSError):
+                if not source.name.endswith(TEMPORARY):  # a file that was set aside: no byte of it is written again
+                    os.replace(target, source)
+                elif before is None:
+                    target.unlink()
+                else:
+                    again = _write_temporary(target, before)
+                    os.replace(again, target)
+                    _unlock(again)
+        raise
+
+
+def _write_temporary(target: Path, content: bytes) -> Path:
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=TEMPORARY, dir=target.parent)
+    path = Path(name)
+    try:
+        kept = os.dup(handle)
+        _locks[path] = kept
+        _locked(kept)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        path.chmod(0o666 & ~_umask())
+    except BaseException:
+        path.unlink(missing_ok=True)
+        _unlock(path)
+        raise
+    return path
+
+
+def _locked(handle: int) -> bool:
+    """Take the lock of an open file, which the system gives back when this process ends; False if another one has it."""
+    try:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:  # a system without such locks: nothing is ever taken for abandoned
+        return False
+    except OSError:
+        return False
+    return True
+
+
+def _unlock(path: Path) -> None:
+    handle = _locks.pop(path, None)
+    if handle is not None:
+        os.close(handle)
+
+
+def _abandoned(path: Path) -> bool:
+    """Whether the process that made a temporary file, or the lock of a folder, was killed: nobody keeps its lock."""
+    try:
+        if time.time() - path.lstat().st_mtime < NEW_S:
+            return False
+        handle = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+    except OSError:
+        return False
+    try:
+        return _locked(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove_abandoned_files(targets: Iterable[Path]) -> None:
+    """Remove what processes that were killed left of files with these names."""
+    names: dict[Path, set[str]] = {}
+    for target in targets:
+        names.setdefault(target.parent, set()).add(target.name)
+    for folder, own in names.items():
+        with contextlib.suppress(OSError):
+            for path in list(folder.iterdir()):
+                found = re.fullmatch(r"\.(.+)\.[a-z0-9_]{8}" + re.escape(TEMPORARY), path.name, re.DOTALL)
+                if found and found[1] in own and _abandoned(path):
+                    path.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def working_folder(name: str = "") -> Iterator[Path]:
+    """Yield a temporary folder that is removed at the end, and by the next process if this one is killed."""
+    remove_abandoned_folders()
+    with tempfile.TemporaryDirectory(prefix=f"{FOLDERS}{name}") as text:
+        lock = os.open(Path(text) / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            _locked(lock)
+            yield Path(text)
+        finally:
+            os.close(lock)
+
+
+def remove_abandoned_folders() -> None:
+    """Remove this user's temporary folders whose processes were killed."""
+    with contextlib.suppress(OSError):
+        for path in Path(tempfile.gettempdir()).glob(f"{FOLDERS}*"):
+            with contextlib.suppress(OSError):
+                mine = not hasattr(os, "geteuid") or path.lstat().st_uid == os.geteuid()
+                if mine and path.is_dir() and not path.is_symlink() and _abandoned(path / LOCK):
+                    shutil.rmtree(path, ignore_errors=True)
+
+
+def _umask() -> int:
+    current = os.umask(0)
+    os.umask(current)
+    return current
+
+
+def write_file(path: str | Path, content: str | bytes) -> Path:
+    """Write one file atomically and return its path."""
+    target = Path(path)
+    folder = OutputFolder(target.parent)
+    folder.add(target.name, content)
+    return folder.commit()[target.name]
+
+
+def read_bytes(path: str | Path, most: int = -1) -> bytes:
+    """Return the contents of ``path``, at most ``most`` bytes of it, or raise an InputError that says why not."""
+    source = Path(path)
+    try:
+        if source.is_dir():
+            raise InputError("is a folder; a file is needed", file=source)
+        with source.open("rb") as stream:
+            return stream.read(most)
+    except FileNotFoundError as error:
+        raise InputError("no such file", file=source) from error
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=source) from error
+
+
+def read_text(path: str | Path) -> str:
+    """Return the UTF-8 text of ``path`` (a byte-order mark is dropped) or raise an InputError that says why not."""
+    return decoded(read_bytes(path), path)
+
+
+def decoded(content: bytes, path: str | Path) -> str:
+    """Return the UTF-8 text of the contents of ``path`` as :func:`read_text` does."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise InputError("is not UTF-8 text; save it as UTF-8", file=path, line=line) from error

@@ -1,0 +1,206 @@
+"""Laser-tracer lengths (``*.lengths.csv``) and lists of commanded points (``*.points.csv``): records, readers, writers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import CsvTable, FloatArray
+from compgen.data.display import Displayed, Overview, ranges_of, shortened
+from compgen.data.records import APPROACH, COVARIATES, LABELS, POSITION, POSITION_COLUMNS, TOOL, Field, Schema, within
+
+__all__ = [
+    "POSITION_COLUMNS",
+    "Lengths",
+    "Points",
+    "format_lengths",
+    "format_points",
+    "read_lengths",
+    "read_points",
+]
+
+
+@dataclass(frozen=True, repr=False)
+class Lengths(Displayed):
+    """Displacement readings of one or more tracer stations; n readings, S stations.
+
+    Parameters
+    ----------
+    stations : names of the stations.
+    station : index into ``stations`` of each reading, shape (n,).
+    point : label of the target point of each reading.
+    position_mm : commanded positions, shape (n, 3).
+    length_mm : readings, the true distance minus an unknown constant per station and set-up, shape (n,).
+    tool_mm : tool offset of each reading, shape (n, 3), or None for the machine's own.
+    approach : last direction of travel of each axis (+1, -1, 0 unknown), shape (n, 3), or None.
+    labels : whole-number labels by column name (run, line, repeat, block, setup, pose), each of shape (n,).
+    covariates : further numbers by column name (``time_s``, ``temp_...``, ...), each of shape (n,).
+    metadata : comments ``key = value`` of the file.
+    origin : (file, line) of each reading, for messages.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> lengths = compgen.read_lengths("examples/zha-gantry.lengths.csv")
+    >>> lengths
+    <Lengths: 10648 readings of LT1, LT2, LT3, LT4>
+    >>> lengths.position_mm.shape, lengths.length_mm.shape
+    ((10648, 3), (10648,))
+    >>> r, k = lengths, slice(9)
+    >>> few = compgen.Lengths(r.stations, r.station[k], r.point[k], r.position_mm[k], r.length_mm[k])
+    >>> len(few)
+    9
+    """
+
+    stations: tuple[str, ...]
+    station: NDArray[np.int64]
+    point: Sequence[str]
+    position_mm: FloatArray
+    length_mm: FloatArray
+    tool_mm: FloatArray | None = None
+    approach: FloatArray | None = None
+    labels: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    origin: Sequence[tuple[str, int]] = ()
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.length_mm)
+
+    def overview(self) -> Overview:
+        """Number of readings of each station."""
+        counts = np.bincount(self.station, minlength=len(self.stations))
+        rows = tuple((name, str(count)) for name, count in zip(self.stations, counts, strict=True))
+        return Overview(f"{len(self)} readings of {shortened(self.stations)}", ("station", "readings"), rows)
+
+
+_LENGTHS = Schema(
+    (
+        Field("station", ("station",), CsvTable.names),
+        Field("point", ("point",), CsvTable.text),
+        POSITION,
+        Field("length_mm", ("length_mm",), within(1e6, "mm", "more than a kilometre; is the unit mm?"), digits=7),
+        LABELS,
+        APPROACH,
+        TOOL,
+        replace(COVARIATES, digits=3),
+    ),
+    keys=("station", "point"),
+)
+
+
+def read_lengths(files: str | Path | Sequence[str | Path]) -> Lengths:
+    """Read one or more ``*.lengths.csv`` files into one :class:`Lengths`.
+
+    Labels that only some of the files carry are 0 in the others; the same station in two files is one station.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> compgen.read_lengths("examples/zha-gantry.lengths.csv").metadata["instrument"]
+    'laser-tracer'
+    """
+    parts = []
+    for values in map(_LENGTHS.values, _LENGTHS.read_tables(files)):
+        stations = tuple(dict.fromkeys(values["station"]))
+        parts.append(Lengths(**values | {"stations": stations, "station": _numbered(values["station"], stations)}))
+    return join_lengths(parts)
+
+
+def _numbered(names: Iterable[str], stations: Sequence[str]) -> NDArray[np.int64]:
+    index = {name: k for k, name in enumerate(stations)}
+    return np.array([index[name] for name in names], dtype=np.int64)
+
+
+def join_lengths(parts: Sequence[Lengths]) -> Lengths:
+    """Return several records as one; stations of the same name are one station."""
+    stations = tuple(dict.fromkeys(name for part in parts for name in part.stations))
+    numbers = [_numbered(part.stations, stations)[part.station] for part in parts]
+    known = [replace(part, stations=stations, station=number) for part, number in zip(parts, numbers, strict=True)]
+    return _LENGTHS.joined(known)
+
+
+def format_lengths(lengths: Lengths) -> str:
+    """Return the text of a ``*.lengths.csv`` file: positions with 6 decimals (1 nm), lengths with 7."""
+    named = replace(_LENGTHS.fields[0], encode=lambda station: [lengths.stations[k] for k in station])
+    return replace(_LENGTHS, fields=(named, *_LENGTHS.fields[1:])).format(lengths, lengths.metadata)
+
+
+# Lists of commanded points (``*.points.csv``), with or without results.
+
+
+@dataclass(frozen=True, repr=False)
+class Points(Displayed):
+    """Commanded points, n of them.
+
+    Parameters
+    ----------
+    position_mm : shape (n, 3).
+    tool_mm : tool offset at each point, shape (n, 3), or None for the machine's own.
+    approach : last direction of travel of each axis (+1, -1, 0 unknown), shape (n, 3), or None.
+    covariates : further numbers by column name (time_s, feed_mm_min, load_kg, setup, temp_<name>_c), each (n,).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> points = compgen.Points(np.array([[0.0, 0.0, 0.0], [100.0, 50.0, 20.0]]))
+    >>> len(points)
+    2
+    """
+
+    position_mm: FloatArray
+    tool_mm: FloatArray | None = None
+    approach: FloatArray | None = None
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.position_mm)
+
+    def overview(self) -> Overview:
+        """Number of the points, and the box that holds them."""
+        return Overview(f"{len(self)} points", ("axis", "from (mm)", "to (mm)"), ranges_of(self.position_mm))
+
+
+_POINTS = Schema(
+    (
+        POSITION,
+        TOOL,
+        replace(APPROACH, presence="complete", digits=6),
+        # what effects of a machine may depend on
+        Field("covariates", ("time_s", "feed_mm_min", "load_kg", "setup"), presence="covariates"),
+    )
+)
+
+
+def read_points(path: str | Path) -> Points:
+    r"""Read a ``*.points.csv`` file; tool and approach columns are optional, but each complete.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import compgen
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "two.points.csv"
+    ...     with path.open("w") as file:
+    ...         print("x_mm,y_mm,z_mm", "0,0,0", "100,50,20", sep="\n", file=file)
+    ...     points = compgen.read_points(path)
+    >>> points
+    <Points: 2 points>
+    """
+    table = _POINTS.read_table(path)
+    return Points(**{field.name: field.of_table(table) for field in _POINTS.fields})
+
+
+def format_points(
+    points: Points, results: Mapping[str, FloatArray], metadata: Mapping[str, object] | None = None
+) -> str:
+    """Return CSV text of the points with result columns (each of shape (n,)) after them, 6 decimals."""
+    return _POINTS.format(points, metadata or {}, results)

@@ -1,0 +1,513 @@
+"""A machine as its TOML file describes it: chain, axes, error model, work zone and tools.
+
+:func:`read_machine` reads one file strictly, :func:`load_machine` finds it by name. A machine keeps the raw sections of its
+controls and effects; each of them reads its own settings when it is used.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import permutations, product
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray
+from compgen.data.display import Displayed, Overview
+from compgen.data.messages import nearest
+from compgen.data.names import AXES, ERROR_NAMES
+from compgen.errors import CompgenWarning, InputError
+from compgen.resources import data_folder
+
+# Where tables have to be best that cannot be good everywhere: a work zone, and tools of several lengths.
+
+
+Interval = tuple[float, float]
+Vector3 = tuple[float, float, float]
+
+#: How much more a coordinate within the work zone counts than one outside, if nothing is said.
+ZONE_WEIGHT = 10.0
+#: The zone all but alone; the rest of the travel still settles what the zone leaves open.
+MOST_ZONE_WEIGHT = 1e3
+
+
+@dataclass(frozen=True)
+class Emphasis:
+    """What the least squares of the tables weighs.
+
+    Parameters
+    ----------
+    zone_mm : ranges of X, Y and Z within the travel (None: the whole travel); where all are None there is no zone.
+    zone_weight : how much more a coordinate within the zone counts; the factors of the axes multiply.
+    tools_mm : tool offsets over which the residual is averaged; none: the machine's own.
+    """
+
+    zone_mm: tuple[Interval | None, Interval | None, Interval | None] = (None, None, None)
+    zone_weight: float = ZONE_WEIGHT
+    tools_mm: tuple[Vector3, ...] = ()
+
+    @property
+    def has_zone(self) -> bool:
+        """Whether a part of the travel counts more than the rest."""
+        return any(part is not None for part in self.zone_mm) and self.zone_weight != 1.0
+
+    def ends_mm(self, axis: int) -> list[float]:
+        """Return the ends of the zone along an axis, none where it takes the whole travel."""
+        part = self.zone_mm[axis]
+        return [] if part is None or not self.has_zone else list(part)
+
+    def factor(self, axis: int, along_mm: FloatArray) -> FloatArray:
+        """Return the factor of one axis in the weight of positions along it, same shape.
+
+        The weight is a product over the axes, so that what depends on one of them stays orthogonal to what depends on
+        another: a table over X must not take up, as a step at the end of the zone, what Y does on the average there.
+        """
+        ends = self.ends_mm(axis)
+        if not ends:
+            return np.ones_like(along_mm)
+        return np.where((along_mm > ends[0]) & (along_mm < ends[1]), self.zone_weight, 1.0)
+
+    def summary(self) -> dict[str, Any]:
+        """Return what ``manifest.json`` says."""
+        zone = {letter: list(part) for letter, part in zip(AXES, self.zone_mm, strict=True) if part is not None}
+        return {
+            "work_zone_mm": zone if self.has_zone else None,
+            "zone_weight": self.zone_weight if self.has_zone else None,
+            "tools_mm": [list(tool) for tool in self.tools_mm],
+        }
+
+    @property
+    def notes(self) -> list[str]:
+        """What the user of the tables should know."""
+        notes = []
+        if self.has_zone:
+            parts = [
+                f"{letter} {part[0]:g} ... {part[1]:g} mm"
+                for letter, part in zip(AXES, self.zone_mm, strict=True)
+                if part
+            ]
+            zone = ", ".join(parts)
+            notes.append(
+                f"The tables are made for the work zone {zone}; a coordinate in it counts {self.zone_weight:g} times."
+            )
+        if self.tools_mm:
+            tools = "; ".join(", ".join(f"{value:g}" for value in tool) for tool in self.tools_mm)
+            notes.append(f"The tables are made for the tool offsets (x, y, z in mm) {tools}, which count alike.")
+        return notes
+
+
+def take_emphasis(root: toml_files.Section, travel_mm: Sequence[Interval]) -> Emphasis:
+    """Take ``work_zone_mm``, ``zone_weight`` and ``tools_mm`` from a machine file."""
+    zone = root.section("work_zone_mm", required=False)
+    parts = [zone.take(letter, toml_files.interval, None) for letter in AXES]
+    zone.finish()
+    for letter, part, (low, high) in zip(AXES, parts, travel_mm, strict=True):
+        if part is not None and (part[0] < low or part[1] > high):
+            raise zone.fail(letter, _outside(letter, part, (low, high)))
+    return Emphasis(
+        zone_mm=(parts[0], parts[1], parts[2]),
+        zone_weight=root.take("zone_weight", zone_weight, ZONE_WEIGHT),
+        tools_mm=root.take("tools_mm", toml_files.vectors3, ()),
+    )
+
+
+def zone_weight(value: Any) -> float:
+    """A weight from 1 to 1000."""
+    result = toml_files.number(value)
+    if not 1.0 <= result <= MOST_ZONE_WEIGHT:
+        raise ValueError(f"a number from 1 (no zone) to {MOST_ZONE_WEIGHT:g} (the zone all but alone) is expected")
+    return result
+
+
+def zone_of(text: str, travel_mm: Sequence[Interval]) -> tuple[Interval | None, Interval | None, Interval | None]:
+    """Read a zone such as ``"X=-400:0,Y=100:300"`` (mm); InputError with what is expected."""
+    found: dict[str, Interval] = {}
+    for part in text.split(","):
+        letter, _, ends = part.strip().partition("=")
+        letter = letter.strip().upper()
+        try:
+            low, high = (float(end) for end in ends.split(":"))
+        except ValueError:
+            low, high = np.nan, np.nan
+        if letter not in AXES or letter in found or not -np.inf < low < high < np.inf:
+            raise InputError(
+                f"--zone: {part.strip()[:40]!r} is not a range; each axis once, lower end first, in mm is expected, "
+                f"e.g. X=-400:0,Y=100:300"
+            )
+        found[letter] = (low, high)
+        travel = travel_mm[AXES.index(letter)]
+        if low < travel[0] or high > travel[1]:
+            raise InputError(f"--zone: {_outside(letter, (low, high), travel)}")
+    return found.get("X"), found.get("Y"), found.get("Z")
+
+
+def _outside(letter: str, part: Interval, travel: Interval) -> str:
+    return (
+        f"the work zone {letter} = {part[0]:g} ... {part[1]:g} mm leaves the travel {travel[0]:g} ... {travel[1]:g} mm; "
+        f"give the part of it within the travel"
+    )
+
+
+# A machine as its TOML file describes it: chain, axes, what the error model contains, settings per control.
+
+
+Reference = Literal["X", "Y"]
+CurveBasis = Literal["linear", "cubic"]
+ErrorSelection = Literal["observable", 17, 21] | tuple[str, ...]
+
+ToolRange = tuple[Interval, Interval, Interval]
+
+#: How far the tool may reach beyond the machine's own offset in X, Y and Z where no file says it, mm.
+ASSUMED_TOOL_MM: Vector3 = (100.0, 100.0, 200.0)
+#: The 24 valid chains: W, every order of X, Y, Z and F, then T.
+CHAINS: tuple[str, ...] = tuple(f"W{''.join(order)}T" for order in permutations("FXYZ"))
+
+
+#: Longest travel and offset of a machine, mm.
+MOST_MM = 1e6
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Kinematic chain from workpiece to tool, e.g. ``WFYXZT``; axes count 0, 1, 2 for X, Y, Z.
+
+    ``workpiece_side`` lists the axes left of F in order from the foundation outwards (the first is next to F),
+    ``tool_side`` those right of F, also from the foundation outwards (the last carries the tool).
+
+    Examples
+    --------
+    >>> import compgen
+    >>> chain = compgen.Chain("WXYFZT")
+    >>> chain.workpiece_side, chain.tool_side
+    ((1, 0), (2,))
+    """
+
+    name: str
+    workpiece_side: tuple[int, ...] = field(init=False)
+    tool_side: tuple[int, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        if self.name not in CHAINS:
+            raise ValueError(
+                f"chain {self.name!r} is not valid: W first, T last, and X, Y, Z, F once each in between, e.g. 'WFYXZT'"
+            )
+        left, _, right = self.name[1:-1].partition("F")
+        object.__setattr__(self, "workpiece_side", tuple(AXES.index(axis) for axis in reversed(left)))
+        object.__setattr__(self, "tool_side", tuple(AXES.index(axis) for axis in right))
+
+    def lever_axes(self, axis: int) -> tuple[int, ...]:
+        """Axes whose travel is part of the lever arm of an angular error of ``axis`` (``docs/conventions.md``)."""
+        if axis in self.tool_side:
+            return self.tool_side[self.tool_side.index(axis) + 1 :]
+        return self.tool_side + self.workpiece_side[: self.workpiece_side.index(axis) + 1]
+
+
+@dataclass(frozen=True, repr=False)
+class Axis(Displayed):
+    """One linear axis: travel range and curve nodes in mm; ``nodes_mm`` has shape (n,) and spans the range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> axis = compgen.Axis((0.0, 600.0), np.linspace(0.0, 600.0, 7))
+    >>> axis
+    <Axis: 0 to 600 mm, 7 nodes>
+    >>> axis.length_mm
+    600.0
+    """
+
+    range_mm: tuple[float, float]
+    nodes_mm: FloatArray
+    expansion_um_per_m_k: float | None = toml_files.setting(toml_files.number, None)
+    screw_pitch_mm: float | None = toml_files.setting(toml_files.positive, None)
+
+    @property
+    def length_mm(self) -> float:
+        """Travel in mm."""
+        return self.range_mm[1] - self.range_mm[0]
+
+    def overview(self) -> Overview:
+        """Travel and number of nodes."""
+        return Overview(f"{self.range_mm[0]:g} to {self.range_mm[1]:g} mm, {len(self.nodes_mm)} nodes")
+
+
+@dataclass(frozen=True, repr=False)
+class Machine(Displayed):
+    """A three-axis machine; ``axes`` holds X, Y, Z in that order, ``errors`` what its model contains.
+
+    ``errors`` is ``"observable"``, 17, 21 or a tuple of names (resolved by :func:`compgen.kinematics.modelled_errors`).
+    ``controllers`` keeps the raw settings of each control; the control itself checks them. ``emphasis`` says where
+    tables have to be best that cannot be good everywhere. ``tool_range_mm`` are the tool offsets that the machine may
+    carry, None if its file does not say. ``effects`` keeps the raw ``[effects.NAME]`` sections, which
+    :func:`compgen.effects.active_effects` reads.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> axis = compgen.Axis((-500.0, 500.0), np.linspace(-500.0, 500.0, 11))
+    >>> machine = compgen.Machine("gantry", compgen.Chain("WFYXZT"), (axis, axis, axis))
+    >>> machine
+    <Machine: gantry, chain WFYXZT>
+    >>> machine.lower_mm.tolist()
+    [-500.0, -500.0, -500.0]
+    """
+
+    name: str
+    chain: Chain
+    axes: tuple[Axis, Axis, Axis]
+    squareness_reference: Reference = "X"
+    tool_offset_mm: Vector3 = (0.0, 0.0, 0.0)
+    reference_point_mm: Vector3 = (0.0, 0.0, 0.0)
+    errors: ErrorSelection = "observable"
+    curves: CurveBasis = "linear"
+    controllers: Mapping[str, toml_files.Section] = field(default_factory=dict)
+    source: Path | None = None
+    emphasis: Emphasis = Emphasis()
+    effects: Mapping[str, toml_files.Section] = field(default_factory=dict)
+    tool_range_mm: ToolRange | None = None
+
+    @property
+    def tool_range(self) -> ToolRange:
+        """Ranges of the tool offset in X, Y and Z, mm, from the machine file, or assumed around its own offset."""
+        if self.tool_range_mm is not None:
+            return self.tool_range_mm
+        x, y, z = ((own - reach, own + reach) for own, reach in zip(self.tool_offset_mm, ASSUMED_TOOL_MM, strict=True))
+        return x, y, z
+
+    @property
+    def tool_range_text(self) -> str:
+        """:attr:`tool_range` in words, and whether it was assumed."""
+        parts = [f"{axis} {low:g} ... {high:g}" for axis, (low, high) in zip(AXES, self.tool_range, strict=True)]
+        assumed = " (assumed; state tool_range_mm in the machine file)" if self.tool_range_mm is None else ""
+        return f"tool offsets {', '.join(parts)} mm{assumed}"
+
+    @property
+    def tool_corners_mm(self) -> list[Vector3]:
+        """Tool offsets at the corners of :attr:`tool_range`, each once."""
+        return list(dict.fromkeys(product(*self.tool_range)))
+
+    @property
+    def lower_mm(self) -> FloatArray:
+        """Lower travel ends, shape (3,)."""
+        return np.array([axis.range_mm[0] for axis in self.axes])
+
+    @property
+    def upper_mm(self) -> FloatArray:
+        """Upper travel ends, shape (3,)."""
+        return np.array([axis.range_mm[1] for axis in self.axes])
+
+    def controller_settings(self, name: str) -> toml_files.Section:
+        """Return a fresh section with the settings of one control (empty if the file has none)."""
+        section = self.controllers.get(name)
+        if section is None:
+            return toml_files.Section({}, path=self.source, name=f"controllers.{name}")
+        return toml_files.Section(section.data, path=section.path, text=section.text, name=section.name)
+
+    def with_setting(self, controller: str, key: str, value: Any) -> Machine:
+        """Return the machine with one setting of one control put in place of what the file says."""
+        section = self.controller_settings(controller)
+        section.data[key] = value
+        return replace(self, controllers={**self.controllers, controller: section})
+
+    def overview(self) -> Overview:
+        """Chain, travel and nodes."""
+        rows = tuple((letter, axis.overview().title) for letter, axis in zip("XYZ", self.axes, strict=True))
+        return Overview(f"{self.name}, chain {self.chain.name}", ("axis", "travel"), rows)
+
+
+def read_machine(path: str | Path) -> Machine:
+    """Read a machine TOML strictly: an unknown key, a wrong unit, a reversed range are errors that say what to do."""
+    return _machine_of(toml_files.read_toml(path), Path(path))
+
+
+def parse_machine(text: str, source: Path) -> Machine:
+    """Read the text of a machine TOML as :func:`read_machine` does; ``source`` is what messages name."""
+    return replace(_machine_of(toml_files.parse_toml(text, source), source), source=None)
+
+
+def _machine_of(root: toml_files.Section, source: Path) -> Machine:
+    name = root.take("name", _name)
+    chain = root.take("chain", Chain)
+    reference = root.take("squareness_reference", toml_files.choice("X", "Y"), "X")
+    tool_offset_mm = root.take("tool_offset_mm", _offset, (0.0, 0.0, 0.0))
+    reference_point_mm = root.take("reference_point_mm", toml_files.vector3, (0.0, 0.0, 0.0))
+    errors: ErrorSelection = root.take("errors", _error_selection, "observable")
+    curves = root.take("curves", toml_files.choice("linear", "cubic"), "linear")
+    axes_section = root.section("axes")
+    axes = [_read_axis(axes_section.section(axis), curves) for axis in AXES]
+    axes_section.finish()
+    controllers_section = root.section("controllers", required=False)
+    controllers = {key: controllers_section.section(key) for key in controllers_section.data}
+    effects_section = root.section("effects", required=False)
+    effects = {key: effects_section.section(key) for key in effects_section.data}
+    for axis_name, axis, reference_mm in zip(AXES, axes, reference_point_mm, strict=True):
+        low, high = axis.range_mm
+        if not low <= reference_mm <= high:
+            raise root.fail(
+                "reference_point_mm",
+                f"{axis_name} = {reference_mm:g} mm lies outside the travel {low:g} ... {high:g} mm; the "
+                f"position-dependent errors are zero there, so it must lie within the travel; set reference_point_mm",
+            )
+    tool_range_mm = _take_tool_range(root, tool_offset_mm)
+    emphasis = take_emphasis(root, [axis.range_mm for axis in axes])
+    root.finish()
+    return Machine(
+        name=name,
+        chain=chain,
+        axes=(axes[0], axes[1], axes[2]),
+        squareness_reference=cast(Reference, reference),
+        tool_offset_mm=tool_offset_mm,
+        reference_point_mm=reference_point_mm,
+        errors=errors,
+        curves=cast(CurveBasis, curves),
+        controllers=controllers,
+        source=source,
+        emphasis=emphasis,
+        effects=effects,
+        tool_range_mm=tool_range_mm,
+    )
+
+
+def _travel(value: object) -> tuple[float, float]:
+    """Lower and upper end of the travel, mm."""
+    lower, upper = toml_files.interval(value)
+    if max(abs(lower), abs(upper)) > MOST_MM:
+        raise ValueError("a range within a kilometre of zero is expected; is the unit mm?")
+    return lower, upper
+
+
+def _offset(value: object) -> Vector3:
+    """A vector from one point of a machine to another, mm."""
+    x, y, z = toml_files.vector3(value)
+    if max(abs(x), abs(y), abs(z)) > MOST_MM:
+        raise ValueError("components of less than a kilometre are expected; is the unit mm?")
+    return x, y, z
+
+
+def _take_tool_range(root: toml_files.Section, own_mm: Vector3) -> ToolRange | None:
+    """Take ``tool_range_mm``: ranges of the tool offset; an axis that is not named has the machine's own offset."""
+    if "tool_range_mm" not in root:
+        return None
+    section = root.section("tool_range_mm")
+    x, y, z = (section.take(axis, toml_files.interval, (own, own)) for axis, own in zip(AXES, own_mm, strict=True))
+    section.finish()
+    return x, y, z
+
+
+def _read_axis(section: toml_files.Section, curves: str) -> Axis:
+    range_mm = section.take("range_mm", _travel)
+    if "nodes_mm" in section or isinstance(section.data.get("nodes"), list):
+        key = "nodes_mm" if "nodes_mm" in section else "nodes"
+        nodes_mm = np.array(section.take(key, toml_files.ascending))
+        if key == "nodes_mm" and "nodes" in section:
+            raise section.fail("nodes", "nodes and nodes_mm are both given; keep one")
+        if abs(nodes_mm[0] - range_mm[0]) > 1e-9 or abs(nodes_mm[-1] - range_mm[1]) > 1e-9:
+            message = f"goes from {nodes_mm[0]:g} to {nodes_mm[-1]:g} mm; first and last node are the ends of range_mm"
+            raise section.fail(key, message)
+    else:
+        nodes_mm = np.linspace(*range_mm, section.take("nodes", toml_files.whole(2, 10001)))
+    if curves == "cubic" and len(nodes_mm) < 4:
+        raise section.fail("nodes", f"{len(nodes_mm)} is too few for curves = 'cubic'; at least 4 are needed")
+    return toml_files.read_settings(Axis, section, range_mm=range_mm, nodes_mm=nodes_mm)
+
+
+def _error_selection(value: Any) -> ErrorSelection:
+    if value == "observable" or (value in (17, 21) and not isinstance(value, bool)):
+        return cast(Literal["observable", 17, 21], value)
+    if not isinstance(value, list) or not value:
+        raise ValueError("'observable', 17, 21 or a list of error names is expected")
+    for name in value:
+        if name not in ERROR_NAMES:
+            raise ValueError(f"{name!r} is not one of the 21 errors; {nearest(str(name), ERROR_NAMES)}")
+    if len(set(value)) != len(value):
+        raise ValueError("each error may be named once")
+    return tuple(name for name in ERROR_NAMES if name in value)
+
+
+def machine_files(folders: tuple[Path, ...] = ()) -> dict[str, Path]:
+    """Return the machine files by the name they declare: the shipped ones, and those in ``folders``.
+
+    Looked for are ``*.toml`` and ``*/machine.toml`` that describe a chain or axes; other files (scenarios, jobs) may lie
+    beside them. A file that is no TOML, and names that several files declare, are left out with a warning: one bad file
+    must not keep the other machines from being used.
+    """
+    found = _declared(folders)
+    for name, paths in found.items():
+        if len(paths) > 1:
+            warnings.warn(f"left out: {_several(name, paths)}", CompgenWarning, stacklevel=2)
+    return {name: paths[0] for name, paths in found.items() if len(paths) == 1}
+
+
+def _several(name: str, paths: Sequence[Path]) -> str:
+    return f"two machines are named {name!r}: {' and '.join(map(str, paths))}; rename one"
+
+
+def _name(value: Any) -> str:
+    """Return the name of a machine, which may be an argument of a command and a cell of a table."""
+    name = toml_files.text(value)
+    if "=" in name or name.lstrip()[0] in "+-@":
+        raise ValueError("a name without '=' that does not begin with '+', '-' or '@' is expected")
+    return name
+
+
+def _declared(folders: tuple[Path, ...]) -> dict[str, list[Path]]:
+    """The files that declare each name; a byte-for-byte copy of a machine from another folder counts once."""
+    found: dict[str, list[Path]] = {}
+    here: dict[str, Path] = {}
+    for folder in dict.fromkeys(path.resolve() for path in (data_folder("machines"), *folders)):
+        for path in sorted([*folder.glob("*.toml"), *folder.glob("*/machine.toml")]):
+            try:
+                root = toml_files.read_toml(path)
+                name = root.take("name", _name) if {"chain", "axes"} & set(root.data) else None
+            except InputError as error:
+                warnings.warn(f"left out of the machines: {error}", CompgenWarning, stacklevel=3)
+                continue
+            if name is None:
+                continue
+            others = found.setdefault(name, [])
+            if here.get(name) == folder or all(other.read_bytes() != path.read_bytes() for other in others):
+                others.append(path)
+            here[name] = folder
+    return found
+
+
+def load_machine(machine: str | Path, folders: tuple[Path, ...] = ()) -> Machine:
+    """Load a machine by the path of its TOML file, or by its name.
+
+    Parameters
+    ----------
+    machine : a path (ends in ``.toml`` or has a folder in it), or a name in the shipped ``machines/``, in a folder
+        ``machines/`` below the working directory, or in ``folders``.
+    folders : further folders to look in.
+
+    Raises
+    ------
+    InputError
+        with file, line and key for anything that is missing, unknown or impossible.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> machine.axes
+    (<Axis: -800 to 0 mm, 11 nodes>, <Axis: -1000 to 0 mm, 11 nodes>, <Axis: -350 to 0 mm, 11 nodes>)
+    """
+    path = Path(machine)
+    if path.suffix == ".toml" or len(path.parts) > 1:
+        return read_machine(path)
+    local = Path("machines")
+    known = _declared((*((local,) if local.is_dir() else ()), *folders))
+    paths = known.get(str(machine), [])
+    if not paths:
+        raise InputError(
+            f"no machine is named {str(machine)!r}; {nearest(str(machine), known)}, or give the path of a TOML file"
+        )
+    if len(paths) > 1:
+        raise InputError(f"{_several(str(machine), paths)}, or give the path of one", file=paths[-1], field="name")
+    return read_machine(paths[0])

@@ -1,0 +1,74 @@
+"""The 21 geometric errors of three linear axes, named as ISO 230-1 does (``docs/conventions.md``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+AXES = ("X", "Y", "Z")
+Kind = Literal["linear", "angular", "squareness"]
+
+#: Sizes of numbers that anybody gives, whatever their unit, but for zero: squares and quotients of them are numbers too.
+SMALLEST, LARGEST = 1e-30, 1e15
+MM_PER_UM = 1e-3
+SECONDS_PER_MIN, SECONDS_PER_HOUR = 60.0, 3600.0
+RAD_PER_URAD = 1e-6
+#: Expanded uncertainties are this many standard ones (about 95 %).
+COVERAGE = 2.0
+
+
+@dataclass(frozen=True)
+class ErrorName:
+    """One geometric error: its kind, the direction it acts in or about, and the axis whose motion has it.
+
+    ``direction`` and ``axis`` count 0, 1, 2 for X, Y, Z (A, B, C for rotations).
+    """
+
+    name: str
+    kind: Kind
+    direction: int
+    axis: int
+
+    @property
+    def unit(self) -> str:
+        """Unit in files: ``um`` for translations, ``urad`` for rotations and squareness."""
+        return "um" if self.kind == "linear" else "urad"
+
+    @property
+    def si_per_unit(self) -> float:
+        """Factor from the file's unit to the program's (mm or rad)."""
+        return MM_PER_UM if self.kind == "linear" else RAD_PER_URAD
+
+    @property
+    def is_straightness(self) -> bool:
+        """Whether it is a translation across the axis' own direction."""
+        return self.kind == "linear" and self.direction != self.axis
+
+
+def _all_errors() -> tuple[ErrorName, ...]:
+    kinds: tuple[tuple[Kind, str], ...] = (("linear", "XYZ"), ("angular", "ABC"))
+    curves = [
+        ErrorName(f"E{letter}{AXES[axis]}", kind, direction, axis)
+        for axis in range(3)
+        for kind, letters in kinds
+        for direction, letter in enumerate(letters)
+    ]
+    squareness = [
+        ErrorName("EC0Y", "squareness", 2, 1),
+        ErrorName("EB0Z", "squareness", 1, 2),
+        ErrorName("EA0Z", "squareness", 0, 2),
+    ]
+    return (*curves, *squareness)
+
+
+#: All 21, in the order of the columns of C: six of X, six of Y, six of Z, then EC0Y, EB0Z, EA0Z.
+ERRORS: tuple[ErrorName, ...] = _all_errors()
+ERROR_NAMES: tuple[str, ...] = tuple(error.name for error in ERRORS)
+ERROR_INDEX: dict[str, int] = {name: k for k, name in enumerate(ERROR_NAMES)}
+CURVE_NAMES: tuple[str, ...] = ERROR_NAMES[:18]
+SQUARENESS_NAMES: tuple[str, ...] = ERROR_NAMES[18:]
+
+
+def error_named(name: str) -> ErrorName:
+    """Return the :class:`ErrorName` of ``name``, e.g. ``"EXX"`` or ``"EC0Y"``; KeyError if there is none."""
+    return ERRORS[ERROR_INDEX[name]]

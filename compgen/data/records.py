@@ -1,0 +1,322 @@
+"""The columns of measurement files, declared once: a schema reads, joins and writes the records, and tells the formats apart.
+
+A record is a frozen dataclass of arrays with one entry (or row) for each line of a file, ``metadata`` for the comments and
+``origin`` for the file and line of every entry. Its schema lists the fields in the order in which they are written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+
+from compgen.data.csv_files import CsvTable, FloatArray, format_csv, names_in_header, read_csv
+from compgen.data.files import read_text
+from compgen.data.messages import repeated
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import InputError
+
+R = TypeVar("R")
+#: Reads one column of a table, shape (rows,).
+ReadColumn = Callable[[CsvTable, str], Any]
+
+POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
+TOOL_COLUMNS = ("tool_x_mm", "tool_y_mm", "tool_z_mm")
+APPROACH_COLUMNS = ("approach_x", "approach_y", "approach_z")
+LABEL_COLUMNS = ("run", "line", "repeat", "block", "setup", "pose")
+COVARIATE_COLUMNS = ("time_s", "feed_mm_min", "load_kg", "u_length_um")
+DEVIATION_COLUMNS = ("dx_um", "dy_um", "dz_um")
+#: Coordinates of features of parts, as they were measured.
+MEASURED_COLUMNS = ("mx_mm", "my_mm", "mz_mm")
+#: Temperatures, of which a file may have any number.
+TEMPERATURES = "temp_*_c"
+#: A deviation beyond this is taken for a slip of unit, um.
+LARGEST_DEVIATION_UM = 1e5
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of a record and the columns that hold it.
+
+    Parameters
+    ----------
+    name : the field.
+    columns : one column for an array (n,), three for one of shape (n, 3).
+    read : how a column is read and checked.
+    unit : factor from the column to the field.
+    digits : decimals in the file.
+    presence : ``required``; ``filled``: columns that a file lacks are ``fill``; ``optional``: as that, but None where the
+        file has none of them; ``complete``: all or none, alike in all files; ``each``: a dict of the columns that
+        are there; ``covariates``: as that, in the order of the file and with its temperatures.
+    fill : value of a column that a file lacks.
+    encode : turns the values into cells of text, as for the letters of axes; None: numbers, or text as it is.
+    """
+
+    name: str
+    columns: tuple[str, ...]
+    read: ReadColumn = CsvTable.numbers
+    unit: float = 1.0
+    digits: int = 6
+    presence: Literal["required", "filled", "optional", "complete", "each", "covariates"] = "required"
+    fill: float = np.nan
+    encode: Callable[[Any], Sequence[str]] | None = None
+
+    def of_table(self, table: CsvTable) -> Any:
+        """Return the values of the field from one file; InputError for columns that are missing or hold something else."""
+        present = [name for name in self.columns if name in table.columns]
+        if self.presence == "each":
+            return {name: self.read(table, name) for name in present}
+        if self.presence == "covariates":
+            known = [name for name in table.columns if name in self.columns or name.startswith("temp_")]
+            # a direction of travel among the covariates is checked as one
+            return {name: table.signs(name) if name == "approach" else table.numbers(name) for name in known}
+        if not present and self.presence in ("optional", "complete"):
+            return None
+        if len(present) < len(self.columns) and self.presence == "complete":
+            raise InputError(f"has {present[0]} but not all of {', '.join(self.columns)}", file=table.path)
+        found = [
+            self.read(table, name) if name in present or self.presence == "required" else np.full(len(table), self.fill)
+            for name in self.columns
+        ]
+        if len(found) > 1:
+            return np.column_stack(found) * self.unit
+        return found[0] if self.unit == 1.0 else found[0] * self.unit
+
+    def cells(self, values: Any) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of a file that hold ``values``; components that were never measured have none."""
+        if isinstance(values, Mapping):
+            return {name: np.asarray(column, dtype=np.float64) for name, column in values.items()}
+        if values is None:
+            return {}
+        if self.encode is not None or not isinstance(values, np.ndarray):
+            return {self.columns[0]: self.encode(values) if self.encode else values}
+        columns = values.T if values.ndim == 2 else [values]
+        found = {name: np.asarray(one / self.unit) for name, one in zip(self.columns, columns, strict=True)}
+        return {name: one for name, one in found.items() if self.presence == "required" or not np.isnan(one).all()}
+
+
+def axes_of(table: CsvTable, column: str) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """Read a column of axis letters as 0, 1, 2 for X, Y, Z."""
+    letters = table.text(column)
+    for row, letter in enumerate(letters):
+        if letter not in AXES:
+            raise table.fail(row, column, f"{letter!r} is not an axis; expected X, Y or Z")
+    return np.array([AXES.index(letter) for letter in letters], dtype=np.int64)
+
+
+def within(most: float, unit: str, doubt: str) -> ReadColumn:
+    """Read numbers of at most ``most`` in size; a larger one is refused with the doubt that it raises."""
+
+    def read(table: CsvTable, column: str) -> FloatArray:
+        values = table.numbers(column)
+        for row in np.flatnonzero(np.abs(values) > most)[:1].tolist():
+            raise table.fail(row, column, f"{values[row]:g} {unit} is {doubt}")
+        return values
+
+    return read
+
+
+def uncertainties(table: CsvTable, column: str) -> FloatArray:
+    """Read standard uncertainties, which are above zero."""
+    values = table.numbers(column)
+    for row in np.flatnonzero(values <= 0)[:1].tolist():
+        raise table.fail(row, column, f"{values[row]:g} um is not a standard uncertainty; it must be above zero")
+    return values
+
+
+def directions(table: CsvTable, column: str) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """Read directions of approach: 1 or -1, nothing else."""
+    values = table.signs(column)
+    for row in np.flatnonzero(values == 0)[:1].tolist():
+        raise table.fail(row, column, "0 is not a direction of approach; expected 1 or -1")
+    return values.astype(np.int64)
+
+
+#: Deviations in um; one beyond 100 mm is taken for a slip of unit.
+deviations_um = within(LARGEST_DEVIATION_UM, "um", "more than 100 mm; is the unit um?")
+
+# Fields that several kinds of record have.
+POSITION = Field("position_mm", POSITION_COLUMNS)
+TOOL = Field("tool_mm", TOOL_COLUMNS, presence="complete")
+APPROACH = Field("approach", APPROACH_COLUMNS, CsvTable.signs, digits=0, presence="optional", fill=0.0)
+LABELS = Field("labels", LABEL_COLUMNS, CsvTable.labels, digits=0, presence="each", fill=0)
+COVARIATES = Field("covariates", (*COVARIATE_COLUMNS, "approach"), presence="covariates")
+AXIS = Field("axis", ("axis",), axes_of, encode=lambda axes: [AXES[k] for k in axes])
+DIRECTION = Field("direction", ("direction",), directions, digits=0)
+RUN = Field("run", ("run",), CsvTable.labels, digits=0)
+#: Actual minus commanded position along a line, of runs along axes and diagonals.
+RUN_DEVIATION = Field("deviation_mm", ("deviation_um",), deviations_um, MM_PER_UM, digits=4)
+
+
+@dataclass(frozen=True)
+class Schema:
+    """The fields of one kind of record.
+
+    ``keys`` are the columns in which no two rows of a file agree, ``needed`` what a file must have of optional columns.
+    """
+
+    fields: tuple[Field, ...]
+    keys: tuple[str, ...] = ()
+    needed: tuple[str, ...] = ()
+
+    def read_table(self, file: str | Path) -> CsvTable:
+        """Read the columns of one file."""
+        required = [name for field in self.fields if field.presence == "required" for name in field.columns]
+        others = [name for field in self.fields if field.presence != "required" for name in field.columns]
+        table = read_csv(file, (*required, *self.needed), others, (TEMPERATURES,))
+        self._check_repeats(table)
+        return table
+
+    def read_tables(self, files: str | Path | Sequence[str | Path]) -> list[CsvTable]:
+        """Read the columns of one or more files; the same rows may not come in twice."""
+        sources = list(files) if isinstance(files, Sequence) and not isinstance(files, str) else [files]
+        if not sources:
+            raise InputError("no measurement file was given")
+        tables = [self.read_table(source) for source in sources]
+        for k, table in enumerate(tables):
+            for earlier in tables[:k]:
+                if table.columns == earlier.columns:
+                    what = f"holds the same rows as {earlier.path}; give each measurement once"
+                    raise InputError(what, file=table.path)
+        return tables
+
+    def values(self, table: CsvTable) -> dict[str, Any]:
+        """Return the fields of a record, with ``metadata`` and ``origin``, from one file."""
+        found = {field.name: field.of_table(table) for field in self.fields}
+        metadata = {key: value for key, value in table.metadata.items() if key != "rows"}
+        return {**found, "metadata": metadata, "origin": [(str(table.path), line) for line in table.lines]}
+
+    def _check_repeats(self, table: CsvTable) -> None:
+        """Two rows that agree in the keys must differ in a label, a direction, the tool or the time."""
+        if not self.keys:
+            return
+        names = (*self.keys, "approach", *APPROACH_COLUMNS, *TOOL_COLUMNS, *LABEL_COLUMNS, "time_s")
+        present = [name for name in names if name in table.columns]
+        found = repeated(zip(*(table.columns[name] for name in present), strict=True))
+        if found is not None:
+            first, row = found
+            keys = [name for name in self.keys if name in present]
+            what = " and ".join(f"{name} {table.columns[name][row]!r}" for name in keys)
+            message = f"{what} already appear in line {table.lines[first]}; give repeats a run or repeat column"
+            raise table.fail(row, keys[-1], message)
+
+    def joined(self, parts: Sequence[R]) -> R:
+        """Return several records as one: labels that some lack are 0, covariates nan, directions unknown.
+
+        Raises
+        ------
+        InputError
+            if only some of them have the tool or uncertainties.
+        """
+        if len(parts) == 1:
+            return parts[0]
+        metadata = {key: value for part in reversed(parts) for key, value in vars(part)["metadata"].items()}
+        values = {field.name: _joined(field, parts) for field in self.fields}
+        return replace(parts[0], **values, metadata=metadata, origin=_chained(parts, "origin"))  # type: ignore[type-var]
+
+    def format(
+        self,
+        record: Any,
+        metadata: Mapping[str, object],
+        others: Mapping[str, FloatArray] | None = None,
+        decimals: Mapping[str, int] | None = None,
+    ) -> str:
+        """Return the text of a file with the record's fields and then ``others``; ``decimals`` of single columns count."""
+        columns: dict[str, Sequence[str] | FloatArray] = {}
+        digits: dict[str, int] = {}
+        for field in self.fields:
+            cells = field.cells(getattr(record, field.name))
+            columns |= cells
+            digits |= dict.fromkeys(cells, field.digits)
+        return format_csv({**columns, **(others or {})}, metadata, digits | dict(decimals or {}))
+
+
+def _chained(parts: Sequence[object], name: str) -> list[Any]:
+    return list(chain.from_iterable(getattr(part, name) for part in parts))
+
+
+def _joined(field: Field, parts: Sequence[Any]) -> Any:
+    """One field of several records."""
+    values = [getattr(part, field.name) for part in parts]
+    if isinstance(values[0], Mapping):
+        kinds = {name: column.dtype for found in values for name, column in found.items()}
+
+        def column(found: Mapping[str, Any], size: int, name: str) -> Any:
+            return found[name] if name in found else np.full(size, field.fill).astype(kinds[name])
+
+        known = list(zip(values, map(len, parts), strict=True))
+        return {name: np.concatenate([column(found, size, name) for found, size in known]) for name in kinds}
+    if all(value is None for value in values):
+        return None
+    lacking = [k for k, value in enumerate(values) if value is None]
+    if lacking and np.isnan(field.fill):
+        origin = parts[lacking[0]].origin
+        message = f"lacks {', '.join(field.columns)}, which another file has; give them in every file"
+        raise InputError(message, file=origin[0][0] if origin else None)
+    if not isinstance(values[0], np.ndarray | None):
+        return type(values[0])(_chained(parts, field.name))
+    return np.concatenate(
+        [np.full((len(part), len(field.columns)), field.fill) if value is None else value
+         for value, part in zip(values, parts, strict=True)]
+    )  # fmt: skip
+
+
+def fail_at(origin: Sequence[tuple[str, int]], row: int, message: str, field: str | None = None) -> InputError:
+    """Return the error that points at one entry of a record."""
+    file, line = origin[row] if origin else (None, None)
+    return InputError(message, file=file, line=line, field=field)
+
+
+# What a file is, by the names in its header.
+
+
+@dataclass(frozen=True)
+class _Signature:
+    """Columns of a native format: any of ``marks`` tells it, ``needed`` are what a file in the format has beside them."""
+
+    kind: str
+    marks: tuple[frozenset[str], ...]
+    needed: frozenset[str] = frozenset()
+
+
+def _any_of(names: Iterable[str]) -> tuple[frozenset[str], ...]:
+    return tuple(frozenset({name}) for name in names)
+
+
+_PLACE = frozenset(POSITION_COLUMNS)
+_SIGNATURES = (
+    _Signature("sixdof", _any_of(("y_qd1_mm", "y_psd1_mm"))),
+    _Signature("part", _any_of(MEASURED_COLUMNS), frozenset(POSITION_COLUMNS[:2])),
+    _Signature("lengths", _any_of(("length_mm",)), _PLACE | {"station", "point"}),
+    _Signature("axis", (frozenset({"axis", "position_mm", "deviation_um"}),), frozenset({"direction", "run"})),
+    _Signature("diagonals", (frozenset({"diagonal", "deviation_um"}),), _PLACE),
+    _Signature("errors", (frozenset({"error", "position_mm", "value"}),)),
+    _Signature("sixdof", (frozenset({"axis", "position_mm", "displacement_mm"}),)),
+    _Signature("deviations", _any_of(DEVIATION_COLUMNS), _PLACE),
+)
+
+
+def format_of_columns(names: set[str], *, complete: bool = False) -> str | None:
+    """Return the native format that a header is meant to be, None for a foreign one.
+
+    Parameters
+    ----------
+    names : columns of the file.
+    complete : only a header that has all columns that tell the format from tables of other programs.
+    """
+    for signature in _SIGNATURES:
+        if any(marks <= names for marks in signature.marks) and (not complete or signature.needed <= names):
+            return signature.kind
+    return None
+
+
+def detect_format(source: str | Path) -> str | None:
+    """Return what a measurement file is meant to be by its columns.
+
+    ``lengths``, ``deviations``, ``part``, ``axis``, ``diagonals``, ``sixdof``, ``errors``, or None.
+    """
+    return format_of_columns(names_in_header(read_text(source)))

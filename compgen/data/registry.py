@@ -1,0 +1,208 @@
+"""Plug-ins: things of third parties that enter a registry, checked at that moment.
+
+A plug-in is a Python file, a package folder, or an entry point of an installed distribution. A file or folder holds the
+same dicts as compgen itself, e.g. ``CONTROLLERS = {"my-csv": MyCsv()}``. Whatever is wrong with it is said when it is
+registered, with the place; nothing of it is taken then.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import re
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.machinery import ModuleSpec
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from compgen.data.messages import one_line
+from compgen.errors import CompgenWarning, InputError
+
+_NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+#: What a fault in the code of a plug-in may raise while it is imported; ``sys.exit`` in it must not end the program.
+_FAULTS = (Exception, SystemExit)
+#: How the origin of a plug-in from a path begins.
+PATH_ORIGIN = "plug-in "
+#: Why an entry point of an installed distribution is not available, by word of its kind and name.
+_BROKEN: dict[tuple[str, str], str] = {}
+
+
+def why_missing(word: str, name: str) -> str:
+    """Return the reason, for the end of a message, if ``name`` would come from an entry point that is broken."""
+    reason = _BROKEN.get((word, name))
+    return f"; {reason}" if reason else ""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of thing that plug-ins may add.
+
+    Parameters
+    ----------
+    word : its name in messages, e.g. ``"control"``.
+    attribute : name of the dict in a plug-in's file, e.g. ``"CONTROLLERS"``.
+    group : group of entry points, e.g. ``"compgen.controllers"``.
+    registry : the dict that receives it, by name.
+    check : takes name and thing, returns the thing to register and everything that is wrong with it, in words.
+    origins : where each thing of a plug-in came from, by name.
+    """
+
+    word: str
+    attribute: str
+    group: str
+    registry: dict[str, Any]
+    check: Callable[[str, Any], tuple[Any, list[str]]]
+    origins: dict[str, str] = field(default_factory=dict)
+
+    def register(self, name: str, thing: Any, origin: str) -> None:
+        """Add a thing of the plug-in ``origin``; InputError with everything that is wrong with it."""
+        thing, problems = self.check(name, thing) if isinstance(name, str) else (thing, [])
+        problems = [*_name_problems(name, self), *problems]
+        if problems:
+            file, line = _place_of(thing)
+            what = f"{origin}: the {self.word} {name!r} cannot be registered: {'; '.join(problems)}"
+            raise InputError(what, file=file, line=line)
+        self.registry[name] = thing
+        self.origins[name] = origin
+
+
+def _name_problems(name: Any, kind: Kind) -> list[str]:
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name) > 40:
+        return ["its name has to be lower-case letters and digits with single '-' between them, e.g. 'my-csv'"]
+    if name in kind.registry:
+        return [f"the name is taken by {kind.origins.get(name, 'a built-in one')}; choose another"]
+    return []
+
+
+def _place_of(thing: Any) -> tuple[str | None, int | None]:
+    """File and line where the code of a thing begins, as far as it is known."""
+    code = thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing)
+    try:
+        return inspect.getsourcefile(code), inspect.getsourcelines(code)[1]
+    except (OSError, TypeError):
+        return None, None
+
+
+def call_problem(function: Any, arguments: Sequence[str], what: str) -> list[str]:
+    """Say what is wrong if ``function`` cannot be called with these arguments, in their order and by their names."""
+    due = f"{what}({', '.join(arguments)})"
+    if not callable(function):
+        return [f"{due} is missing" if function is None else f"{what} is not a function; expected {due}"]
+    try:
+        signature = inspect.signature(function)
+        signature.bind(*arguments)
+        return []
+    except (TypeError, ValueError):
+        return [f"{what}{signature} cannot be called as {due}"]
+
+
+def load_file(path: str | Path, kinds: Sequence[Kind]) -> None:
+    """Import the plug-in in a ``.py`` file or package folder and register what it holds; a second time does nothing."""
+    source = Path(path).resolve()
+    file = source / "__init__.py" if source.is_dir() else source
+    if not file.is_file():
+        raise InputError("no such plug-in; give a .py file or a folder with an __init__.py", file=file)
+    if file.suffix != ".py":
+        raise InputError("is not a Python file; a plug-in is a .py file or a folder with an __init__.py", file=file)
+    origin = f"{PATH_ORIGIN}{source}"
+    if any(origin in kind.origins.values() for kind in kinds):
+        return
+    name = f"compgen_plugin_{hashlib.sha256(str(file).encode()).hexdigest()[:12]}"
+    _register_all(_import(name, file, source.is_dir(), origin), file, origin, kinds)
+
+
+def _import(name: str, file: Path, package: bool, origin: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(
+        name, file, submodule_search_locations=[str(file.parent)] if package else None
+    )
+    assert isinstance(spec, ModuleSpec) and spec.loader is not None  # true for every .py file
+    module = importlib.util.module_from_spec(spec)
+    _forget(name)
+    sys.modules[name] = module  # dataclasses and relative imports look there
+    try:
+        spec.loader.exec_module(module)
+    except _FAULTS as error:
+        _forget(name)
+        raise _import_error(error, origin, file) from error
+    return module
+
+
+def _forget(name: str) -> None:
+    """Take a plug-in and its parts out of the loaded modules, so that they are read again."""
+    for loaded in [key for key in sys.modules if key == name or key.startswith(f"{name}.")]:
+        del sys.modules[loaded]
+
+
+def _import_error(error: BaseException, origin: str, file: Path | None) -> InputError:
+    """Name the file and line of a fault: that of the syntax, else the innermost line of the plug-in's own code."""
+    message = f"{origin} cannot be imported: {type(error).__name__}: {one_line(error)}"
+    if isinstance(error, SyntaxError) and error.filename:
+        return InputError(message, file=error.filename, line=error.lineno)
+    folder = file.parent if file else None
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if path.is_file() and (folder is None or path.resolve().is_relative_to(folder)):
+            return InputError(message, file=path, line=frame.lineno)
+    return InputError(message, file=file)
+
+
+def _register_all(module: ModuleType, file: Path, origin: str, kinds: Sequence[Kind]) -> None:
+    found: list[tuple[Kind, str, Any]] = []
+    for kind in kinds:
+        things = getattr(module, kind.attribute, None)
+        if things is not None and not isinstance(things, Mapping):
+            raise InputError(f"{origin}: {kind.attribute} has to be a dict from names to {kind.word}s", file=file)
+        found += [(kind, name, thing) for name, thing in (things or {}).items()]
+    if not found:
+        dicts = ", ".join(f"{kind.attribute} ({kind.word}s by name)" for kind in kinds)
+        raise InputError(f"{origin} holds nothing to register; expected at least one dict: {dicts}", file=file)
+    with restored(kinds, only_after_errors=True):
+        for kind, name, thing in found:
+            kind.register(name, thing, origin)
+
+
+def load_entry_points(kinds: Sequence[Kind]) -> None:
+    """Register the entry points of installed distributions; a broken one is a warning, and its name unavailable."""
+    installed = entry_points()
+    for kind in kinds:
+        for entry in installed.select(group=kind.group):
+            if kind.origins.get(entry.name) != _origin(entry):
+                origin = _origin(entry)
+                try:
+                    try:
+                        thing = entry.load()
+                    except _FAULTS as error:
+                        raise _import_error(error, origin, None) from error
+                    kind.register(entry.name, thing, origin)
+                except InputError as error:
+                    if entry.name not in kind.registry:
+                        _BROKEN[kind.word, entry.name] = str(error)
+                    warnings.warn(f"left out: {error}", CompgenWarning, stacklevel=4)
+
+
+def _origin(entry: EntryPoint) -> str:
+    package = f" of {entry.dist.name} {entry.dist.version}" if entry.dist else ""
+    return f"entry point {entry.name} = {entry.value}{package}"
+
+
+@contextmanager
+def restored(kinds: Sequence[Kind], *, only_after_errors: bool = False) -> Iterator[None]:
+    """Put the registries back to what they were before, always or only if an error leaves the block."""
+    before = [(item, dict(item)) for kind in kinds for item in (kind.registry, kind.origins)]
+    failed = True
+    try:
+        yield
+        failed = False
+    finally:
+        if failed or not only_after_errors:
+            for item, contents in before:
+                item.clear()
+                item.update(contents)

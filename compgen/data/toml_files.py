@@ -1,0 +1,439 @@
+"""Strict reading of TOML: every key is taken by a reader, the rest is an error that names the nearest known key.
+
+A :class:`Section` is one table of a file. A dataclass whose fields are declared with :func:`setting` is read by
+:func:`read_settings`; a reader with rules of its own takes key by key. The checks at the end say what a value may be.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar, cast, overload
+
+from compgen.data.files import read_text
+from compgen.data.messages import nearest, visible_line
+from compgen.data.names import AXES, LARGEST, SMALLEST
+from compgen.errors import InputError
+
+T = TypeVar("T")
+D = TypeVar("D")
+_REQUIRED = object()
+
+
+@dataclass(frozen=True)
+class RequestedKey:
+    """A key that a reader asked for: its name with those of sub-sections, its default unless required, its check."""
+
+    key: str
+    required: bool
+    default: Any
+    check: Callable[[Any], Any]
+
+    @property
+    def allowed(self) -> str:
+        """What the check says that it expects: its message about something that fits nowhere."""
+        message = _refusal(self.check, object())
+        if message == _refusal(number, object()):
+            message = _refusal(self.check, -1.0) or message
+        return re.sub(r"\s+(is|are) expected\b", "", message).rstrip(",")
+
+
+class Section:
+    """One table of a TOML file whose keys are taken one by one.
+
+    ``take`` checks and returns a value, ``section`` descends, ``finish`` raises for a key that nobody took.
+    """
+
+    def __init__(self, data: Mapping[str, Any], *, path: Path | None, text: str = "", name: str = "") -> None:
+        self.data, self.path, self.text, self.name = dict(data), path, text, name
+        self._nth = 0  # which of the tables of that name, for an array of tables
+        self._known: set[str] = set()
+        self._asked: dict[str, RequestedKey | Section] = {}
+
+    @property
+    def asked(self) -> list[RequestedKey]:
+        """What was taken so far, in its order, also in sub-sections (``axis_names.X``)."""
+        found: list[RequestedKey] = []
+        for key, item in self._asked.items():
+            if isinstance(item, RequestedKey):
+                found.append(item)
+            else:  # a sub-section; one without a key so far stands for itself
+                inner = [replace(one, key=f"{key}.{one.key}") for one in item.asked]
+                found += inner or [RequestedKey(key, False, None, table)]
+        return found
+
+    def fail(self, key: str, message: str) -> InputError:
+        """Return the error that points at ``key`` of this section."""
+        place = f"[{self.name}] {key}" if self.name else key
+        return InputError(message, file=self.path, line=self._line_of(key), field=visible_line(place))
+
+    def __contains__(self, key: str) -> bool:
+        """Whether the file holds ``key``; asking makes the key a known one."""
+        self._known.add(key)
+        return key in self.data
+
+    @overload
+    def take(self, key: str, check: Callable[[Any], T]) -> T: ...
+    @overload
+    def take(self, key: str, check: Callable[[Any], T], default: D) -> T | D: ...
+    def take(self, key: str, check: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
+        """Return the checked value of ``key``; ``check`` raises ValueError with what is expected."""
+        self._asked[key] = RequestedKey(key, default is _REQUIRED, None if default is _REQUIRED else default, check)
+        if key not in self:
+            if default is _REQUIRED:
+                raise self.fail(key, f"is missing{self._misspelt(key)}")
+            return default
+        try:
+            return check(self.data[key])
+        except ValueError as error:
+            raise self.fail(key, f"{error}; got {visible_line(repr(self.data[key]))[:80]}") from None
+
+    def _misspelt(self, key: str) -> str:
+        """The end of a message about a missing ``key``: a key of the file that was probably meant for it."""
+        present = [name for name in self.data if name not in self._known]
+        # another case, or the unit was left out
+        alike = [name for name in present if f"{key}_".lower().startswith(f"{name}_".lower())]
+        alike = alike or difflib.get_close_matches(key, present, n=1, cutoff=0.6)
+        return f"; {visible_line(alike[0])!r} is not a key here, did you mean {key!r}?" if alike else ""
+
+    def section(self, key: str, *, required: bool = True) -> Section:
+        """Return the sub-section ``key`` (an empty one if it is absent and not required)."""
+        full = f"{self.name}.{key}" if self.name else key
+        value = self.take(key, table) if required else self.take(key, table, {})
+        inner = Section(value, path=self.path, text=self.text, name=full)
+        self._asked[key] = inner
+        return inner
+
+    def sections(self, key: str) -> list[Section]:
+        """Return the sub-sections of an array of tables (``[[key]]``), empty if absent."""
+        full = f"{self.name}.{key}" if self.name else key
+        tables = self.take(key, _tables, [])
+        found = [Section(table, path=self.path, text=self.text, name=full) for table in tables]
+        for nth, section in enumerate(found):
+            section._nth = nth
+        return found
+
+    def file(self, key: str) -> Path | None:
+        """Return the path of an existing file, None if ``key`` is absent; relative to the folder of the TOML file."""
+        name = self.take(key, text_of_path, None)
+        return None if name is None else self._existing(key, name)
+
+    def files(self, key: str) -> tuple[Path, ...]:
+        """Return the paths of existing files, from one path or a list of paths; none if ``key`` is absent."""
+        return tuple(self._existing(key, name) for name in self.take(key, texts_of_paths, ()))
+
+    def _existing(self, key: str, name: str) -> Path:
+        path = (self.path.parent if self.path else Path()) / name
+        if not path.is_file():
+            raise self.fail(key, f"no such file: {path}; give the path of a file")
+        return path
+
+    def finish(self) -> None:
+        """Raise InputError for the first key that was never asked for."""
+        for key in self.data:
+            if key not in self._known:
+                raise self.fail(key, f"is not a known key; {nearest(key, self._known)}")
+
+    def _line_of(self, key: str) -> int | None:
+        """Line of ``key``, or of its table's header if the file does not have the key."""
+        full = f"{self.name}.{key}" if self.name else key
+        inside, count, own = not self.name, -1, None
+        for number, line in enumerate(self.text.split("\n"), start=1):
+            header = re.match(r"\s*\[\[?\s*([^\[\],]+?)\s*\]\]?\s*(#.*)?$", line)
+            if header:
+                table = re.sub(r"[\"' ]", "", header.group(1))
+                count += table == self.name
+                inside = table == self.name and count == self._nth
+                own = number if inside else own
+                if table == full and max(count, 0) == self._nth:
+                    return number
+            elif inside and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line):
+                return number
+        return own
+
+
+def read_toml(path: str | Path) -> Section:
+    """Read a TOML file as the root :class:`Section`; a syntax error, also a doubled key or table, is an InputError."""
+    return parse_toml(read_text(path), Path(path))
+
+
+def parse_toml(text: str, source: Path) -> Section:
+    """Read the text of the TOML file ``source`` as :func:`read_toml` does."""
+    if not text.strip():
+        raise InputError("is empty", file=source)
+    try:
+        return Section(tomllib.loads(text), path=source, text=text)
+    except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
+        found = re.search(r"line (\d+)", str(error))
+        line = int(found.group(1)) if found else len(text.splitlines())
+        raise InputError(f"is not valid TOML: {error}", file=source, line=line) from error
+
+
+def _refusal(check: Callable[[Any], Any], value: Any) -> str:
+    """The message of a check about a value, empty if it takes it or is not prepared for it."""
+    try:
+        check(value)
+    except ValueError as error:
+        return str(error)
+    except Exception:  # a check that takes texts for granted
+        return ""
+    return ""
+
+
+# --- settings: declared once as fields of a dataclass, read from a section ---------------------------------------
+
+
+def setting(
+    check: Callable[[Any], Any],
+    default: Any = _REQUIRED,
+    *,
+    key: str = "",
+    unit: float = 1.0,
+    required: bool = False,
+    stated: Any = None,
+    meaning: str = "",
+) -> Any:
+    """Declare a field of a dataclass as a setting.
+
+    Parameters
+    ----------
+    check : returns the clean value of the file or raises ValueError with what is expected.
+    default : value of the field where the file does not have the key; without one the key is required.
+    stated : the default as a file would have it, in place of ``default``.
+    meaning : for the card of a control, in a few words.
+    key : the key of the file if it is not the name of the field.
+    unit : factor from the numbers of the file to those of the field.
+    required : the file must have the key though the field has a default for programs.
+    """
+    if stated is not None:
+        default = check(stated) if unit == 1.0 else unit * check(stated)
+    metadata = {"check": check, "key": key, "unit": unit, "required": required or default is _REQUIRED}
+    metadata |= {"stated": default if stated is None and unit == 1.0 else stated, "meaning": meaning}
+    return field(metadata=metadata) if default is _REQUIRED else field(default=default, metadata=metadata)
+
+
+def axis_setting(
+    check: Callable[[Any], Any],
+    defaults: tuple[Any, Any, Any] = (None, None, None),
+    *,
+    key: str = "",
+    unit: float = 1.0,
+    differ: str = "",
+    meaning: str = "",
+) -> Any:
+    """Declare a field with a value for each of X, Y and Z, from a sub-section with these keys.
+
+    ``differ`` is the message if two axes have the same value, in which ``{}`` becomes the three of them; by default they
+    may be the same. The other parameters are those of :func:`setting`.
+    """
+    metadata = {"check": check, "key": key, "unit": unit, "axes": defaults, "differ": differ, "meaning": meaning}
+    return field(default=defaults, metadata=metadata)
+
+
+def take_axes(section: Section, item: Field[Any]) -> tuple[Any, Any, Any]:
+    """Return the values of X, Y and Z of a field that :func:`axis_setting` declares."""
+    data, key = item.metadata, item.metadata["key"] or item.name
+    part = section.section(key, required=False)
+    found = tuple(part.take(letter, data["check"], default) for letter, default in zip(AXES, data["axes"], strict=True))
+    part.finish()
+    if data["differ"] and len(set(found)) < 3:
+        raise section.fail(key, data["differ"].format(", ".join(map(str, found))))
+    x, y, z = (value if value is None or data["unit"] == 1.0 else data["unit"] * value for value in found)
+    return x, y, z
+
+
+def meanings_of(kind: type) -> dict[str, str]:
+    """Return what the settings of a dataclass mean, by their keys in a file."""
+    if not is_dataclass(kind):
+        return {}
+    declared = [item for item in fields(kind) if item.metadata.get("meaning")]
+    return {item.metadata["key"] or item.name: item.metadata["meaning"] for item in declared}
+
+
+def take_settings(kind: type[T], section: Section, /, **given: Any) -> T:
+    """Return a ``kind`` with the settings that it declares from a section, and the fields that are ``given``."""
+    for item in fields(cast(Any, kind)):
+        if "check" not in item.metadata or item.name in given:
+            continue
+        if "axes" in item.metadata:
+            given[item.name] = take_axes(section, item)
+            continue
+        key, check, unit = (item.metadata[name] for name in ("key", "check", "unit"))
+        key, default = key or item.name, item.metadata["stated"]
+        found = section.take(key, check, *(() if item.metadata["required"] else (default,)))
+        if key in section:
+            scaled = [unit * value for value in found] if isinstance(found, tuple) and unit != 1.0 else None
+            given[item.name] = tuple(scaled) if scaled else found if unit == 1.0 else unit * found
+    return kind(**given)
+
+
+def read_settings(kind: type[T], section: Section, /, **given: Any) -> T:
+    """Return a ``kind`` as :func:`take_settings` does; a key of the section that it does not know is an error."""
+    result = take_settings(kind, section, **given)
+    section.finish()
+    return result
+
+
+# --- checks: each returns the clean value or raises ValueError with what is expected -----------------------------
+
+
+def number(value: Any) -> float:
+    """A finite number; zero, or of a size from SMALLEST to LARGEST, so that its square is one as well."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < math.inf:
+        raise ValueError("a finite number is expected")
+    if not (value == 0 or SMALLEST <= abs(value) <= LARGEST):
+        raise ValueError(f"a finite number is expected: 0, or a size from {SMALLEST:g} to {LARGEST:g}")
+    return float(value)
+
+
+def positive(value: Any) -> float:
+    """A finite number above zero."""
+    result = number(value)
+    if result <= 0:
+        raise ValueError("a number above zero is expected")
+    return result
+
+
+def not_negative(value: Any) -> float:
+    """A finite number, zero or more."""
+    result = number(value)
+    if result < 0:
+        raise ValueError("a number that is not negative is expected")
+    return result
+
+
+def whole(minimum: int, maximum: int | None = None) -> Callable[[Any], int]:
+    """A whole number within limits."""
+
+    def check(value: Any) -> int:
+        upper = math.inf if maximum is None else maximum
+        if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= upper:
+            limits = f"from {minimum} to {maximum}" if maximum is not None else f"of at least {minimum}"
+            raise ValueError(f"a whole number {limits} is expected")
+        return value
+
+    return check
+
+
+def flag(value: Any) -> bool:
+    """``true`` or ``false``."""
+    if not isinstance(value, bool):
+        raise ValueError("true or false is expected")
+    return value
+
+
+def text(value: Any) -> str:
+    """One line of text, at most 200 characters."""
+    if not isinstance(value, str) or not value.strip() or len(value) > 200 or any(ord(char) < 32 for char in value):
+        raise ValueError("one line of text is expected")
+    return value
+
+
+def name(value: Any) -> str:
+    """A text without "=", which separates a name from its value in comments and commands."""
+    if "=" in text(value):
+        raise ValueError("a name without '=' is expected")
+    return str(value)
+
+
+def text_of_path(value: Any) -> str:
+    """A path as text: not empty, without control characters."""
+    if not isinstance(value, str) or not value.strip() or any(ord(char) < 32 for char in value):
+        raise ValueError("the path of a file is expected")
+    return value
+
+
+def texts_of_paths(value: Any) -> tuple[str, ...]:
+    """A path, or a list of paths, as text."""
+    if isinstance(value, list) and value:
+        return tuple(text_of_path(item) for item in value)
+    if not isinstance(value, str):
+        raise ValueError("the path of a file, or a list of paths, is expected")
+    return (text_of_path(value),)
+
+
+def choice(*allowed: str) -> Callable[[Any], str]:
+    """One of the given words."""
+
+    def check(value: Any) -> str:
+        if value not in allowed:
+            raise ValueError(f"one of {', '.join(map(repr, allowed))} is expected")
+        return str(value)
+
+    return check
+
+
+def word_for(values: Mapping[str, T]) -> Callable[[Any], T]:
+    """One of the given words, as the value that it stands for."""
+    check = choice(*values)
+    return lambda value: values[check(value)]
+
+
+def share(most: float, whole: str) -> Callable[[Any], float]:
+    """A number from 0 to ``most``, which is a share of ``whole`` (for the message)."""
+
+    def check(value: Any) -> float:
+        result = not_negative(value)
+        if result > most:
+            raise ValueError(f"a share of {whole} from 0 to {most:g} is expected")
+        return result
+
+    return check
+
+
+def numbers(value: Any) -> tuple[float, ...]:
+    """A list of finite numbers."""
+    if not isinstance(value, list):
+        raise ValueError("a list of numbers is expected")
+    return tuple(number(item) for item in value)
+
+
+def vector3(value: Any) -> tuple[float, float, float]:
+    """Three finite numbers, for X, Y and Z."""
+    if not isinstance(value, list) or len(value) != 3:
+        raise ValueError("three numbers, for X, Y and Z, are expected")
+    x, y, z = (number(item) for item in value)
+    return x, y, z
+
+
+def vectors3(value: Any) -> tuple[tuple[float, float, float], ...]:
+    """A list of tool offsets, each three finite numbers."""
+    if not isinstance(value, list) or not value:
+        raise ValueError("a list of tool offsets [[x, y, z], ...] is expected")
+    return tuple(vector3(item) for item in value)
+
+
+def interval(value: Any) -> tuple[float, float]:
+    """Two finite numbers, the lower one first."""
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError("two numbers [lower, upper] are expected")
+    lower, upper = number(value[0]), number(value[1])
+    if lower >= upper:
+        raise ValueError("a range [lower, upper] with the lower number first is expected")
+    return lower, upper
+
+
+def ascending(value: Any) -> tuple[float, ...]:
+    """At least two numbers in ascending order."""
+    items = numbers(value)
+    if len(items) < 2 or any(b <= a for a, b in zip(items, items[1:], strict=False)):
+        raise ValueError("at least two numbers in ascending order are expected")
+    return items
+
+
+def table(value: Any) -> dict[str, Any]:
+    """A table of keys and values."""
+    if not isinstance(value, dict):
+        raise ValueError("a table ([section]) is expected")
+    return value
+
+
+def _tables(value: Any) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise ValueError("an array of tables ([[section]]) is expected")
+    return value

@@ -1,0 +1,355 @@
+"""The base model (smooth error curves, squareness, stations) and its nonlinear least-squares fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
+from compgen.data.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
+from compgen.diagnose.observed import Observed
+from compgen.effects import Effect, Readings
+from compgen.errors import InputError
+from compgen.kinematics.curves import hat_matrix, spline_matrix
+from compgen.kinematics.exact_chain import exact_columns
+from compgen.kinematics.first_order import modelled_errors
+
+# The base model of a diagnosis: smooth curves for the errors of the machine file, rich enough for the data.
+#
+# Legendre polynomials, because the positions of lines and diagonals form no grid; where the data ask for more, higher
+# degrees or the curves of the machine file between its nodes are added. What cannot be told apart is left to the rank.
+
+
+T = TypeVar("T")
+
+#: Degree of the curves, if there are enough levels; and of those of an axis that asks for more.
+DEGREE, HIGHER_DEGREE = 7, 11
+#: Readings at distinct poses for each unknown of the curves; a smaller degree would leave errors of the machine over.
+READINGS_PER_UNKNOWN = 2
+#: A position this near a node is at it, mm.
+SAME_MM = 1e-3
+#: Nodes beyond this are not tried as a richer basis.
+MOST_NODES = 40
+
+
+def legendre(s: FloatArray, degree: int) -> FloatArray:
+    """Legendre polynomials P0 ... P_degree at ``s`` (m,), shape (m, degree + 1)."""
+    return np.asarray(np.polynomial.legendre.legvander(s, degree))
+
+
+@dataclass(frozen=True)
+class CurveBasis:
+    """Basis of the curves of the three axes: ``degree`` of the polynomials, ``nodal`` where nodes are added.
+
+    ``span_mm``: lowest and highest position of each axis over which the polynomials run; default its travel. Over a part
+    of the travel, those of the whole would be nearly alike.
+    """
+
+    machine: Machine
+    errors: tuple[str, ...]
+    degree: tuple[int, int, int]
+    nodal: tuple[bool, bool, bool] = (False, False, False)
+    span_mm: tuple[tuple[float, float], ...] = ()
+
+    def _span(self, axis: int) -> tuple[float, float]:
+        return self.span_mm[axis] if self.span_mm else self.machine.axes[axis].range_mm
+
+    def with_axis(self, axis: int, other: CurveBasis) -> CurveBasis:
+        """Return the basis with the curves of one axis as in another basis."""
+        degree = _with(self.degree, axis, other.degree[axis])
+        return replace(self, degree=degree, nodal=_with(self.nodal, axis, other.nodal[axis]))
+
+    def of_axis(self, axis: int, position_mm: FloatArray) -> FloatArray:
+        """Basis of an axis at positions (m,): polynomials P1, P2 ..., then nodal curves, (m, k)."""
+        item = self.machine.axes[axis]
+        low, high = self._span(axis)
+        s = (2.0 * position_mm - low - high) / (high - low)
+        columns = legendre(s, self.degree[axis])[:, 1:]
+        if not self.nodal[axis]:
+            return columns
+        build = spline_matrix if self.machine.curves == "cubic" else hat_matrix
+        return np.hstack([columns, build(item.nodes_mm, position_mm)])
+
+    def _zeroed(self, axis: int, position_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Bases of an axis zero at the reference point, and zero at both ends of the span, each (m, k)."""
+        start, end = self._span(axis)
+        fixed = np.array([np.clip(self.machine.reference_point_mm[axis], start, end), start, end])
+        whole = self.of_axis(axis, np.concatenate([fixed, position_mm]))
+        reference, low, high, columns = whole[0], whole[1], whole[2], whole[3:]
+        share = ((position_mm - start) / (end - start))[:, None]
+        return columns - reference, (columns - (1.0 - share) * low - share * high)[:, 1:]
+
+    def parts(self, position_mm: FloatArray) -> list[Part]:
+        """Name, place in the vector of unknowns and basis (m, k) of every error at positions (m, 3)."""
+        bases = [self._zeroed(axis, position_mm[:, axis]) for axis in range(3)]
+        parts: list[Part] = []
+        start = 0
+        for name in self.errors:
+            if name in SQUARENESS_NAMES:
+                part = np.ones((len(position_mm), 1))
+            else:
+                error = error_named(name)
+                part = bases[error.axis][1 if error.is_straightness else 0]
+            parts.append(Part(name, slice(start, start + part.shape[1]), part))
+            start += part.shape[1]
+        return parts
+
+
+@dataclass(frozen=True)
+class Part:
+    """One error: its name, its place in the vector of unknowns, its basis at the poses (m, k)."""
+
+    name: str
+    place: slice
+    basis: FloatArray
+
+
+def size_of(parts: Sequence[Part]) -> int:
+    """Number of unknowns of all errors."""
+    return parts[-1].place.stop if parts else 0
+
+
+def names_of(parts: Sequence[Part]) -> list[str]:
+    """Error of every unknown."""
+    return [part.name for part in parts for _ in range(part.basis.shape[1])]
+
+
+def values_of(parts: Sequence[Part], unknowns: FloatArray, poses: int) -> FloatArray:
+    """All 21 errors (poses, 21) for the unknowns, mm and rad."""
+    values = np.zeros((poses, len(ERROR_INDEX)))
+    for part in parts:
+        values[:, ERROR_INDEX[part.name]] = part.basis @ unknowns[part.place]
+    return values
+
+
+def tip_columns(parts: Sequence[Part], columns: FloatArray) -> FloatArray:
+    """Derivative of the tip by the unknowns, (3, m, k); ``columns`` (m, 3, 21) is that by the errors."""
+    design = np.empty((3, len(columns), size_of(parts)))
+    for part in parts:
+        own = columns[:, :, ERROR_INDEX[part.name]]
+        for k in range(3):
+            np.multiply(own[:, k, None], part.basis, out=design[k, :, part.place])
+    return design
+
+
+def base_errors(machine: Machine) -> tuple[str, ...]:
+    """Errors of the base model: those of the machine file with its own tool; what other tools show is an effect."""
+    return modelled_errors(machine)
+
+
+def first_basis(machine: Machine, position_mm: FloatArray, readings: int, poses: int) -> CurveBasis:
+    """Return the smooth basis that ``readings`` at ``poses`` distinct positions can carry."""
+    errors = base_errors(machine)
+    curves = sum(name not in SQUARENESS_NAMES for name in errors)
+    most = max(2, int(min(readings, 3 * poses) / READINGS_PER_UNKNOWN / max(curves, 1)))
+    degree, nodal, span = [], [], []
+    for axis in range(3):
+        levels = np.unique(np.round(position_mm[:, axis], 3))
+        degree.append(max(1, min(DEGREE, len(levels) - 1, most)))
+        nodal.append(len(levels) <= min(most, MOST_NODES) and _at_nodes(machine, axis, levels))
+        moved = len(levels) > 1
+        span.append((float(levels[0]), float(levels[-1])) if moved else machine.axes[axis].range_mm)
+    return CurveBasis(machine, errors, (degree[0], degree[1], degree[2]), (nodal[0], nodal[1], nodal[2]), tuple(span))
+
+
+def _at_nodes(machine: Machine, axis: int, levels_mm: FloatArray) -> bool:
+    """Whether an axis was measured at nodes of the machine file only: then its curves are free at every level."""
+    nodes = machine.axes[axis].nodes_mm
+    return len(levels_mm) > 2 and bool(np.all(np.abs(levels_mm[:, None] - nodes).min(axis=1) < SAME_MM))
+
+
+def wider_bases(basis: CurveBasis, axis: int, position_mm: FloatArray, readings: int) -> list[CurveBasis]:
+    """Return wider bases of one axis that ``readings`` can carry: of higher degree, with the nodes of the machine file."""
+    if basis.nodal[axis]:
+        return []
+    levels = len(np.unique(np.round(position_mm[:, axis], 3)))
+    curves = sum(name not in SQUARENESS_NAMES for name in basis.errors)
+    most = int(min(readings, 3 * len(position_mm)) / READINGS_PER_UNKNOWN / max(curves, 1))
+    found = []
+    if basis.degree[axis] == DEGREE and levels > HIGHER_DEGREE and most >= HIGHER_DEGREE:
+        found.append(replace(basis, degree=_with(basis.degree, axis, HIGHER_DEGREE)))
+    nodes = len(basis.machine.axes[axis].nodes_mm)
+    if basis.degree[axis] + 1 < nodes <= MOST_NODES:
+        found.append(replace(basis, nodal=_with(basis.nodal, axis, True)))
+    return found
+
+
+def _with(values: tuple[T, T, T], axis: int, value: T) -> tuple[T, T, T]:
+    """Return three values with that of one axis changed."""
+    changed = list(values)
+    changed[axis] = value
+    return changed[0], changed[1], changed[2]
+
+
+# The nonlinear base fit: error curves, squareness, stations and dead lengths together, with the exact machine model.
+#
+# Gauss-Newton steps by QR and a truncated SVD, so that directions that the data do not determine stay where they are.
+# Effects of the catalogue may take part with parameters of their own.
+
+
+Whiten = Callable[[FloatArray], FloatArray]
+
+STEPS = 12
+#: Singular values below this share of the largest, with columns scaled to 1, are directions without information.
+LEAST_SINGULAR = 1e-9
+#: A step that changes the readings by less than this, mm, ends the iteration.
+SMALL_MM = 1e-8
+#: Curves are taken to be about this small, mm and rad, against readings good to ``READING_MM``: far too loose to matter
+#: where the data say anything, but what they hardly determine stays put instead of running away.
+LIKELY, READING_MM = 0.1, 1e-3
+LIKELY_RAD = 1e-4
+
+
+@dataclass(frozen=True)
+class BaseFit:
+    """A fit of the base model, and of effects if there were any; n readings, p unknowns.
+
+    Parameters
+    ----------
+    observed : the measurement.
+    basis : the curves.
+    unknowns : curve and squareness coefficients, placement, then the parameters of the effects in SI units, (p,).
+    residual_mm : reading minus model, (n,).
+    jacobian : derivative of the model by the unknowns, (n, p); those of the effects come last.
+    names : what each unknown is.
+    readings : the readings as effects see them, at this fit.
+    effects : effects that took part, with the number of their parameters.
+    """
+
+    observed: Observed
+    basis: CurveBasis
+    unknowns: FloatArray
+    residual_mm: FloatArray
+    jacobian: FloatArray
+    names: tuple[str, ...]
+    readings: Readings
+    effects: tuple[tuple[Effect, int], ...] = ()
+
+    @property
+    def rms_mm(self) -> float:
+        """RMS of the residuals."""
+        return float(np.sqrt(np.mean(self.residual_mm**2)))
+
+    @property
+    def base_size(self) -> int:
+        """Number of unknowns without those of the effects."""
+        return len(self.unknowns) - sum(count for _, count in self.effects)
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    model: FloatArray
+    jacobian: FloatArray
+    readings: Readings
+
+
+def least_norm(design: FloatArray, target: FloatArray) -> FloatArray:
+    """Least-squares solution with scaled columns; directions without information get zero."""
+    scale = np.linalg.norm(design, axis=0)
+    scale[scale == 0.0] = 1.0
+    q, r = np.linalg.qr(design / scale)
+    u, singular, vt = np.linalg.svd(r, full_matrices=False)
+    kept = singular > LEAST_SINGULAR * singular[0]
+    return np.asarray((vt[kept].T @ ((u[:, kept].T @ (q.T @ target)) / singular[kept])) / scale)
+
+
+def fit_base(
+    observed: Observed,
+    basis: CurveBasis,
+    effects: Sequence[Effect] = (),
+    *,
+    start: FloatArray | None = None,
+    whiten: Whiten | None = None,
+    steps: int = STEPS,
+) -> BaseFit:
+    """Fit errors, placement and effects to the readings.
+
+    Parameters
+    ----------
+    observed : the measurement.
+    basis : curves of the errors.
+    effects : effects with their scan position fixed that take part.
+    start : start values of curves, squareness and placement.
+    whiten : takes columns (n, k) to those whose noise is white; default: all readings alike.
+    steps : most Gauss-Newton steps.
+    """
+    parts = basis.parts(observed.poses.position_mm)
+    unknowns = np.concatenate([np.zeros(size_of(parts)), observed.start()]) if start is None else start.copy()
+    counts: list[int] = [0] * len(effects)
+    now = _linearise(observed, parts, unknowns, effects, counts)
+    unknowns = np.concatenate([unknowns, np.zeros(sum(counts))])
+    hold = _hold(parts)
+    for _ in range(steps):
+        residual = observed.value_mm - now.model
+        design, target = now.jacobian, residual
+        if whiten is not None:
+            both = whiten(np.column_stack([design, target]))
+            design, target = both[:, :-1], both[:, -1]
+        step = _step(design, target, unknowns, hold if whiten is None else hold / READING_MM)
+        unknowns = unknowns + step
+        change = now.jacobian @ step
+        now = _linearise(observed, parts, unknowns, effects, counts)
+        if float(np.sqrt(np.mean(change**2))) < SMALL_MM:
+            break
+    names = [*names_of(parts), *observed.placement_names]
+    names += [f"{e.card.name} {k}" for e, count in zip(effects, counts, strict=True) for k in range(count)]
+    taken = tuple(zip(effects, counts, strict=True))
+    residual = observed.value_mm - now.model
+    return BaseFit(observed, basis, unknowns, residual, now.jacobian, tuple(names), now.readings, taken)
+
+
+def _hold(parts: Sequence[Part]) -> FloatArray:
+    """Weight that holds each coefficient of the curves near zero, (k,): accuracy of a reading over its likely size."""
+    found = np.empty(size_of(parts))
+    for part in parts:
+        found[part.place] = READING_MM / (LIKELY if error_named(part.name).kind == "linear" else LIKELY_RAD)
+    return found
+
+
+def _step(design: FloatArray, target: FloatArray, unknowns: FloatArray, hold: FloatArray) -> FloatArray:
+    """Least-squares step with the first unknowns held near zero by weights ``hold`` (k,)."""
+    held = np.zeros((len(hold), design.shape[1]))
+    held[:, : len(hold)] = np.diag(hold)
+    return least_norm(np.vstack([design, held]), np.concatenate([target, -hold * unknowns[: len(hold)]]))
+
+
+def _linearise(
+    observed: Observed, parts: Sequence[Part], unknowns: FloatArray, effects: Sequence[Effect], counts: list[int]
+) -> _Linearised:
+    """Model and derivative at ``unknowns``; ``counts`` receives the number of parameters of every effect."""
+    poses = observed.poses
+    size = size_of(parts)
+    tip, columns = exact_columns(
+        observed.machine, values_of(parts, unknowns, len(poses.position_mm)), poses.position_mm, poses.tool_mm
+    )
+    placement = unknowns[size : size + len(observed.placement_names)]
+    model, direction, placing = observed.placed(tip, placement)
+    moved = tip_columns(parts, columns)
+    readings = observed.readings(tip, placement)
+    changes = [_columns(effect, readings) for effect in effects]
+    counts[:] = [change.shape[1] for change in changes]
+    jacobian = np.empty((len(observed), size + len(placement) + sum(counts)))
+    jacobian[:, :size] = direction[:, [0]] * moved[0][poses.of]
+    for k in (1, 2):
+        jacobian[:, :size] += direction[:, [k]] * moved[k][poses.of]
+    jacobian[:, size:] = np.hstack([placing, *changes])
+    if changes and len(unknowns) == jacobian.shape[1]:
+        model = model + np.hstack(changes) @ unknowns[-sum(counts) :]
+    return _Linearised(model, jacobian, readings)
+
+
+def _columns(effect: Effect, readings: Readings) -> FloatArray:
+    change = effect.columns(readings)
+    if change is None:
+        raise InputError(f"the measurement lacks what {effect.card.name} needs: {', '.join(effect.card.covariates)}")
+    return change
+
+
+def error_columns(observed: Observed, basis: CurveBasis, unknowns: FloatArray) -> FloatArray:
+    """Derivative of the readings by the coefficients of the curves alone, (n, k), at ``unknowns``."""
+    parts = basis.parts(observed.poses.position_mm)
+    return _linearise(observed, parts, unknowns, (), []).jacobian[:, : size_of(parts)]

@@ -1,0 +1,473 @@
+"""The diagnosis as a result: effects refitted in the full model, the misfit before and after, the JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.files import read_text
+from compgen.data.machine import Machine
+from compgen.data.messages import one_line
+from compgen.data.names import MM_PER_UM
+from compgen.diagnose.analysis import Analysis
+from compgen.diagnose.base_fit import BaseFit, fit_base
+from compgen.diagnose.groups import Group
+from compgen.diagnose.layout import IntArray
+from compgen.diagnose.noise_model import TAU, Noise, difference_matrix
+from compgen.diagnose.search import Design
+from compgen.diagnose.verdict import DisplayedDiagnosis, Named, Unknown, Verdict
+from compgen.effects import Card, Effect, Readings, catalogue
+from compgen.effects.catalogue import section_text, what_to_do
+
+# The full nonlinear model with the effects inside: their parameters with uncertainty, and the extended machine file.
+
+
+class FixedColumns(Effect):
+    """A smooth term without a name, with the columns that it had at the base fit."""
+
+    def __init__(self, group: Group, mapping: FloatArray) -> None:
+        self.card = Card(group.name, group.name, "", "", group.covariates, ())
+        self._columns = group.columns @ mapping
+
+    def columns(self, readings: Readings) -> FloatArray:
+        """The columns of the base fit; a change of the stations by um does not matter to them."""
+        return self._columns
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A parameter in the unit of its name, with its standard uncertainty."""
+
+    name: str
+    value: float
+    u: float
+
+
+@dataclass(frozen=True)
+class Refit:
+    """The nonlinear fit with the effects inside, and the parameters of each by its group."""
+
+    fit: BaseFit
+    parameters: dict[int, tuple[Fitted, ...]]
+
+
+def refit(analysis: Analysis, members: Sequence[int]) -> Refit:
+    """Fit base model and members together with the noise model as weight."""
+    design = analysis.design
+    members = [g for g in members if design.size(g)]
+    effects = [_effect_of(design, g) for g in members]
+    fit = fit_base(
+        analysis.fit.observed,
+        analysis.fit.basis,
+        effects,
+        start=analysis.fit.unknowns,
+        whiten=design.whiten,
+        steps=3,
+    )
+    return Refit(fit, _parameters(design, fit, members))
+
+
+def _effect_of(design: Design, group: int) -> Effect:
+    item = design.groups[group]
+    return item.effect if item.effect is not None else FixedColumns(item, design.maps[group])
+
+
+def _parameters(design: Design, fit: BaseFit, members: Sequence[int]) -> dict[int, tuple[Fitted, ...]]:
+    if not members:
+        return {}
+    white = design.whiten(fit.jacobian)
+    residual = design.whiten(fit.residual_mm)
+    norm = np.linalg.norm(white, axis=0)
+    norm[norm == 0.0] = 1.0
+    square, vectors = np.linalg.eigh((white / norm).T @ (white / norm))
+    kept = square > 1e-10 * square[-1]
+    inverse = (vectors[:, kept] / square[kept]) @ vectors[:, kept].T
+    freedom = max(len(residual) - int(kept.sum()), 1)
+    factor = max(1.0, float(residual @ residual) / freedom)
+    u = np.sqrt(np.maximum(np.diag(inverse) * factor, 0.0)) / norm
+    at, found = fit.base_size, {}
+    for group, (effect, count) in zip(members, fit.effects, strict=True):
+        values, own = fit.unknowns[at : at + count], u[at : at + count]
+        names = effect.card.parameters
+        if len(names) == count:
+            fitted = [
+                Fitted(p.name, float(v) / p.si_per_unit, float(w) / p.si_per_unit)
+                for p, v, w in zip(names, values, own, strict=True)
+            ]
+        else:
+            fitted = [Fitted(f"c{k + 1}", float(v), float(w)) for k, (v, w) in enumerate(zip(values, own, strict=True))]
+        found[group] = tuple(fitted)
+        at += count
+    return found
+
+
+def extended_toml(machine: Machine, analysis: Analysis, found: Refit, groups: Sequence[int]) -> str:
+    """Return the machine file with a section ``[effects.NAME]`` for each of the named ``groups``."""
+    text = read_text(machine.source) if machine.source is not None else ""
+    lines = [text.rstrip("\n"), ""]
+    for group in groups:
+        item = analysis.design.groups[group]
+        assert item.effect is not None
+        fitted = found.parameters.get(group, ())
+        values = [p.value * own.si_per_unit for p, own in zip(fitted, item.effect.card.parameters, strict=True)]
+        u = ", ".join(f"{p.name} {p.u:.2g}" for p in fitted)
+        lines += ["", f"# found by volcomp diagnose: {one_line(item.effect.card.title)}; standard uncertainty {u}"]
+        lines.append(section_text(item.effect, found.fit.readings, np.array(values)).rstrip("\n"))
+    return "\n".join(lines) + "\n"
+
+
+def settings_of(analysis: Analysis, item: Group) -> dict[str, float]:
+    """Settings of an effect that hold for the readings: what a machine file has to keep."""
+    return {} if item.effect is None else item.effect.used(analysis.fit.readings)
+
+
+# Does the misfit shrink: residuals before and after, on the readings used and on lines, stations and times left out.
+#
+# Plain least squares on all but the part left out; columns that vanish on the rest (a dead length, a station) are fitted
+# to the part itself, since nothing else can know them.
+
+
+FOLDS = 5
+#: Stations that must be left for the others to determine the errors.
+LEAST_STATIONS = 3
+#: Eigenvalues of the scaled normal matrix below this hold no information.
+LEAST_EIGENVALUE = 1e-9
+
+
+@dataclass(frozen=True)
+class BeforeAfter:
+    """RMS of the residuals without and with what was added, mm."""
+
+    before_mm: float
+    after_mm: float
+
+    def to_dict(self) -> dict[str, float]:
+        """Values in um, as in ``diagnosis.json``."""
+        return {"before_rms_um": self.before_mm / MM_PER_UM, "after_rms_um": self.after_mm / MM_PER_UM}
+
+    @property
+    def shrinks(self) -> bool:
+        """Whether what was added makes the residual smaller."""
+        return self.after_mm < self.before_mm
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The misfit on the readings used and on parts left out; None where that is not possible."""
+
+    train: BeforeAfter
+    lines: BeforeAfter | None
+    stations: BeforeAfter | None
+    times: BeforeAfter | None
+    floor_mm: float
+    floor_source: str
+    residual_before_mm: FloatArray
+    residual_after_mm: FloatArray
+
+
+def gap_of(
+    fit: BaseFit,
+    added: Sequence[FloatArray],
+    predicting: Sequence[FloatArray],
+    noise: Noise,
+    base: Sequence[FloatArray] = (),
+) -> Gap:
+    """Compute the misfit.
+
+    Parameters
+    ----------
+    fit : the base fit.
+    added : columns (n, k) of everything that was added.
+    predicting : those of them that say something about readings that were left out.
+    noise : the noise model.
+    base : further columns that belong to the base model: they are there before and after.
+    """
+    count = len(fit.residual_mm)
+    columns = np.hstack([fit.jacobian[:, : fit.base_size], *base])
+    weight = 1.0 / noise.scale
+    everything = _Problem(columns, _hstack(added, count), fit.residual_mm, weight)
+    before, after = everything.fitted(False), everything.fitted(True)
+    some = _Problem(columns, _hstack(predicting, count), fit.residual_mm, weight)
+    layout = fit.observed.layout
+    lines = _line_folds(layout.condition[layout.stop])
+    stations = layout.channel if len(fit.readings.stations) > LEAST_STATIONS else None
+    return Gap(
+        _rms_pair(before, after),
+        some.left_out(lines),
+        None if stations is None else some.left_out(stations),
+        some.left_out(_time_folds(fit)),
+        _floor(fit, after, noise),
+        noise.source,
+        before,
+        after,
+    )
+
+
+def _hstack(columns: Sequence[FloatArray], count: int) -> FloatArray:
+    return np.hstack(columns) if columns else np.zeros((count, 0))
+
+
+def _line_folds(condition: IntArray) -> IntArray | None:
+    """Fold of every reading: whole conditions, so that both repeats of a line are left out together."""
+    kinds = int(condition.max()) + 1
+    if kinds < 2 * FOLDS:
+        return None
+    order = np.random.default_rng(0).permutation(kinds)
+    return np.asarray((order % FOLDS)[condition], dtype=np.int64)
+
+
+def _time_folds(fit: BaseFit) -> IntArray | None:
+    """Fold of every reading: time blocks of the file, else quarters of the time."""
+    block = fit.readings.labels.get("block")
+    if block is not None and len(np.unique(block)) > 2:
+        return np.unique(block, return_inverse=True)[1].ravel().astype(np.int64)
+    layout = fit.observed.layout
+    if layout.stops < 8:
+        return None
+    if fit.readings.kind == "axis":
+        return (layout.run[layout.stop] % 4).astype(np.int64)
+    return np.minimum(layout.stop * 4 // layout.stops, 3).astype(np.int64)
+
+
+def _rms_pair(before: FloatArray, after: FloatArray) -> BeforeAfter:
+    return BeforeAfter(float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2))))
+
+
+def _floor(fit: BaseFit, after: FloatArray, noise: Noise) -> float:
+    """RMS that the repeats alone leave, else the standard deviation of the noise model."""
+    if noise.source != "repeats":
+        return float(np.sqrt(noise.variances.total))
+    layout = fit.observed.layout
+    squares, count = 0.0, 0
+    for block in layout.blocks:
+        matrix = difference_matrix(layout, block)
+        values = matrix @ after[block.rows]
+        squares += float(np.sum(values**2))
+        count += values.size
+    return float(np.sqrt(squares / max(count, 1)))
+
+
+class _Problem:
+    """Linear least squares with base columns and added ones, through one normal matrix."""
+
+    def __init__(self, base: FloatArray, added: FloatArray, residual: FloatArray, weight: FloatArray) -> None:
+        self.base = base.shape[1]
+        columns = np.hstack([base, added])
+        self.norm = np.linalg.norm(columns, axis=0)
+        self.columns = columns / np.maximum(self.norm, 1e-300)
+        self.residual, self.weight = residual, weight
+        self._weighted = self.columns * weight[:, None]
+        self._target = residual * weight
+        self.normal, self.right = self._weighted.T @ self._weighted, self._weighted.T @ self._target
+
+    def _sizes(self, added: bool) -> int:
+        return int(self.columns.shape[1]) if added else self.base
+
+    def fitted(self, added: bool) -> FloatArray:
+        """Residuals after a fit to everything, (n,)."""
+        k = self._sizes(added)
+        return np.asarray(self.residual - self.columns[:, :k] @ _solve(self.normal[:k, :k], self.right[:k]))
+
+    def left_out(self, fold: IntArray | None) -> BeforeAfter | None:
+        """RMS over all folds, each predicted from the others; None without folds."""
+        if fold is None or len(np.unique(fold)) < 2:
+            return None
+        before, after = np.empty_like(self.residual), np.empty_like(self.residual)
+        for k in np.unique(fold):
+            rows = np.flatnonzero(fold == k)
+            before[rows], after[rows] = self._predicted(rows, False), self._predicted(rows, True)
+        return _rms_pair(before, after)
+
+    def _predicted(self, rows: IntArray, added: bool) -> FloatArray:
+        k = self._sizes(added)
+        own = self._weighted[rows][:, :k]
+        square = own.T @ own
+        normal = self.normal[:k, :k] - square
+        right = self.right[:k] - own.T @ self._target[rows]
+        unseen = np.diag(normal) < 1e-9 * np.maximum(np.diag(self.normal)[:k], 1e-300)
+        known = ~unseen
+        solution = np.zeros(k)
+        solution[known] = _solve(normal[np.ix_(known, known)], right[known])
+        left = self.residual[rows] - self.columns[rows][:, :k] @ solution
+        if unseen.any():
+            part = own[:, unseen]
+            left = left - self.columns[rows][:, :k][:, unseen] @ _solve(
+                part.T @ part, part.T @ (left * self.weight[rows])
+            )
+        return np.asarray(left)
+
+
+def _solve(normal: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution of normal equations without directions that hold no information."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    square, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    kept = square > LEAST_EIGENVALUE * max(float(square[-1]), 1e-300)
+    turned = vectors[:, kept].T @ (right / scale)
+    return np.asarray((vectors[:, kept] @ (turned / square[kept])) / scale)
+
+
+# The result of a diagnosis, and the JSON that holds it.
+
+
+@dataclass(frozen=True)
+class Classed:
+    """Something about the noise or the file that has a name of the catalogue: outliers, a trend of the variance ..."""
+
+    name: str
+    parameters: dict[str, float]
+    confidence: float
+    text: str
+
+
+@dataclass(frozen=True, repr=False)
+class Diagnosis(DisplayedDiagnosis):
+    """What a diagnosis found.
+
+    Parameters
+    ----------
+    machine : the machine.
+    analysis, verdict, refit, gap : the results of the steps.
+    classed : noise classes and gross errors.
+    advice : measurements that would decide or separate, in words.
+    changes, against_rms_mm : errors that differ from those that were compared with, and the residual against them.
+    notes : what was assumed or left out, in words.
+    """
+
+    machine: Machine
+    analysis: Analysis
+    verdict: Verdict
+    refit: Refit
+    gap: Gap
+    classed: tuple[Classed, ...] = ()
+    advice: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    changes: tuple[dict[str, Any], ...] = ()
+    against_rms_mm: float | None = None
+
+    @property
+    def acceptable(self) -> bool:
+        """Whether it is decided, and the misfit shrinks on readings left out if something was added."""
+        if self.verdict.word == "not_decidable":
+            return False
+        left_out = self.gap.lines or self.gap.times
+        return not self.verdict.named or left_out is None or left_out.shrinks
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``diagnosis.json``."""
+        verdict, analysis = self.verdict, self.analysis
+        cards = self._cards
+        effects = [self._named(item) for item in verdict.named] + [
+            {**_classed(item), "what_to_do": what_to_do(cards[item.name])} for item in self.classed
+        ]
+        word = "named" if verdict.word == "none" and self.classed else verdict.word
+        gap: dict[str, Any] = {"train": self.gap.train.to_dict()}
+        for key, pair in (
+            ("heldout_lines", self.gap.lines),
+            ("heldout_stations", self.gap.stations),
+            ("heldout_times", self.gap.times),
+        ):
+            gap[key] = None if pair is None else pair.to_dict()
+        gap |= {"noise_floor_um": self.gap.floor_mm / MM_PER_UM, "noise_floor_source": self.gap.floor_source}
+        return {
+            "verdict": word,
+            "effects": effects,
+            "unknown": [_unknown(item) for item in verdict.unknown],
+            "invisible": list(verdict.invisible),
+            "secondary": [self._named(item) for item in verdict.secondary],
+            "gap": gap,
+            "advice": list(self.advice),
+            "reasons": list(verdict.reasons),
+            "notes": list(self.notes),
+            "noise": self._noise(),
+            "evidence": {
+                "lack_of_fit_z": analysis.evidence.lack_of_fit_z,
+                "run_ratio": analysis.evidence.run_ratio,
+                "readings": len(analysis.fit.residual_mm),
+                "unknowns": analysis.fit.base_size,
+                "groups": len({group.name for group in analysis.design.groups}),
+            },
+            **self._against(),
+        }
+
+    @cached_property
+    def _cards(self) -> dict[str, Card]:
+        return {name: effect.card for name, effect in catalogue(self.analysis.fit.readings.stations).items()}
+
+    def _named(self, item: Named) -> dict[str, Any]:
+        group = self.analysis.design.groups[item.group]
+        parameters: dict[str, dict[str, float | None]] = {
+            p.name: {"value": p.value, "u": p.u} for p in self.refit.parameters.get(item.group, ())
+        }
+        if item.name != group.name:
+            parameters = {}
+        for key, value in settings_of(self.analysis, group).items():
+            parameters[key] = {"value": value, "u": None}
+        return {
+            "name": item.name,
+            "what_to_do": what_to_do(self._cards[item.name]),
+            "alias_set": [{"name": other.name, "weight": round(other.weight, 4)} for other in item.alternatives],
+            "parameters": parameters,
+            "confidence": round(item.confidence, 4),
+            "grade": item.grade,
+            "visible_fraction": round(item.visible, 4),
+            "chi2": item.chi2,
+            "homogeneity_p": item.homogeneity_p,
+            "shape_exact": item.shape_exact,
+            "reasons": list(item.reasons),
+        }
+
+    def _against(self) -> dict[str, Any]:
+        if self.against_rms_mm is None:
+            return {}
+        return {"against": {"rms_um": self.against_rms_mm / MM_PER_UM, "changes": list(self.changes)}}
+
+    def _noise(self) -> dict[str, Any]:
+        noise = self.analysis.noise
+        v = noise.variances
+        return {
+            "white_um": float(np.sqrt(v.white)) / MM_PER_UM,
+            "own_slow_um": {
+                f"{tau * noise.spacing:g} s": float(np.sqrt(x)) / MM_PER_UM for tau, x in zip(TAU, v.own, strict=False)
+            },
+            "common_slow_um": {
+                f"{tau * noise.spacing:g} s": float(np.sqrt(x)) / MM_PER_UM
+                for tau, x in zip(TAU, v.common, strict=False)
+            },
+            "run_to_run_um": float(np.sqrt(v.own[-2:].sum() + v.common[-2:].sum())) / MM_PER_UM,
+            "grows_with_range": bool(np.ptp(noise.scale) > 0),
+            "source": noise.source,
+        }
+
+    def extended(self) -> str:
+        """The machine file with the effects that were found; empty without a name or a file."""
+        if not self.verdict.named or self.machine.source is None:
+            return ""
+        groups = [i.group for i in self.verdict.named if i.name == self.analysis.design.groups[i.group].name]
+        return extended_toml(self.machine, self.analysis, self.refit, groups)
+
+
+def _unknown(item: Unknown) -> dict[str, Any]:
+    return {
+        "covariates": list(item.covariates),
+        "direction": item.direction,
+        "rms_um": item.rms_mm / MM_PER_UM if np.isfinite(item.rms_mm) else None,
+        "text": item.text,
+        "resembles": item.resembles or None,
+    }
+
+
+def _classed(item: Classed) -> dict[str, Any]:
+    return {
+        "name": item.name,
+        "alias_set": [{"name": item.name, "weight": 1.0}],
+        "parameters": {key: {"value": value, "u": None} for key, value in item.parameters.items()},
+        "confidence": item.confidence,
+        "grade": "confirmed",
+        "visible_fraction": 1.0,
+        "text": item.text,
+    }

@@ -1,0 +1,591 @@
+"""The noise of a measurement: kernels, their variances by restricted maximum likelihood, and whitening."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import lapack, solve_triangular
+from scipy.sparse import csr_array
+
+from compgen.data.csv_files import FloatArray
+from compgen.diagnose.base_fit import BaseFit
+from compgen.diagnose.groups import Group
+from compgen.diagnose.layout import Block, IntArray, MeasurementLayout
+
+# The noise of a measurement: white, slow parts of each channel and common to all, and parts that change from run to run.
+#
+# The covariance is a sum of kernels whose variances are found by restricted maximum likelihood on the differences of
+# repeats (Patterson and Thompson 1971): every effect that depends on position, direction, feed, load or set-up cancels
+# there, known or not. Channels of a stop are rotated to their mean and contrasts, which decouples a common part.
+
+
+#: Time constants of the kernels, in distances between stops.
+TAU = (3.0, 10.0, 40.0, 200.0, 2000.0)
+#: Lower bound of a variance, as a share of the raw one.
+LEAST_SHARE = 1e-5
+#: Differences of repeats, and stops without repeats, beyond these numbers cost time and tell little more.
+MOST_DIFFERENCES, MOST_STOPS = 640, 450
+
+
+@dataclass(frozen=True)
+class Variances:
+    """Variances of the kernels, mm^2: white, own to each channel (K,), common to all (K,); ``runs`` of the last two."""
+
+    white: float
+    own: FloatArray
+    common: FloatArray
+
+    @property
+    def slow(self) -> float:
+        """Variance of everything but white in one channel."""
+        return float(self.own.sum() + self.common.sum())
+
+    @property
+    def total(self) -> float:
+        """Variance of one reading."""
+        return self.white + self.slow
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The fitted noise model.
+
+    Parameters
+    ----------
+    variances : of the kernels.
+    scale : factor s of the standard deviation of every reading, (n,); 1 without dependence on range.
+    quadratic : d' P d of the differences, the pure-error sum of squares.
+    freedom : its degrees of freedom.
+    criterion : twice the REML criterion, up to a constant.
+    source : ``"repeats"``, ``"given"`` or ``"assumed"``.
+    spacing_s : median distance between stops.
+    """
+
+    variances: Variances
+    scale: FloatArray
+    quadratic: float
+    freedom: int
+    criterion: float
+    source: str
+    spacing: float
+
+
+def kernels(
+    time: FloatArray, spacing: float, run: IntArray, in_run: FloatArray, *, runs: bool = True
+) -> list[FloatArray]:
+    """Correlation matrices (T, T) of a block: one per time constant, then two of single runs."""
+    apart = np.abs(time[:, None] - time[None, :]) / spacing
+    found = [np.exp(-apart / tau) for tau in TAU]
+    if runs and len(np.unique(run)) > 1:
+        same = (run[:, None] == run[None, :]).astype(np.float64)
+        found += [same, same * np.outer(in_run, in_run)]
+    else:
+        found += [np.zeros_like(apart)] * 2
+    return found
+
+
+def rotation(channels: int) -> FloatArray:
+    """Orthonormal matrix (c, c) whose first row takes the mean of the channels, the others contrasts."""
+    matrix = np.zeros((channels, channels))
+    matrix[0] = 1.0 / np.sqrt(channels)
+    for k in range(1, channels):
+        matrix[k, :k] = 1.0
+        matrix[k, k] = -k
+        matrix[k] /= np.sqrt(k * (k + 1.0))
+    return matrix
+
+
+def rotated(block: Block, columns: FloatArray) -> FloatArray:
+    """Columns (n, k) of all readings in the rotated channels of a block, (c, T, k)."""
+    picked = columns[block.rows]  # (T, c, k)
+    if block.channels == 1:
+        return np.ascontiguousarray(picked.transpose(1, 0, 2), dtype=np.float64)
+    return np.asarray(np.einsum("dc,tck->dtk", rotation(block.channels), picked, optimize=True))
+
+
+def spacing_of(layout: MeasurementLayout) -> float:
+    """Median distance between stops in time, 1 if they have none."""
+    steps = np.diff(layout.time)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if steps.size else 1.0
+
+
+def difference_matrix(layout: MeasurementLayout, block: Block) -> csr_array:
+    """Orthonormal differences (d, T) of the repeats in a block; stops of one cell in their order in time."""
+    cells = layout.cell[block.stop]
+    order = np.argsort(cells, kind="stable")
+    rows, columns, values, at = [], [], [], 0
+    bounds = np.flatnonzero(np.diff(cells[order], prepend=-1, append=-1))
+    for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+        members = order[first:last]
+        for k in range(1, len(members)):
+            share = 1.0 / np.sqrt(k * (k + 1.0))
+            rows += [at] * (k + 1)
+            columns += members[: k + 1].tolist()
+            values += [-share] * k + [k * share]
+            at += 1
+    return csr_array((values, (rows, columns)), shape=(at, len(cells)))
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One block in its differences: kernels (d, d), data (c, d), fixed effects (c, d, q)."""
+
+    kernels: list[FloatArray]
+    data: FloatArray
+    fixed: FloatArray
+
+
+@dataclass
+class Reml:
+    """The REML criterion of the differences of repeats; log-variances of white, own and common kernels."""
+
+    parts: list[_Part]
+    fixed: int
+    common: bool
+    starts: FloatArray
+
+    def value(self, log_variance: FloatArray) -> tuple[float, FloatArray, float]:
+        """Criterion, its gradient, and d' P d."""
+        theta = np.exp(log_variance)
+        count = len(TAU) + 2
+        own, shared = theta[1 : 1 + count], theta[1 + count :] if self.common else np.zeros(count)
+        solved = [self._solve(part, theta[0], own, shared) for part in self.parts]
+        normal = sum((piece[2] for piece in solved), np.zeros((self.fixed, self.fixed)))
+        right = sum((piece[3] for piece in solved), np.zeros(self.fixed))
+        logdet = sum(piece[4] for piece in solved)
+        quadratic = sum(piece[5] for piece in solved)
+        inverse = np.zeros_like(normal)
+        beta = np.zeros(self.fixed)
+        if self.fixed:
+            inverse = np.linalg.inv(normal)
+            beta = inverse @ right
+            quadratic -= float(right @ beta)
+            logdet += float(np.linalg.slogdet(normal)[1])
+        gradient = np.zeros(len(log_variance))
+        for part, piece in zip(self.parts, solved, strict=True):
+            self._add_gradient(gradient, part, piece, inverse, beta)
+        return 0.5 * (logdet + quadratic), gradient * theta, quadratic
+
+    @staticmethod
+    def _solve(part: _Part, white: float, own: FloatArray, shared: FloatArray) -> tuple:  # type: ignore[type-arg]
+        channels, size = part.data.shape
+        contrast = white * np.eye(size)
+        for theta, kernel in zip(own, part.kernels, strict=True):
+            contrast += theta * kernel
+        matrices = [contrast]
+        if channels > 1 and shared.any():
+            mean = contrast.copy()
+            for theta, kernel in zip(shared, part.kernels, strict=True):
+                mean += channels * theta * kernel
+            matrices = [mean, contrast]
+        inverses, logdets = zip(*(_inverse(matrix) for matrix in matrices), strict=True)
+        which = [0, *[len(matrices) - 1] * (channels - 1)]
+        weighted = np.stack([inverses[which[c]] @ part.fixed[c] for c in range(channels)])
+        data = np.stack([inverses[which[c]] @ part.data[c] for c in range(channels)])
+        normal = np.einsum("cdq,cdr->qr", part.fixed, weighted, optimize=True)
+        right = np.einsum("cdq,cd->q", weighted, part.data)
+        logdet = float(sum(logdets[which[c]] for c in range(channels)))
+        quadratic = float(np.sum(part.data * data))
+        return inverses, weighted, normal, right, logdet, quadratic, data, which
+
+    def _add_gradient(
+        self,
+        gradient: FloatArray,
+        part: _Part,
+        piece: tuple,  # type: ignore[type-arg]
+        inverse: FloatArray,
+        beta: FloatArray,
+    ) -> None:
+        inverses, weighted, _, _, _, _, data, which = piece
+        residual = data - weighted @ beta  # P d, (c, d)
+        count = len(TAU) + 2
+        for group in range(len(inverses)):
+            mine = [c for c in range(len(which)) if which[c] == group]
+            p = len(mine) * inverses[group]
+            if self.fixed:
+                tall = np.hstack([weighted[c] for c in mine])
+                turned = np.hstack([weighted[c] @ inverse for c in mine])
+                p = p - tall @ turned.T
+            vectors = residual[mine]
+            p -= vectors.T @ vectors
+            trace = np.array([np.vdot(p, kernel) for kernel in part.kernels])
+            gradient[0] += 0.5 * np.trace(p)
+            gradient[1 : 1 + count] += 0.5 * trace
+            if self.common and group == 0 and len(which) > 1:
+                gradient[1 + count :] += 0.5 * len(which) * trace
+
+
+def _inverse(matrix: FloatArray) -> tuple[FloatArray, float]:
+    """Inverse and logarithm of the determinant of a covariance."""
+    factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=0)
+    if failed:
+        raise np.linalg.LinAlgError("the covariance is not positive definite")
+    logdet = 2.0 * float(np.log(np.diag(factor)).sum())
+    inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
+    inverse = np.tril(inverse) + np.tril(inverse, -1).T
+    return inverse, logdet
+
+
+def reml_problem(
+    layout: MeasurementLayout,
+    residual: FloatArray,
+    fixed: FloatArray,
+    *,
+    repeats: bool = True,
+    runs: bool = True,
+    numbered: bool = False,
+) -> Reml:
+    """Set up the criterion: residuals (n,) and fixed effects (n, q) in the differences of repeats.
+
+    Without ``repeats`` the residuals themselves are taken; they must then hold nothing but noise. ``numbered``: noise
+    goes on from stop to stop, however long that takes.
+    """
+    time = np.arange(layout.stops, dtype=np.float64) if numbered else layout.time
+    spacing = 1.0 if numbered else spacing_of(layout)
+    parts, columns = [], np.column_stack([residual, fixed])
+    for block in layout.blocks:
+        turned = rotated(block, columns)
+        size = len(block.stop)
+        matrix = difference_matrix(layout, block) if repeats else _thinned(size)
+        if not matrix.shape[0]:
+            continue
+        if matrix.shape[0] > MOST_DIFFERENCES:
+            matrix = matrix[:MOST_DIFFERENCES]
+        pattern = kernels(time[block.stop], spacing, layout.run[block.stop], layout.in_run[block.stop], runs=runs)
+        between = [np.ascontiguousarray((matrix @ (matrix @ kernel).T).T) for kernel in pattern]
+        channels = np.stack([matrix @ turned[c] for c in range(block.channels)])
+        parts.append(_Part(between, np.ascontiguousarray(channels[:, :, 0]), channels[:, :, 1:]))
+    return _with_fixed(parts)
+
+
+def _thinned(size: int) -> csr_array:
+    keep = np.arange(min(size, MOST_STOPS))
+    return csr_array((np.ones(len(keep)), (keep, keep)), shape=(len(keep), size))
+
+
+def _with_fixed(parts: list[_Part]) -> Reml:
+    """Orthonormalise the fixed effects over all parts, without directions that do not vary."""
+    common = any(part.data.shape[0] > 1 for part in parts)
+    stacked = np.concatenate([part.fixed.reshape(part.data.size, part.fixed.shape[2]) for part in parts])
+    norm = np.linalg.norm(stacked, axis=0)
+    varying = norm > 1e-9
+    stacked = stacked[:, varying] / norm[varying]
+    basis = np.zeros((len(stacked), 0))
+    if stacked.shape[1]:
+        u, singular, _ = np.linalg.svd(stacked, full_matrices=False)
+        basis = u[:, singular > 1e-3 * singular[0]]
+    raw = np.concatenate([part.data.ravel() for part in parts])
+    start = float(np.mean((raw - basis @ (basis.T @ raw)) ** 2))
+    done, at = [], 0
+    for part in parts:
+        rows = part.data.size
+        fixed = basis[at : at + rows].reshape(*part.data.shape, basis.shape[1])
+        done.append(_Part(part.kernels, part.data, np.ascontiguousarray(fixed)))
+        at += rows
+    count = len(TAU) + 2
+    variances = np.full(1 + count * (2 if common else 1), 0.02 * start)
+    variances[0] = 0.8 * start
+    return Reml(done, basis.shape[1], common, variances)
+
+
+def fit_reml(problem: Reml, *, start: FloatArray | None = None, steps: int = 60) -> tuple[Variances, float, float, int]:
+    """Return variances, d' P d, the criterion, and the degrees of freedom of the differences."""
+    raw = float(problem.starts[0]) / 0.8
+    bound = (np.log(LEAST_SHARE * raw), np.log(100.0 * raw))
+    first = np.clip(np.log(problem.starts if start is None else start), *bound)
+
+    def value(x: FloatArray) -> tuple[float, FloatArray]:
+        found = problem.value(x)
+        return found[0], found[1]
+
+    from scipy.optimize import minimize  # imported here: slow to load
+
+    result = minimize(
+        value, first, jac=True, method="L-BFGS-B", bounds=[bound] * len(first), options={"maxiter": steps, "ftol": 2e-6}
+    )
+    criterion, _, quadratic = problem.value(result.x)
+    theta = np.exp(result.x)
+    theta[theta <= LEAST_SHARE * raw * 1.01] = 0.0
+    count = len(TAU) + 2
+    common = theta[1 + count :] if problem.common else np.zeros(count)
+    freedom = sum(part.data.size for part in problem.parts) - problem.fixed
+    return (
+        Variances(float(max(theta[0], LEAST_SHARE * raw)), theta[1 : 1 + count], common),
+        quadratic,
+        2 * criterion,
+        freedom,
+    )
+
+
+def packed(variances: Variances, common: bool) -> FloatArray:
+    """Variances as start values of :func:`fit_reml`."""
+    parts: Sequence[FloatArray] = [np.array([variances.white]), variances.own, *([variances.common] if common else [])]
+    return np.maximum(np.concatenate(parts), 1e-30)
+
+
+# From a base fit to its noise model: dependence on range and channel, then the variances of the kernels.
+
+
+#: Differences of repeats below which the residuals themselves have to serve.
+LEAST_DIFFERENCES = 60
+#: Slope over its uncertainty above which the noise depends on range.
+RANGE_Z = 3.5
+#: The same for channels whose noise differs: deviate of the logarithm of a variance.
+CHANNEL_Z = 6.0
+#: Neighbouring second differences overlap: sum of their squared correlations.
+OVERLAP = 1 + 2 * (4 / 6) ** 2 + 2 * (1 / 6) ** 2
+#: Squares beyond this many times the variance are gross errors and count as this much.
+FAR_OUT = 16.0
+#: Variance of single runs, as a share of the white one, below which it is not tested.
+LEAST_RUN_SHARE = 0.04
+
+
+def has_repeats(layout: MeasurementLayout) -> bool:
+    """Whether the measurement holds enough repeats for an independent noise model."""
+    counts = np.bincount(layout.cell)
+    return int(np.sum(np.maximum(counts - 1, 0))) >= LEAST_DIFFERENCES
+
+
+def noise_of(
+    fit: BaseFit, fixed: Sequence[Group], *, sigma_mm: FloatArray | None = None, before: Noise | None = None
+) -> Noise:
+    """Fit the noise model.
+
+    Parameters
+    ----------
+    fit : the base fit.
+    fixed : groups whose columns may differ between repeats; they neither inflate the noise nor are eaten by it.
+    sigma_mm : standard uncertainty of every reading, if it is given, (n,); used without repeats.
+    before : an earlier model to start from.
+    """
+    layout = fit.observed.layout
+    if not has_repeats(layout):
+        return _without_repeats(fit, fixed, sigma_mm)
+    scale = before.scale if before is not None else noise_scale(fit)
+    residual = fit.residual_mm / scale
+    problem = reml_problem(layout, residual, _unit_columns(fixed, len(residual)) / scale[:, None])
+    start = None if before is None else np.maximum(packed(before.variances, problem.common), problem.starts * 1e-3)
+    variances, quadratic, criterion, freedom = fit_reml(problem, start=start, steps=60 if before is None else 15)
+    return Noise(variances, scale, quadratic, freedom, criterion, "repeats", spacing_of(layout))
+
+
+def _unit_columns(groups: Sequence[Group], count: int) -> FloatArray:
+    if not groups:
+        return np.zeros((count, 0))
+    columns = np.hstack([group.columns for group in groups])
+    return np.asarray(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
+
+
+def _without_repeats(fit: BaseFit, fixed: Sequence[Group], sigma_mm: FloatArray | None) -> Noise:
+    """Noise from the residuals of the base model and of the groups ``fixed``: an assumption, not a measurement."""
+    residual = fit.residual_mm
+    columns = _unit_columns(fixed, len(residual))
+    design = np.hstack([fit.jacobian, columns])
+    q = np.linalg.qr(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300))[0]
+    residual = residual - q @ (q.T @ residual)
+    freedom = max(len(residual) - design.shape[1], 1)
+    residual = residual * np.sqrt(len(residual) / freedom)
+    scale = np.ones(len(residual)) if sigma_mm is None else sigma_mm / np.sqrt(np.mean(sigma_mm**2))
+    problem = reml_problem(
+        fit.observed.layout, residual / scale, np.zeros((len(residual), 0)), repeats=False, runs=False
+    )
+    variances, quadratic, criterion, _ = fit_reml(problem, steps=20)
+    source = "assumed" if sigma_mm is None else "given"
+    if sigma_mm is not None:
+        variances = Variances(float(np.mean(sigma_mm**2)), variances.own, variances.common)
+    return Noise(variances, scale, quadratic, 0, criterion, source, spacing_of(fit.observed.layout))
+
+
+def run_ratio(fit: BaseFit, fixed: Sequence[Group], noise: Noise, enough: float = 0.0) -> float:
+    """Likelihood ratio of the parts that change from run to run; 0 where they are too small to matter.
+
+    They are compared with noise that goes on in time, and with noise that goes on from stop to stop, unless the first
+    comparison gives no more than ``enough``.
+    """
+    runs = float(noise.variances.own[-2:].sum() + noise.variances.common[-2:].sum())
+    if noise.source != "repeats" or runs <= LEAST_RUN_SHARE * noise.variances.white:
+        return 0.0
+    scale = noise.scale
+    columns = _unit_columns(fixed, len(scale)) / scale[:, None]
+    ratio = np.inf
+    for numbered in (False, True):
+        problem = reml_problem(fit.observed.layout, fit.residual_mm / scale, columns, runs=False, numbered=numbered)
+        start = np.maximum(packed(noise.variances, problem.common), problem.starts * 1e-3)
+        ratio = min(ratio, fit_reml(problem, start=start, steps=30)[2] - noise.criterion)
+        if ratio <= enough:
+            break
+    return max(0.0, float(ratio))
+
+
+def noise_scale(fit: BaseFit) -> FloatArray:
+    """Factor of the standard deviation of every reading, (n,), mean square 1.
+
+    It is 1 unless the noise grows with range, or differs between channels by more than that.
+    """
+    bends = _bends(fit)
+    count = len(fit.residual_mm)
+    if bends is None:
+        return np.ones(count)
+    readings = fit.readings
+    square = (readings.range_mm / readings.range_mm.mean()) ** 2 if readings.kind == "lengths" else None
+    with_range = _range_scale(bends.power, bends.rows, square, count)
+    own = _channel_factor(fit, bends, bends.power / with_range[bends.rows] ** 2)
+    if not own.any():
+        return with_range
+    factor = _channel_factor(fit, bends, bends.power, certain=True)
+    factor = np.where(factor > 0, factor, 1.0)[fit.observed.layout.channel]
+    scale = factor * _range_scale(bends.power / factor[bends.rows] ** 2, bends.rows, square, count)
+    return np.asarray(scale / np.sqrt(np.mean(scale**2)))
+
+
+@dataclass(frozen=True)
+class _Bends:
+    """Squared second differences of the differences of repeats, mm^2, with variance of a reading; their middle rows."""
+
+    power: FloatArray
+    rows: IntArray
+
+
+def _bends(fit: BaseFit) -> _Bends | None:
+    """Second differences of the differences of repeats along a run: they hold nothing slow. None if they are few."""
+    layout = fit.observed.layout
+    power, middle = [], []
+    for block in layout.blocks:
+        first, second = _pairs(layout, block.stop)
+        if len(first) < 3:
+            continue
+        runs = layout.run[block.stop]
+        together = (runs[second[2:]] == runs[second[:-2]]) & (runs[first[2:]] == runs[first[:-2]])
+        difference = fit.residual_mm[block.rows[second]] - fit.residual_mm[block.rows[first]]
+        bend = (difference[2:] - 2 * difference[1:-1] + difference[:-2])[together]
+        power.append((bend**2 / 12.0).ravel())
+        middle.append(block.rows[second[1:-1]][together].ravel())
+    if sum(map(len, power)) < LEAST_DIFFERENCES:
+        return None
+    return _Bends(np.concatenate(power), np.concatenate(middle))
+
+
+def _clipped(power: FloatArray) -> FloatArray:
+    """Squares without the weight of gross errors; 0.455 is the median of a squared normal deviate."""
+    return np.minimum(power, FAR_OUT * float(np.median(power)) / 0.455)
+
+
+def _channel_factor(fit: BaseFit, bends: _Bends, power: FloatArray, *, certain: bool = False) -> FloatArray:
+    """Standard deviation of every channel over that of all, (channels,); zeros if they do not differ beyond doubt."""
+    channel = fit.observed.layout.channel[bends.rows]
+    factor = np.zeros(int(fit.observed.layout.channel.max()) + 1)
+    means, counts = np.zeros(len(factor)), np.bincount(channel, minlength=len(factor))
+    for k in np.flatnonzero(counts):
+        means[k] = float(_clipped(power[channel == k]).mean())
+    seen = counts > 0
+    middle = float(np.exp(np.average(np.log(means[seen]), weights=counts[seen])))
+    u = np.sqrt(2.0 * OVERLAP / np.maximum(counts, 1))
+    apart = np.abs(np.log(np.where(seen, means, middle) / middle)) / u
+    if not certain and float(apart.max()) < CHANNEL_Z:
+        return factor
+    factor[seen] = np.sqrt(means[seen] / middle)
+    return factor
+
+
+def _range_scale(power: FloatArray, rows: IntArray, square: FloatArray | None, count: int) -> FloatArray:
+    """Factor of the standard deviation by range, mean square 1, from a regression of squares on the squared range."""
+    if square is None:
+        return np.ones(count)
+    against, power = square[rows], _clipped(power)
+    design = np.column_stack([np.ones(len(against)), against])
+    weight = np.ones(len(power))
+    for _ in range(4):  # the variance of a squared normal deviate is twice the square of its mean
+        coefficients = np.linalg.lstsq(design * weight[:, None], power * weight, rcond=None)[0]
+        expected = np.maximum(design @ coefficients, 0.05 * power.mean())
+        weight = 1.0 / expected
+    inverse = np.linalg.inv((design * weight[:, None]).T @ (design * weight[:, None]))
+    u = np.sqrt(inverse[1, 1] * 2.0 * OVERLAP)
+    if coefficients[1] / u <= RANGE_Z:
+        return np.ones(len(square))
+    variance = np.maximum(coefficients[0] + coefficients[1] * square, 0.02 * power.mean())
+    return np.asarray(np.sqrt(variance / variance.mean()))
+
+
+def _pairs(layout: MeasurementLayout, stop: IntArray) -> tuple[IntArray, IntArray]:
+    """Places in a block of the first and second stop of each repeated cell, in the order of the second one in time."""
+    cells = layout.cell[stop]
+    order = np.lexsort((np.arange(len(cells)), cells))
+    starts = np.flatnonzero(np.diff(cells[order], prepend=-1))
+    counts = np.diff(np.append(starts, len(cells)))
+    twice = starts[counts > 1]
+    first, second = order[twice], order[twice + 1]
+    by_time = np.argsort(second)
+    return first[by_time], second[by_time]
+
+
+# Whitening: columns and readings in which the noise is white with variance 1.
+
+
+@dataclass(frozen=True)
+class Whitener:
+    """Takes columns (n, k) of all readings to (n, k) of whitened ones, block by block and channel by channel.
+
+    ``factors`` of a block: inverse-free Cholesky factors of the covariance of the mean and of the contrasts.
+    """
+
+    layout: MeasurementLayout
+    scale: FloatArray
+    factors: tuple[tuple[FloatArray, FloatArray], ...]
+
+    def __call__(self, columns: FloatArray) -> FloatArray:
+        """Whiten columns (n, k), or one of (n,)."""
+        wide = columns if columns.ndim == 2 else columns[:, None]
+        wide = wide / self.scale[:, None]
+        parts = []
+        for block, (mean, contrast) in zip(self.layout.blocks, self.factors, strict=True):
+            turned = rotated(block, wide)
+            for channel in range(block.channels):
+                factor = mean if channel == 0 else contrast
+                parts.append(_solved(factor, turned[channel]))
+        result = np.concatenate(parts)
+        return result if columns.ndim == 2 else result[:, 0]
+
+    def order_of(self, stop: IntArray) -> IntArray:
+        """Stop of every whitened row, (n,); ``stop`` is that of every reading."""
+        blocks = self.layout.blocks
+        return np.concatenate([np.tile(stop[block.rows[:, 0]], block.channels) for block in blocks])
+
+
+def _solved(factor: FloatArray, columns: FloatArray) -> FloatArray:
+    if factor.ndim == 1:
+        return np.asarray(columns / factor[:, None])
+    return np.asarray(solve_triangular(factor, columns, lower=True, check_finite=False))
+
+
+def whitener(layout: MeasurementLayout, noise: Noise) -> Whitener:
+    """Return the whitening of a noise model."""
+    spacing = spacing_of(layout)
+    return Whitener(layout, noise.scale, tuple(_factors(layout, block, noise, spacing) for block in layout.blocks))
+
+
+def _factors(layout: MeasurementLayout, block: Block, noise: Noise, spacing: float) -> tuple[FloatArray, FloatArray]:
+    size = len(block.stop)
+    variances = noise.variances
+    if variances.slow <= 0.0:
+        plain = np.full(size, np.sqrt(variances.white))
+        return plain, plain
+    pattern = kernels(layout.time[block.stop], spacing, layout.run[block.stop], layout.in_run[block.stop])
+    contrast = variances.white * np.eye(size)
+    mean = np.zeros((size, size))
+    for own, common, kernel in zip(variances.own, variances.common, pattern, strict=True):
+        if own > 0:
+            contrast += own * kernel
+        if common > 0:
+            mean += (block.channels if block.channels > 1 else 1) * common * kernel
+    both = _factor(contrast)
+    return (_factor(contrast + mean) if mean.any() else both), both
+
+
+def _factor(matrix: FloatArray) -> FloatArray:
+    factor, failed = lapack.dpotrf(np.asfortranarray(matrix), lower=1, clean=1)
+    if failed:
+        raise np.linalg.LinAlgError("the covariance of the noise is not positive definite")
+    return np.asarray(factor)

@@ -1,0 +1,79 @@
+"""What shows in the noise of the readings, not in their mean: found by tests of the residuals, without columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.names import AXES
+from compgen.effects.base import Card, Effect, Family
+from compgen.effects.readings import Readings
+
+
+class NoiseClass(Effect):
+    """A class of noise; it has a card and no columns."""
+
+    def __init__(self, card: Card) -> None:
+        self.card = card
+
+    def columns(self, readings: Readings) -> FloatArray | None:
+        """None: there is no mean to fit."""
+        return None
+
+
+def _card(name: str, title: str, equation: str, covariates: tuple[str, ...], breaker: str) -> Card:
+    source = "tests of whitened residuals: docs/effects.md"
+    return Card(name, title, equation, source, covariates, (), ("every weak effect",), breaker, ("noise",))
+
+
+def noise_cards() -> list[Card]:
+    """Cards of the classes of noise."""
+    cards = [
+        _card(
+            "outliers", "Gross errors of single readings", "readings far outside the rest", (), "measure these again"
+        ),
+        _card(
+            "variance_trend",
+            "Noise that changes with time, range or position",
+            "sigma depends on a covariate",
+            ("time_s",),
+            "repeat lines at the beginning and at the end",
+        ),
+        _card(
+            "autocorrelated_noise",
+            "Noise that is alike in neighbouring readings",
+            "noise with a memory (random walk, drift of the air)",
+            ("time_s", "repeat"),
+            "measure every line at least twice, in random order",
+        ),
+        _card("quantisation", "Readings in coarse steps", "readings are multiples of a step", (), "log more decimals"),
+        _card(
+            "axis_mapping",
+            "Swapped axes, signs or stations",
+            "columns of the file exchanged or of the other sign",
+            (),
+            "check the file: residuals of mm, not of um",
+        ),
+    ]
+    stick_slip = [
+        _card(
+            f"stick_slip_{letter}",
+            f"Stick-slip of {letter}",
+            f"d_{letter} jumps by steps of one size at random after reversals",
+            (f"approach_{letter.lower()}",),
+            "approach every target slowly and fast, several times each",
+        )
+        for letter in AXES
+    ]
+    return cards + stick_slip
+
+
+class ListedEffects(Family):
+    """Effects that are listed and have no columns: classes of noise, and what shows in the signals of an instrument alone."""
+
+    def __init__(self, name: str, cards: Sequence[Card]) -> None:
+        self.name, self._cards = name, tuple(cards)
+
+    def members(self, stations: object) -> list[Effect]:
+        """One for each card."""
+        return [NoiseClass(card) for card in self._cards]

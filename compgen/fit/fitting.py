@@ -1,0 +1,526 @@
+"""The fit: identified errors in, smooth errors within bounds out; robust weights and user constraints."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.machine import Machine
+from compgen.data.names import error_named
+from compgen.errors import ConvergenceError, InputError
+from compgen.fit.bounds import (
+    Bounds,
+    CurveReport,
+    CurveSolution,
+    FitOptions,
+    FitResult,
+    active_bounds,
+    constraint_rows,
+)
+from compgen.fit.smoother import (
+    CorrelatedSmoother,
+    Method,
+    Smoother,
+    choose,
+    curve_covariances,
+    propagated,
+)
+from compgen.fit.stacked import CurveProblem, solve_curves
+from compgen.fit.zeroing import FixedCurve, zero_ends
+from compgen.identify.covariance import Covariance
+from compgen.kinematics.kernel_switch import one_thread
+
+# One curve from preparation to report, in um or urad: weights, smoothness, uncertainty; many are solved together.
+
+
+#: An uncertainty counts at least this fraction of the curve's median one, and this much (um, urad): exact data.
+_LEAST_FRACTION, _LEAST = 1e-3, 1e-6
+#: With fewer degrees of freedom left than this the residuals say nothing about the noise.
+_LEAST_LEFT = 0.5
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """One curve ready to be fitted, everything in um or urad (``unit`` in mm or rad).
+
+    ``y`` (n,) is the zeroed input, ``u0`` the scale of its uncertainty (None: unknown), ``smoother`` holds weights and
+    zeros, ``trust`` (n,) the share of each node's weight that a robust loss leaves, ``covariance`` (n, n) that of the
+    input if it is used.
+    """
+
+    name: str
+    fixed: FixedCurve
+    unit: float
+    y: FloatArray
+    u0: float | None
+    smoother: Smoother
+    bounds: Bounds
+    trust: FloatArray
+    covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Weighted:
+    """Smoothness and how it was found."""
+
+    mu: float
+    method: Method
+
+
+def weights(fixed: FixedCurve, unit: float) -> tuple[FloatArray, float | None]:
+    """Dimensionless weights (u0/u)^2, shape (n,), and u0 in um or urad; ones and None if an uncertainty is unknown.
+
+    Nodes that are fixed at zero do not count; u0 is the harmonic root mean square of the others.
+    """
+    weight = np.ones(len(fixed.value))
+    free = np.ones(len(weight), dtype=bool)
+    free[[row[0][0] for row in fixed.rows if len(row) == 1]] = False
+    u = fixed.u[free] / unit
+    if not np.isfinite(u).all() or not u.size:
+        return weight, None
+    u = np.maximum(u, _least(u))
+    u0 = float(1 / np.sqrt(np.mean(1 / u**2)))
+    weight[free] = (u0 / u) ** 2
+    return weight, u0
+
+
+def _least(u: FloatArray) -> float:
+    positive = u[u > 0]
+    return max(_LEAST, _LEAST_FRACTION * float(np.median(positive))) if positive.size else _LEAST
+
+
+def prepare(name: str, fixed: FixedCurve, options: FitOptions, trust: FloatArray | None = None) -> Prepared:
+    """Set up the smoother of one fixed curve; ``trust`` (n,) in (0, 1] divides the variance of each node."""
+    unit = error_named(name).si_per_unit
+    share = np.ones(len(fixed.value)) if trust is None else trust
+    weight, u0 = weights(fixed, unit)
+    smoother = Smoother.build(fixed.position_mm, weight * share, fixed.rows)
+    covariance = None
+    if fixed.covariance is not None and u0 is not None and smoother.unknowns:
+        covariance = fixed.covariance / unit**2 / np.sqrt(share[:, None] * share)
+        # with the least variance that counts on the diagonal, so that it has an inverse
+        least = _least(np.sqrt(np.diag(covariance))) ** 2 * np.eye(len(covariance))
+        smoother = CorrelatedSmoother.of(smoother, (fixed.zeroing @ covariance @ fixed.zeroing.T + least) / u0**2)
+    bounds = options.bounds(name).in_unit(unit)
+    return Prepared(name, fixed, unit, fixed.value / unit, u0, smoother, bounds, share, covariance)
+
+
+def smoothness(prepared: Prepared, options: FitOptions) -> Weighted:
+    """Return the given smoothness, or the one that the data ask for."""
+    if options.smoothness is not None:
+        return Weighted(min(options.smoothness, prepared.smoother.largest_mu), "given")
+    method: Method = "REML" if prepared.u0 is not None else "GCV"
+    return Weighted(choose(prepared.smoother, prepared.y, prepared.u0), method)
+
+
+def solve(prepared: Sequence[Prepared], mu: Sequence[float]) -> list[CurveSolution]:
+    """Fit curves at given smoothness within their bounds."""
+    return solve_curves(
+        [
+            CurveProblem(item.smoother, weight, item.fixed.position_mm, item.y, item.bounds)
+            for item, weight in zip(prepared, mu, strict=True)
+        ]
+    )
+
+
+def finish(prepared: Prepared, weighted: Weighted, solution: CurveSolution) -> tuple[Curve, CurveReport]:
+    """Return the fitted curve in mm or rad with its uncertainty, and the report.
+
+    The uncertainty is that of the input carried linearly through the zeroing and the smoother without bounds; it does
+    not hold the smoothing bias, which the report states.
+    """
+    smoother, fixed = prepared.smoother, prepared.fixed
+    bias = smoother.solve(weighted.mu, solution.curve[:, None])[:, 0] - solution.curve
+    if prepared.covariance is not None:
+        u = propagated(smoother, weighted.mu, fixed, prepared.covariance) * prepared.unit
+    else:
+        u = propagate(smoother, weighted.mu, fixed, prepared.trust)
+    curve = Curve(fixed.position_mm, solution.curve * prepared.unit + 0.0, u)
+    return curve, _report(prepared, weighted, solution, bias)
+
+
+def propagate(smoother: Smoother, mu: float, fixed: FixedCurve, trust: FloatArray) -> FloatArray:
+    """Standard uncertainty (n,) of the fitted curve in mm or rad: sqrt of the diagonal of (S G) U^2 (S G)^T.
+
+    G takes the line or constant out that zeroing removed (G = 1 where nothing was removed), U holds the input's u over
+    the root of ``trust`` (n,). An unknown u counts only where the fit uses it; if it does, the result is nan.
+    """
+    if np.isnan(fixed.u).all():
+        return np.where(smoother.expand(np.ones((len(fixed.u), 1)))[:, 0] == 0, 0.0, np.nan)
+    smooth_shapes = smoother.solve(mu, fixed.shapes * fixed.moved)
+    functional, variance = fixed.functional, fixed.u**2 / trust
+    total = np.zeros(len(fixed.value))
+    for picked, columns in smoother.columns(mu):
+        gain = columns - smooth_shapes @ functional[:, picked]
+        total += np.where(gain != 0, gain**2 * variance[picked], 0.0).sum(axis=1)
+    return np.asarray(np.sqrt(total))
+
+
+def _report(prepared: Prepared, weighted: Weighted, solution: CurveSolution, bias: FloatArray) -> CurveReport:
+    smoother, residual = prepared.smoother, prepared.y - solution.curve
+    left = smoother.residual_degrees(weighted.mu)
+    noise2 = smoother.misfit(residual) / left if left >= _LEAST_LEFT else math.nan
+    distrusted = np.flatnonzero(prepared.trust < 1)
+    return CurveReport(
+        error=prepared.name,
+        unit=error_named(prepared.name).unit,
+        smoothness=weighted.mu,
+        method=weighted.method,
+        half_gain_mm=half_gain_mm(weighted.mu, prepared.fixed.position_mm),
+        degrees_of_freedom=smoother.degrees_of_freedom(weighted.mu),
+        free_nodes=smoother.unknowns,
+        rms_residual=float(np.sqrt(np.mean(residual**2))),
+        reduced_chi_square=noise2 / prepared.u0**2 if prepared.u0 is not None else math.nan,
+        noise=math.sqrt(noise2),
+        smoothing_bias_max=float(np.abs(bias).max()),
+        smoothing_bias_rms=float(np.sqrt(np.mean(bias**2))),
+        smoothing_bias=bias,
+        active_bounds=active_bounds(prepared.fixed.position_mm, solution.touched, prepared.bounds),
+        solver=solution.solver,
+        correlated=prepared.covariance is not None,
+        distrusted_mm=tuple(float(prepared.fixed.position_mm[k]) for k in distrusted),
+    )
+
+
+def half_gain_mm(mu: float, position_mm: FloatArray) -> float:
+    """Wave length L with 1/(1 + mu (2 sin(pi h/L))^4) = 1/2 at the mean spacing h; 0 if no wave is halved.
+
+    >>> round(half_gain_mm(1.0, np.array([0.0, 10.0, 20.0])), 6)  # six nodes
+    60.0
+    """
+    mean = float(np.mean(np.diff(position_mm)))
+    return math.pi * mean / math.asin(0.5 * mu**-0.25) if mu > 1 / 16 else 0.0
+
+
+# Huber's loss: nodes far from the curve pull with a constant force instead of one that grows (Huber 1964).
+#
+# Solved by reweighting: a node at distance r from the curve has its weight times min(1, k u/r), k = 1.345, until nothing
+# changes; the curve is then the minimum of Huber's loss plus the smoothness. Bounds are not part of that (they would make
+# good data look like outliers): the fit within bounds takes the weights as they are. With correlated nodes the variances
+# of a distrusted node and its covariances are inflated alike. The start compares each node with the median of
+# five neighbours, because a curve chosen by the data might follow an outlier and see none.
+
+
+#: Huber's constant: 95 % efficient for normal noise.
+HUBER = 1.345
+_SEARCHES, _ROUNDS, _SETTLED = 6, 400, 1e-8
+_MAD = 1.4826
+_NEIGHBOURS = 5
+_LEAST_TRUST = 1e-9
+
+
+def robust(curves: Mapping[str, FixedCurve], options: FitOptions) -> tuple[list[Prepared], list[Weighted]]:
+    """Prepare every curve with the weights of Huber's loss and choose its smoothness.
+
+    The smoothness follows the weights for the first rounds and is then kept.
+    """
+    prepared = [prepare(name, fixed, options) for name, fixed in curves.items()]
+    scales = [_scale(item, item.y - running_median(item.y)) for item in prepared]
+    trusts = [trust_of(item.y - running_median(item.y), scale) for item, scale in zip(prepared, scales, strict=True)]
+    weighted: list[Weighted] = []
+    for count in range(_ROUNDS):
+        if count < _SEARCHES:
+            # with the variance of each node so large that it lies within Huber's distance, the search sees no outliers
+            weighted = [
+                smoothness(prepare(item.name, item.fixed, options, trust**2), options)
+                for item, trust in zip(prepared, trusts, strict=True)
+            ]
+        prepared = [
+            prepare(item.name, item.fixed, options, trust) for item, trust in zip(prepared, trusts, strict=True)
+        ]
+        found = solve([replace(item, bounds=Bounds()) for item in prepared], [item.mu for item in weighted])
+        residuals = [item.y - solution.curve for item, solution in zip(prepared, found, strict=True)]
+        if count < _SEARCHES:
+            scales = [_scale(item, residual) for item, residual in zip(prepared, residuals, strict=True)]
+        fresh = [trust_of(residual, scale) for residual, scale in zip(residuals, scales, strict=True)]
+        change = max(float(np.abs(new - old).max()) for new, old in zip(fresh, trusts, strict=True))
+        if count >= _SEARCHES and change <= _SETTLED:
+            return prepared, weighted
+        trusts = fresh
+    raise ConvergenceError(f"the robust fit did not settle in {_ROUNDS} rounds; fit without it or give a smoothness")
+
+
+def running_median(y: FloatArray) -> FloatArray:
+    """Median (n,) of each node and its two neighbours on either side, fewer at the ends."""
+    reach = _NEIGHBOURS // 2
+    return np.array([np.median(y[max(0, k - reach) : k + reach + 1]) for k in range(len(y))])
+
+
+def trust_of(residual: FloatArray, scale: FloatArray) -> FloatArray:
+    """Huber's weights (n,) in (0, 1] for residuals and standard uncertainties (n,)."""
+    far = np.abs(residual) / (HUBER * scale)
+    return np.maximum(1 / np.maximum(far, 1.0), _LEAST_TRUST)
+
+
+def _scale(prepared: Prepared, residual: FloatArray) -> FloatArray:
+    """Standard uncertainty (n,) of each node: its own, or one for all from the residuals."""
+    if prepared.u0 is not None:
+        return prepared.u0 / np.sqrt(prepared.smoother.weight / prepared.trust)
+    some = residual[residual != 0]
+    spread = _MAD * float(np.median(np.abs(some))) if some.size else 0.0
+    return np.full(len(residual), max(spread, 1e-9 * float(np.abs(prepared.y).max(initial=0.0)), 1e-12))
+
+
+# Constraints of the user: the whole problem, all curves together, in cvxpy.
+#
+# The sum of the curves' costs is a quadratic form (a sum of squares of differences would slow every solver down); zeros,
+# bounds and the user's constraints are added as they are. Where no curves satisfy these, the elastic problem
+# (least sum of violations, zeros and bounds kept) says which of them to relax, and by how much.
+
+
+#: Receives cvxpy variables by error name, returns cvxpy constraints, as a list or by name.
+OwnConstraints = Callable[[Mapping[str, Any]], Iterable[Any] | Mapping[str, Any]]
+#: The user's constraints are kept to this, in um or urad.
+TOLERANCE = 1e-6
+_TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
+_STATES = ("optimal", "optimal_inaccurate")
+
+
+def solve_constrained(
+    prepared: Sequence[Prepared], mu: Sequence[float], constraints: OwnConstraints
+) -> list[CurveSolution]:
+    """Fit all curves at given smoothness within their bounds and the user's constraints.
+
+    Raises
+    ------
+    InputError
+        if what the callable returns is not a set of cvxpy constraints, or cannot be satisfied.
+    ConvergenceError
+        if the solver fails.
+    """
+    cp: Any = import_module("cvxpy")
+    inner = {item.name: cp.Variable(len(item.y), name=item.name) for item in prepared}
+    shown = {item.name: cp.Variable(len(item.y), name=item.name) for item in prepared}
+    own = _named(cp, constraints(shown))
+    rules = [rule for item in prepared for rule in _rules(item, inner[item.name], shown[item.name])]
+    cost = 0.0
+    for item, weight in zip(prepared, mu, strict=True):
+        # c^T A c / 2 - c^T W y in units of the weight of its data, so that all curves count alike
+        x, matrix = inner[item.name], item.smoother.matrix(weight)
+        form = 0.5 * cp.quad_form(x, cp.psd_wrap(sp.csc_array(0.5 * (matrix + matrix.T))))
+        cost = cost + (form - item.smoother.load(item.y[:, None])[:, 0] @ x) / (
+            item.u0**2 if item.u0 is not None else 1.0
+        )
+    problem = cp.Problem(cp.Minimize(cost), [*rules, *own.values()])
+    _solve(cp, problem)
+    if problem.status in ("infeasible", "infeasible_inaccurate"):
+        raise InputError(_relaxation(cp, rules, own), field="constraints")
+    if problem.status not in _STATES:
+        raise ConvergenceError(f"the fit with your constraints ended with {problem.status}; scale or loosen them")
+    for name, rule in own.items():
+        broken = float(np.max(rule.violation(), initial=0.0))
+        if not broken <= TOLERANCE:
+            raise ConvergenceError(f"{name} is broken by {broken:.3g} in the solver's result; scale or loosen it")
+    return [_solution(item, np.asarray(inner[item.name].value)) for item in prepared]
+
+
+def _rules(item: Prepared, x: Any, shown: Any) -> list[Any]:
+    """Zeros and bounds: ``x`` are the smoother's unknowns (eliminated ones zero), ``shown`` the node values."""
+    turn = sp.csr_array(item.smoother.expand(np.eye(len(item.y))))
+    rows = constraint_rows(item.fixed.position_mm, item.smoother, *item.bounds.limits, item.bounds.direction)
+    high, low = np.flatnonzero(np.isfinite(rows.upper)), np.flatnonzero(np.isfinite(rows.lower))
+    rules = [shown == turn @ x]
+    gone = [node for node, _, _ in item.smoother.steps]
+    if gone:
+        rules.append(x[gone] == 0)
+    if len(high):
+        rules.append(rows.matrix[high] @ x <= rows.upper[high])
+    if len(low):
+        rules.append(rows.matrix[low] @ x >= rows.lower[low])
+    return rules
+
+
+def _named(cp: Any, given: Any) -> dict[str, Any]:
+    """The user's constraints by name; those of a list are named by their place and text."""
+    if isinstance(given, Mapping):
+        own = {str(name): rule for name, rule in given.items()}
+    elif isinstance(given, Iterable):
+        own = {f"constraint {k} ({str(rule)[:80]})": rule for k, rule in enumerate(given, 1)}
+    else:
+        raise InputError(f"the callable returned {type(given).__name__}; return a list of cvxpy constraints")
+    for name, rule in own.items():
+        if not isinstance(rule, cp.constraints.constraint.Constraint):
+            raise InputError(f"{name} is a {type(rule).__name__}; return cvxpy constraints", field="constraints")
+        if not rule.is_dcp():
+            raise InputError(f"{name} is not convex; write it as a convex one", field="constraints")
+    return own
+
+
+def _solve(cp: Any, problem: Any) -> None:
+    """Solve to tight tolerances, to looser ones if that fails."""
+    for settings in (_TIGHT, {}):
+        try:
+            with warnings.catch_warnings():  # what is inaccurate is checked by what it keeps
+                warnings.simplefilter("ignore")
+                problem.solve(solver="CLARABEL", **settings)
+        except cp.error.SolverError:
+            continue
+        if problem.status != "user_limit":
+            return
+    if problem.status is None:
+        raise ConvergenceError("no solver could work with your constraints; scale or loosen them")
+
+
+def _relaxation(cp: Any, rules: Sequence[Any], own: Mapping[str, Any]) -> str:
+    """Name the constraints that must give way and by how much: least sum of violations, zeros and bounds kept."""
+    slack, elastic = {}, []
+    for name, rule in own.items():
+        if isinstance(rule, cp.constraints.Inequality):
+            slack[name] = cp.Variable(rule.expr.shape, nonneg=True)
+            elastic.append(rule.expr <= slack[name])
+        elif isinstance(rule, cp.constraints.Equality | cp.constraints.Zero):
+            slack[name] = cp.Variable(rule.expr.shape, nonneg=True)
+            elastic.append(cp.abs(rule.expr) <= slack[name])
+        else:
+            elastic.append(rule)
+    beginning = "no curves satisfy zeros, bounds and your constraints together; "
+    if not slack:
+        return beginning + "none of them can be relaxed by an amount; leave one out"
+    problem = cp.Problem(cp.Minimize(sum(cp.sum(amount) for amount in slack.values())), [*rules, *elastic])
+    _solve(cp, problem)
+    if problem.status not in _STATES:
+        return beginning + f"those that can be relaxed by an amount ({', '.join(slack)}) do not help; leave one out"
+    amounts = {name: np.atleast_1d(np.asarray(amount.value)) for name, amount in slack.items()}
+    named = [f"{name} by {_amount(amount)}" for name, amount in amounts.items() if amount.max() > TOLERANCE]
+    return beginning + "the least relaxation that helps: " + "; ".join(named)
+
+
+def _amount(amount: np.ndarray) -> str:
+    over = amount[amount > TOLERANCE]
+    entries = "" if amount.size == 1 else f" (largest of {over.size} of its {amount.size} entries)"
+    return f"{math.ceil(over.max() * 1e6) / 1e6:.6g}{entries}"
+
+
+def _solution(item: Prepared, x: np.ndarray) -> CurveSolution:
+    curve = item.smoother.expand(x[:, None])[:, 0]
+    rows = constraint_rows(item.fixed.position_mm, item.smoother, *item.bounds.limits, item.bounds.direction)
+    values = np.asarray(rows.matrix @ curve)
+    near = np.where(values >= rows.upper - TOLERANCE, 1.0, np.where(values <= rows.lower + TOLERANCE, -1.0, 0.0))
+    return CurveSolution(curve, near, "cvxpy")
+
+
+# The whole fit: identified errors in, smooth and endpoint-zeroed errors out.
+
+
+_DEFAULT = FitOptions()
+
+
+def fit(
+    machine: Machine,
+    errors: ErrorTable,
+    options: FitOptions = _DEFAULT,
+    *,
+    covariance: Covariance | Mapping[str, FloatArray] | None = None,
+    constraints: OwnConstraints | None = None,
+) -> FitResult:
+    """Smooth every curve of a table, zero where it has to be, within bounds if these are given.
+
+    First the curves are brought to zero without changing the machine (:func:`compgen.fit.zero_ends`), then each is
+    the minimum of ``sum((u0/u)^2 (c - y)^2) + mu |D2 c|^2`` that stays zero there (Zha & Zhang 2024, section 5).
+
+    Parameters
+    ----------
+    machine : travel, reference point, chain, tool offset and modelled errors count.
+    errors : curves on any nodes, in mm and rad; the result has the same nodes, and the travel ends where these were
+        missing. Uncertainties may be nan (unknown).
+    options : smoothness, bounds, robust loss.
+    covariance : that of an identification (:func:`compgen.identify.joint_covariance`), or the covariance (n, n) of a curve's
+        nodes by error name, mm and rad: (y - c)^T V^-1 (y - c) takes the place of the sum. Curves without have
+        independent nodes with the table's uncertainties.
+    constraints : your own. It is called with the node values of every curve as cvxpy variables in um or urad, by error
+        name, and returns cvxpy constraints, as a list or by name; they may couple curves. The whole problem then goes to
+        cvxpy, with the smoothness that the data ask for without them.
+
+    Raises
+    ------
+    InputError
+        for values that are not finite, a squareness that is needed but not in the machine's model, a covariance that
+        does not fit, or constraints that no curves satisfy: the message names them and the least relaxation that helps.
+    ConvergenceError
+        when the bounded fit does not pass its check.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> errors = compgen.read_errors("examples/zha-gantry.truth.errors.csv")
+    >>> fitted = compgen.fit(machine, errors)
+    >>> curve = fitted.errors.curves["EYX"]  # a straightness error: zero at both ends
+    >>> bool(abs(curve.value[[0, -1]]).max() < 1e-12)
+    True
+    """
+    with one_thread():
+        return _fit(machine, errors, options, covariance, constraints)
+
+
+def _fit(
+    machine: Machine,
+    errors: ErrorTable,
+    options: FitOptions,
+    covariance: Covariance | Mapping[str, FloatArray] | None,
+    constraints: OwnConstraints | None,
+) -> FitResult:
+    blocks = curve_covariances(errors, covariance) if covariance is not None else {}
+    zeroed = zero_ends(machine, _as_independent(machine, errors, blocks), blocks)
+    if options.robust and zeroed.curves:
+        prepared, weighted = robust(zeroed.curves, options)
+    else:
+        prepared = [prepare(name, fixed, options) for name, fixed in zeroed.curves.items()]
+        weighted = [smoothness(item, options) for item in prepared]
+    mu = [item.mu for item in weighted]
+    _check_monotone(prepared, mu)
+    solved = solve(prepared, mu) if constraints is None else solve_constrained(prepared, mu, constraints)
+    fitted = {
+        item.name: finish(item, how, solution) for item, how, solution in zip(prepared, weighted, solved, strict=True)
+    }
+    reference = ", ".join(f"{value:g}" for value in machine.reference_point_mm)
+    kept = {key: value for key, value in errors.metadata.items() if key != "covariance"}  # that of the unfitted values
+    table = ErrorTable(
+        curves={name: curve for name, (curve, _) in fitted.items()},
+        squareness=zeroed.squareness,
+        metadata={**kept, "reference_point_mm": reference},
+    )
+    return FitResult(table, {name: report for name, (_, report) in fitted.items()}, zeroed.change)
+
+
+def _check_monotone(prepared: Sequence[Prepared], mu: Sequence[float]) -> None:
+    """Refuse a direction for a curve that is zero at two points: only zero between them would be left."""
+    for item, weight in zip(prepared, mu, strict=True):
+        if item.bounds.direction == 0 or len(item.fixed.rows) < 2:
+            continue
+        free = item.smoother.solve(weight, item.y[:, None])[:, 0]
+        backward = item.bounds.excess(item.fixed.position_mm, free)[3]
+        unit = error_named(item.name).unit
+        raise InputError(
+            f"{item.name} is zero at both ends of the travel, so a monotone one would be zero everywhere; remove the "
+            f"direction of {item.name} (least relaxation: its fit has slopes of {1e3 * backward:.4g} {unit}/m against it)",
+            field="monotone",
+        )
+
+
+def _as_independent(machine: Machine, errors: ErrorTable, known: Container[str]) -> ErrorTable:
+    """Give the points of cubic curves the uncertainty that independent points of the same information would have.
+
+    A cubic curve is written at more positions than it has coefficients, so that its points repeat each other; taken
+    as independent they would claim too much, and the smoothing would believe them. Curves whose covariance is ``known``
+    stay as they are.
+    """
+    if machine.curves != "cubic":
+        return errors
+    curves = {}
+    for name, curve in errors.curves.items():
+        if name in known:
+            curves[name] = curve
+            continue
+        surplus = len(curve.position_mm) / len(machine.axes[error_named(name).axis].nodes_mm)
+        curves[name] = Curve(curve.position_mm, curve.value, curve.u * max(1.0, surplus) ** 0.5)
+    return errors.replace(curves=curves)

@@ -1,0 +1,269 @@
+"""What a person does: approve, reject, roll back, adopt tables, process a stored measurement again.
+
+Each is kept in the store first; then the files of the machine follow, and the notification. ``clock`` tells the time of a
+simulated factory; None: that of the computer or the database.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from compgen.errors import CompgenError, InputError
+from compgen.fleet import claims, decisions, logs
+from compgen.fleet.claims import ChangedMeanwhileError, keep_result
+from compgen.fleet.decisions import check_person
+from compgen.fleet.job import Job, MachineJob
+from compgen.fleet.process import ADOPTED, process, without_folder
+from compgen.fleet.publish import check_folder, notify, publish, set_aside
+from compgen.fleet.records import HELD_BACK, DecisionRecord, MachineRecord, MeasurementRecord, TableRecord
+from compgen.fleet.store import Clock, Store, open_store
+from compgen.kinematics.kernel_switch import one_thread
+
+
+class NotPublishedError(CompgenError):
+    """The decision is in the store, but the files could not be updated; the next run publishes them."""
+
+    exit_code = 1
+
+
+def approve(
+    job: Job,
+    name: str,
+    version: int,
+    actor: str,
+    reason: str = "",
+    *,
+    override: bool = False,
+    seen: int | None = None,
+    clock: Clock | None = None,
+) -> DecisionRecord:
+    """Approve a version and make its files the active ones.
+
+    Errors as :func:`compgen.fleet.decisions.approve` has them, and NotPublishedError if the folder cannot be written.
+    ``seen`` is the version that the person saw as the active one.
+    """
+
+    def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
+        return decisions.approve(store, machine, version, actor, reason, override=override, seen=seen)
+
+    return carried_out(job, name, decide, clock)
+
+
+def reject(
+    job: Job,
+    name: str,
+    version: int | None,
+    actor: str,
+    reason: str,
+    *,
+    seen: int | None = None,
+    clock: Clock | None = None,
+) -> DecisionRecord:
+    """Reject a version (None: the only one that is open)."""
+
+    def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
+        chosen = decisions.only_pending(store, machine).version if version is None else version
+        return decisions.reject(store, machine, chosen, actor, reason, seen=seen)
+
+    return carried_out(job, name, decide, clock)
+
+
+def rollback(
+    job: Job,
+    name: str,
+    actor: str,
+    reason: str,
+    *,
+    to: int | None = None,
+    seen: int | None = None,
+    clock: Clock | None = None,
+) -> DecisionRecord:
+    """Make an earlier version active again, byte for byte; ``to`` = 0 leaves none active."""
+
+    def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
+        return decisions.rollback(store, machine, actor, reason, to=to, seen=seen)
+
+    return carried_out(job, name, decide, clock)
+
+
+def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None = None) -> Path | None:
+    """Give the folder of a machine to this store: what it holds is set aside, and the store publishes its own.
+
+    From now on the store does not know which tables are on until one is approved or a measurement says it.
+
+    Returns
+    -------
+    The folder into which what was there was moved, None if there was nothing.
+
+    Raises
+    ------
+    InputError
+        without a name or a reason, or if the folder cannot be written.
+    """
+    if not actor.strip() or not reason.strip():
+        raise InputError("giving a folder to this store needs a name and a reason", field="--reason")
+    machine_job = job.machine(name)
+    with closing(open_store(job.store, clock=clock)) as store:
+        machine = store.add_machine(name)
+        try:
+            moved = set_aside(machine_job.out)
+        except OSError as error:
+            raise InputError(f"cannot be set aside: {error.strerror or error}", file=machine_job.out) from error
+        said = "nothing was there" if moved is None else f"what was there is in {moved.name}"
+        store.add_event(ADOPTED, "folder", f"given to this store by {actor}, {said}: {reason}", machine)
+        publish(store, machine, machine_job.out)
+        return moved
+
+
+def carried_out(
+    job: Job, name: str, decide: Callable[[Store, MachineRecord], DecisionRecord], clock: Clock | None = None
+) -> DecisionRecord:
+    """Make a decision about a machine, given as a function of :mod:`compgen.fleet.decisions`; its files follow."""
+    machine_job = job.machine(name)
+    with closing(open_store(job.store, clock=clock)) as store:
+        machine = store.machine(name)
+        check_folder(store, machine, machine_job.out)
+        decision = decide(store, machine)
+        _follow(store, machine_job, machine, "The decision is made")
+        return decision
+
+
+def _follow(store: Store, job: MachineJob, machine: MachineRecord, done: str) -> None:
+    """Publish and notify; NotPublishedError says what was done all the same."""
+    try:
+        publish(store, machine, job.out)
+        notify(store, machine, job.notify)
+    except CompgenError as error:
+        raise NotPublishedError(f"{done}, but the files could not be updated yet: {error}") from error
+
+
+# --- process a stored measurement again ----------------------------------------------------------------------------
+#
+# After machine file, instrument, policy or program changed: nothing old is replaced, there is one more identification of
+# the measurement and one more version of the tables, judged as any other. The history says who requested it and why.
+
+#: How often it is judged again because other tables became active meanwhile.
+JUDGED_AT_MOST = 5
+SHORTEST_HASH = 8
+#: Kind of the events that say why a measurement could not be processed again.
+REPROCESS_FAILED = "reprocess"
+
+
+@dataclass(frozen=True)
+class Reprocessed:
+    """The measurement, how often it was identified by now, and the new version of the tables."""
+
+    measurement: MeasurementRecord
+    revision: int
+    table: TableRecord
+
+    @property
+    def exit_code(self) -> int:
+        """0: proposed or active; 1: held back or refused."""
+        return 1 if self.table.state in HELD_BACK else 0
+
+
+@dataclass(frozen=True)
+class ReprocessRequest:
+    """Which measurement (None: the newest), who wants it and why.
+
+    ``active_table`` states which tables were on while it was made, a version or "none"; None: what the file says.
+    """
+
+    measurement: str | None
+    actor: str
+    reason: str
+    active_table: str | None = None
+
+
+def reprocess(job: Job, name: str, request: ReprocessRequest, *, clock: Clock | None = None) -> Reprocessed:
+    """Process a stored measurement of a machine again, as the job says now, and publish what comes of it.
+
+    Raises
+    ------
+    InputError
+        without a reason, for an unknown machine or measurement.
+    CompgenError
+        if the measurement cannot be used now, which is kept as an event, or another runner works on it.
+    """
+    machine_job = job.machine(name)
+    if request.active_table is not None and not re.fullmatch(r"(?i)none|v?[0-9]{1,9}", request.active_table):
+        raise InputError(
+            f"{request.active_table!r} does not name tables; give a version (v3) or none", field="--active-table"
+        )
+    if not request.reason.strip() or not request.actor.strip():
+        raise InputError("processing a measurement again needs a reason and a name", field="--reason")
+    check_person(request.actor)
+    with closing(open_store(job.store, clock=clock)) as store:
+        machine = store.machine(name)
+        check_folder(store, machine, machine_job.out)
+        measurement = _chosen(store, machine, request.measurement)
+        with one_thread():  # the same bytes however many processors there are
+            table, revision = _again(store, machine_job, machine, measurement, request)
+        logs.info("measurement processed again", machine=name, measurement=measurement.name, version=table.version)
+        _follow(store, machine_job, machine, "The new version is stored")
+        return Reprocessed(measurement, revision, table)
+
+
+def _chosen(store: Store, machine: MachineRecord, requested: str | None) -> MeasurementRecord:
+    """Return the measurement with this number, or SHA-256 that begins like this; without either the newest."""
+    known = store.measurements(machine)
+    if not known:
+        raise InputError(f"the store holds no measurement of {machine.name}; `volcomp recal run` takes them in")
+    if requested is None:
+        return known[-1]
+    text = requested.strip().lower()
+    found = [item for item in known if re.fullmatch(r"[0-9]{1,7}", text) and item.id == int(text)]
+    if len(text) >= SHORTEST_HASH:
+        found += [item for item in known if item.sha256.startswith(text)]
+    if len(found) != 1:
+        listed = ", ".join(f"{item.id} ({item.name}, {item.sha256[:12]})" for item in known[-5:])
+        what = "several begin like that" if found else f"the newest are {listed}"
+        raise InputError(f"{machine.name} has no single measurement {requested!r}; {what}", field="--measurement")
+    return found[0]
+
+
+def _again(
+    store: Store, job: MachineJob, machine: MachineRecord, measurement: MeasurementRecord, request: ReprocessRequest
+) -> tuple[TableRecord, int]:
+    for _ in range(JUDGED_AT_MOST):
+        claim = claims.take(store, measurement, claims.owner_name(), again=True)
+        if claim is None:
+            raise claims.ClaimLostError(f"{machine.name}: another runner works on {measurement.name}; try again later")
+        done = [item for item in store.identifications(machine) if item.measurement_id == measurement.id]
+        revision = 1 + max((item.revision for item in done), default=0)
+        try:
+            return _kept(store, job, machine, (measurement, claim), request, revision), revision
+        except ChangedMeanwhileError:
+            claims.give_back(store, claim)
+        except BaseException as error:
+            claims.give_back(store, claim)
+            if isinstance(error, CompgenError):
+                told = f"{request.actor} ({request.reason}): {without_folder(str(error))}"
+                store.add_event(REPROCESS_FAILED, measurement.name, told, machine)
+            raise
+    raise claims.ClaimLostError(f"{machine.name}: other tables become active again and again; try again later")
+
+
+def _kept(
+    store: Store,
+    job: MachineJob,
+    machine: MachineRecord,
+    work: tuple[MeasurementRecord, claims.Claim],
+    request: ReprocessRequest,
+    revision: int,
+) -> TableRecord:
+    measurement, claim = work
+    started = time.monotonic()
+    with claims.renewal(store, claim):
+        done = process(store, job, machine, measurement, request.active_table)
+    stated = "" if request.active_table is None else f" with active_table = {request.active_table}"
+    why = f"{measurement.name} processed again{stated}: {request.reason}"
+    who = {"revision": revision, "actor": request.actor, "reason": why}
+    result = replace(done.result, seconds=time.monotonic() - started, **who)  # type: ignore[arg-type]
+    return keep_result(store, machine, claim, result, done.judged_against)

@@ -1,0 +1,509 @@
+"""Whether a machine has changed between calibrations, against the uncertainty of both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable
+from compgen.data.machine import Machine
+from compgen.data.names import ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.errors import InputError
+from compgen.fleet.decisions import excluded
+from compgen.fleet.records import MachineRecord
+from compgen.fleet.store import Store, at_one_moment, counting
+from compgen.identify.covariance import (
+    Covariance,
+    covariance_of_values,
+    covariance_or_independent,
+    error_design,
+    values_at_nodes,
+)
+from compgen.kinematics.curves import hat_matrix
+from compgen.kinematics.first_order import volumetric_error
+from compgen.kinematics.gauge import LEVER_MM, gauge_directions, rigid_fields
+
+# Whether a machine has changed between two measurements, against the uncertainty of both.
+#
+# The change is E = C P of the new errors minus that of the old ones at points of the volume, with the best-fit rigid
+# motion taken out: so the gauge directions, which no measurement shows, do not count. If nothing changed, its covariance
+# is the sum of both, and the sum of squares T over the points is a weighted sum of chi-squares with the eigenvalues of
+# that covariance as weights; its distribution is taken as that of a scaled chi-square with the same mean and variance
+# (Satterthwaite 1946, Biometrics Bulletin 2).
+
+
+#: Points along each axis of the grid on which the change is looked at.
+POINTS = 6
+#: A change is like a field if it differs from it by at most the first share of the field (rms) beyond the noise, or by at
+#: most the second one where it holds the field just once, give or take the third: then a drift of another shape came on top.
+ALIKE, DRIFTED, ONCE = 0.25, 0.5, 0.1
+#: Probabilities below this are said as that: the number of independent directions is hardly known.
+LEAST_P = 1e-9
+
+
+@dataclass(frozen=True)
+class Change:
+    """Change of the machine over its volume, rigid motion taken out, um.
+
+    ``expected_rms_um`` is the rms that the uncertainties alone make; ``p_value`` the probability of at least this change
+    if there was none.
+    """
+
+    rms_um: float
+    max_um: float
+    expected_rms_um: float
+    p_value: float
+    confidence: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether the change exceeds its uncertainty with the requested confidence."""
+        return self.p_value < 1.0 - self.confidence
+
+    def summary(self) -> dict[str, object]:
+        """Return the figures by name."""
+        return {**asdict(self), "significant": self.significant}
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """A change that equals plus or minus a known field, both over the volume without rigid motion.
+
+    ``field`` is the key of that field, ``sign`` +1 or -1, ``correlation`` that of the two, ``size`` the factor by which
+    the field fits the change best. ``p_value``: the probability that a change drawn evenly from all those of at most
+    twice the size of the field comes as close to any of the fields that were looked at, each with its sign.
+    """
+
+    field: str
+    sign: int
+    correlation: float
+    size: float
+    p_value: float
+
+    def words(self) -> str:
+        """Say the figures, e.g. ``correlation +0.990, size 1.02; an arbitrary change comes as close with probability 1e-07``."""
+        by_chance = f"{self.p_value:.1g}" if self.p_value >= LEAST_P else f"below {LEAST_P:g}"
+        return (
+            f"correlation {self.correlation:+.3f}, size {abs(self.size):.2f}; an arbitrary change comes as close with "
+            f"probability {by_chance}"
+        )
+
+    def summary(self) -> dict[str, object]:
+        """Return the figures by name."""
+        return asdict(self)
+
+
+def likeness(
+    machine: Machine,
+    new: tuple[ErrorTable, Covariance | None],
+    old: tuple[ErrorTable, Covariance | None],
+    added: Mapping[str, FloatArray],
+    missing: Mapping[str, FloatArray],
+) -> Likeness | None:
+    """Return the field that the change equals, with its sign; None if it equals none.
+
+    Readings of a machine whose tables were on, but are not taken out, change by what the tables add; readings of the
+    bare machine from which tables are taken out change by the opposite. That looks like a drift, and tables made of it
+    undo the compensation.
+
+    Parameters
+    ----------
+    new, old : identified errors and, where it is known, their covariance.
+    added : fields that may have acted without being counted, at the points of :func:`volume_points`, (n, 3), mm.
+    missing : fields that may have been counted without acting.
+    """
+    position_mm = volume_points(machine)
+    keep = rigid_free_projector(machine, position_mm)
+    difference = volumetric_error(machine, new[0], position_mm) - volumetric_error(machine, old[0], position_mm)
+    moved = keep @ difference.ravel()
+    factors = [_spread(machine, spread, position_mm) for _, spread in (new, old) if spread is not None]
+    noise = sum(float(np.sum((keep @ factor) ** 2)) for factor in factors)
+    free = _directions(machine, new[0], position_mm, keep)
+    best: Likeness | None = None
+    nearest = DRIFTED
+    signed = [
+        *((name, 1, field) for name, field in added.items()),
+        *((name, -1, field) for name, field in missing.items()),
+    ]
+    for name, sign, error_field in signed:
+        known = keep @ error_field.ravel()
+        square, product = float(known @ known), float(known @ moved)
+        if square <= 4.0 * noise or sign * product <= 0.0:
+            continue  # too small to be told from nothing, or the other way round
+        apart = float(np.sum((moved - sign * known) ** 2))
+        share = float(np.sqrt(max(apart - noise, 0.0) / square))
+        once = abs(sign * product / square - 1.0) <= ONCE
+        if share <= (nearest if once else min(nearest, ALIKE)):
+            nearest = share
+            correlation = product / float(np.sqrt(square * (moved @ moved)))
+            p_value = min(1.0, len(signed) * (0.5 * min(float(np.sqrt(apart / square)), 2.0)) ** free)
+            best = Likeness(name, sign, correlation, product / square, p_value)
+    return best
+
+
+def _directions(machine: Machine, errors: ErrorTable, position_mm: FloatArray, keep: FloatArray) -> float:
+    """Number of independent directions that low-order changes of the errors span over the volume.
+
+    Each error may change by its value (squareness), or by a line and a bow; fields that nearly coincide count once: n^2
+    over the sum of squares of the eigenvalues of their correlation matrix (participation ratio), at least 1.
+    """
+    layout = covariance_of_values(errors, np.diag(errors.uncertainties()))
+    design = error_design(machine, layout, position_mm).reshape(3 * len(position_mm), -1)
+    names = np.array(layout.error)
+    columns = []
+    for name in errors.names:
+        own = np.flatnonzero(names == name)
+        at = layout.position_mm[own]
+        if len(own) < 2:
+            shapes = np.ones((1, len(own)))
+        else:
+            share = np.interp(at, (at.min(), at.max()), (-1.0, 1.0))
+            shapes = np.array([share, share**2 - 1.0 / 3.0])
+        columns += [keep @ (design[:, own] @ shape) for shape in shapes]
+    fields = np.column_stack(columns)
+    length = np.linalg.norm(fields, axis=0)
+    fields = fields[:, length > 1e-6 * length.max()] / length[length > 1e-6 * length.max()]
+    if fields.shape[1] == 0:
+        return 1.0
+    gram = fields.T @ fields
+    return float(max(1.0, fields.shape[1] ** 2 / np.sum(gram**2)))
+
+
+def change_between(
+    machine: Machine,
+    new: tuple[ErrorTable, Covariance],
+    old: tuple[ErrorTable, Covariance],
+    confidence: float,
+) -> Change:
+    """Compare two identifications (errors with covariance) of one machine over its volume."""
+    position_mm = volume_points(machine)
+    difference = volumetric_error(machine, new[0], position_mm) - volumetric_error(machine, old[0], position_mm)
+    keep = rigid_free_projector(machine, position_mm)
+    moved = keep @ difference.ravel()
+    factors = [_spread(machine, covariance, position_mm) for _, covariance in (new, old)]
+    factor = keep @ np.hstack(factors)
+    count = len(position_mm)
+    p_value = _p_value(float(moved @ moved), factor)
+    return Change(
+        rms_um=float(np.sqrt(moved @ moved / count)) / MM_PER_UM,
+        max_um=float(np.max(np.linalg.norm(moved.reshape(-1, 3), axis=1))) / MM_PER_UM,
+        expected_rms_um=float(np.sqrt(np.sum(factor**2) / count)) / MM_PER_UM,
+        p_value=p_value,
+        confidence=confidence,
+    )
+
+
+def volume_points(machine: Machine) -> FloatArray:
+    """Return the points at which changes are looked at, (n, 3), mm."""
+    levels = [np.linspace(*axis.range_mm, POINTS) for axis in machine.axes]
+    return np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _spread(machine: Machine, covariance: Covariance, position_mm: FloatArray) -> FloatArray:
+    """Factor of the covariance of E at all points one after another, (3 n, r), mm."""
+    design = error_design(machine, covariance, position_mm)
+    return np.asarray(design.reshape(3 * len(position_mm), -1) @ covariance.errors_factor)
+
+
+def rigid_free_projector(machine: Machine, position_mm: FloatArray) -> FloatArray:
+    """Projector (3 n, 3 n) that takes translations and rotations out of a field at points (n, 3)."""
+    tip = (position_mm - position_mm.mean(axis=0)) / 1000.0
+    rigid, _ = np.linalg.qr(rigid_fields(tip))
+    return np.asarray(np.eye(tip.size) - rigid @ rigid.T)
+
+
+def _p_value(total: float, factor: FloatArray) -> float:
+    """Probability that the squares of a normal vector with covariance F F^T add up to ``total`` or more."""
+    gram = factor.T @ factor if factor.shape[1] < factor.shape[0] else factor @ factor.T
+    mean, squares = float(np.trace(gram)), float(np.sum(gram**2))
+    if mean <= 0.0:
+        return 0.0 if total > 0.0 else 1.0
+    return float(chi2.sf(total * mean / squares, mean * mean / squares))
+
+
+# The calibrations of one machine on common figures: gauge-aligned, each with its joint covariance.
+#
+# Two tables of errors may describe the same machine (:mod:`compgen.kinematics.gauge`). Every calibration is therefore brought
+# into one gauge first: along the gauge directions the curves are made as small as possible, so that constants vanish and
+# slopes that a squareness error can express as well become part of it. That map is linear, so covariances follow it.
+#
+# A curve is watched by two figures of its best-fit parabola: ``line``, what its straight part adds from the first to the
+# last node, and ``bow``, by how much the middle lies above the ends. A squareness error is its own ``value``.
+
+
+#: A figure whose weights keep less than this share of their size in the common gauge is not observable.
+NOTHING_LEFT = 1e-6
+#: A calibration that shows less than this share of the errors of the richest one is left out.
+LEAST_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """One identification: when it was measured, errors (mm, rad) with covariance, mean temperature by channel, degC."""
+
+    at: datetime
+    errors: ErrorTable
+    covariance: Covariance
+    temperatures_c: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MonitoredFigure:
+    """One watched quantity of one error: ``part`` is "value", "line" or "bow"; mm or rad inside."""
+
+    error: str
+    part: str
+
+    @property
+    def unit(self) -> str:
+        """Unit in reports: um or urad."""
+        return error_named(self.error).unit
+
+    @property
+    def scale(self) -> float:
+        """Factor from mm or rad to the unit of reports."""
+        return 1.0 / error_named(self.error).si_per_unit
+
+    @property
+    def name(self) -> str:
+        """Name in reports, e.g. ``EXX line``, ``EC0Y``."""
+        return self.error if self.part == "value" else f"{self.error} {self.part}"
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """All calibrations in one gauge on the same k error values.
+
+    Parameters
+    ----------
+    machine : chain, travel and tool offset that the gauge is that of.
+    error, position_mm : name and position (k,) of each value; nan for squareness.
+    days : times in days since the first calibration, (n,).
+    value : (n, k), mm and rad. ``factor``: n factors (k, r_i) of the covariance of each.
+    figures, weights : f watched figures and what each takes of the values, (f, k).
+    """
+
+    machine: Machine
+    error: tuple[str, ...]
+    position_mm: FloatArray
+    days: FloatArray
+    value: FloatArray
+    factor: tuple[FloatArray, ...]
+    figures: tuple[MonitoredFigure, ...]
+    weights: FloatArray
+
+    def figure_values(self) -> FloatArray:
+        """Values of the figures, (n, f)."""
+        return np.asarray(self.value @ self.weights.T)
+
+    def figure_u(self) -> FloatArray:
+        """Standard uncertainties of the figures, (n, f)."""
+        return np.array([np.linalg.norm(self.weights @ factor, axis=1) for factor in self.factor])
+
+    def columns(self, name: str) -> NDArray[np.intp]:
+        """Positions in the list of values that belong to an error."""
+        return np.flatnonzero(np.array(self.error) == name)
+
+    def field_covariance(self, k: int) -> Covariance:
+        """Covariance of calibration ``k`` in the common gauge."""
+        return Covariance(self.error, self.position_mm, (), np.zeros(0, dtype=np.int64), self.factor[k])
+
+
+@at_one_moment
+def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibration], list[int], Machine]:
+    """Return the calibrations of a machine with known uncertainty, their identification ids, and the newest machine file.
+
+    Those that a person excluded are left out. InputError if there is none.
+    """
+    left_out, records = excluded(store, machine), counting(store, machine)
+    measured = {item.id: item for item in store.measurements(machine)}
+    found, ids = [], []
+    for record in records:
+        errors = store.errors_of(record)
+        covariance = covariance_or_independent(errors, store.covariance_of(record))
+        if covariance is not None and record.measurement_id not in left_out:
+            logged = measured[record.measurement_id].temperatures_c
+            means = {name: float(figures["mean"]) for name, figures in logged.items()}
+            found.append(Calibration(record.measured_at, errors, covariance, means))
+            ids.append(record.id)
+    if not found:
+        raise InputError(
+            f"the store holds no identified errors of {machine.name!r} with uncertainties; measure it first"
+        )
+    newest = next(item for item in records if item.id == ids[-1])
+    return found, ids, store.machine_of(newest)
+
+
+def with_all_errors(
+    history: Sequence[Calibration], ids: Sequence[int]
+) -> tuple[list[Calibration], list[int], list[str]]:
+    """Keep the calibrations that show at least half of the errors of the richest one; return a note about the others.
+
+    What a laser along one axis saw has another gauge, and would leave nothing but that axis to compare.
+    """
+    names = [{*item.covariance.error} for item in history]
+    richest = max(names, key=len)
+    kept = [k for k, found in enumerate(names) if len(found & richest) >= LEAST_SHARE * len(richest)]
+    left = len(history) - len(kept)
+    notes = [f"{left} of {len(history)} calibrations are left out: they show a few errors only"] if left else []
+    return [history[k] for k in kept], [ids[k] for k in kept], notes
+
+
+def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
+    """Bring calibrations, oldest first, into one gauge on the nodes of the newest."""
+    if any(late.at < early.at for early, late in zip(history, history[1:], strict=False)):
+        raise InputError("calibrations must be in order of time; sort them")
+    common = set.intersection(*({*item.covariance.error} for item in history))
+    newest = history[-1].covariance
+    kept = [k for k, name in enumerate(newest.error) if name in common]
+    if not kept:
+        raise InputError("the calibrations have no error in common; keep the same errors in the machine file")
+    error, position = tuple(newest.error[k] for k in kept), newest.position_mm[kept]
+    keep = _gauge_projector(machine, error, position)
+    maps = [keep @ _resampler(error, position, item.covariance) for item in history]
+    values = [
+        each @ values_at_nodes(item.errors, item.covariance.error, item.covariance.position_mm)
+        for each, item in zip(maps, history, strict=True)
+    ]
+    factors = [each @ item.covariance.errors_factor for each, item in zip(maps, history, strict=True)]
+    seconds = [(item.at - history[0].at).total_seconds() for item in history]
+    figures, weights = _figures(error, position, keep)
+    days = np.array(seconds) / 86400.0
+    return Aligned(machine, error, position, days, np.array(values), tuple(factors), figures, weights)
+
+
+def _resampler(error: Sequence[str], position_mm: FloatArray, source: Covariance) -> FloatArray:
+    """Matrix (k, k_i) that takes values of one calibration to the common nodes, linear in between."""
+    names, given = np.array(error), np.array(source.error)
+    matrix = np.zeros((len(names), len(given)))
+    for name in dict.fromkeys(error):
+        rows, columns = np.flatnonzero(names == name), np.flatnonzero(given == name)
+        if name in SQUARENESS_NAMES:
+            matrix[np.ix_(rows, columns)] = 1.0
+        else:
+            matrix[np.ix_(rows, columns)] = hat_matrix(source.position_mm[columns], position_mm[rows])
+    return matrix
+
+
+def _gauge_projector(machine: Machine, error: Sequence[str], position_mm: FloatArray) -> FloatArray:
+    """Matrix (k, k) that takes the gauge directions out so that the curves, not squareness, become small."""
+    counts = {name: error.count(name) for name in error}
+    names = [name for name, count in counts.items() if count > 1 or name in SQUARENESS_NAMES]
+    directions = gauge_directions(machine, names)
+    index = [ERROR_INDEX[name] for name in error]
+    shapes = directions[:, index, 0] + directions[:, index, 1] * np.nan_to_num(position_mm)
+    gauge = shapes.T  # (k, directions)
+    weight = np.array([_weight(name, counts[name]) for name in error])
+    gauge = gauge / np.maximum(np.linalg.norm(weight[:, None] * gauge, axis=0), 1e-300)
+    amounts = np.linalg.pinv(weight[:, None] * gauge, rcond=1e-10) * weight
+    return np.asarray(np.eye(len(error)) - gauge @ amounts)
+
+
+def _weight(name: str, count: int) -> float:
+    kind = error_named(name).kind
+    if kind == "squareness":
+        return 0.0
+    return (1.0 if kind == "linear" else LEVER_MM) / float(np.sqrt(count))
+
+
+def _figures(
+    error: Sequence[str], position_mm: FloatArray, keep: FloatArray
+) -> tuple[tuple[MonitoredFigure, ...], FloatArray]:
+    """Figures that the common gauge leaves, and their weights (f, k)."""
+    figures, rows = [], []
+    for name in dict.fromkeys(error):
+        columns = np.flatnonzero(np.array(error) == name)
+        for part, weights in _parts(name, position_mm[columns]).items():
+            row = np.zeros(len(error))
+            row[columns] = weights
+            if np.linalg.norm(row @ keep) > NOTHING_LEFT * np.linalg.norm(row):
+                figures.append(MonitoredFigure(name, part))
+                rows.append(row)
+    return tuple(figures), np.array(rows).reshape(-1, len(error))
+
+
+def _parts(name: str, position_mm: FloatArray) -> dict[str, FloatArray]:
+    if name in SQUARENESS_NAMES:
+        return {"value": np.ones(1)}
+    if len(position_mm) < 2:
+        return {}
+    share = np.interp(position_mm, (position_mm[0], position_mm[-1]), (-1.0, 1.0))
+    degree = 2 if len(position_mm) > 2 else 1
+    fit = np.linalg.pinv(np.vander(share, degree + 1, increasing=True))
+    found = {} if error_named(name).is_straightness else {"line": 2.0 * fit[1]}
+    return found | ({"bow": -fit[2]} if degree == 2 else {})
+
+
+# Change between two calibrations: of each error with the joint covariance of its values, and of the volume.
+
+
+#: Directions of the covariance with less than this share of the largest standard uncertainty are rounding.
+ROUNDING = 1e-7
+
+
+@dataclass(frozen=True)
+class ErrorChange:
+    """Change of one error in the common gauge.
+
+    ``largest`` is the change of the value that changed most (mm or rad, with its sign), ``u`` its standard uncertainty,
+    ``p_value`` the probability of at least this change of the whole curve if there was none, ``adjusted`` the same when
+    all errors that are looked at count (Holm 1979, Scandinavian Journal of Statistics 6).
+    """
+
+    error: str
+    largest: float
+    u: float
+    p_value: float
+    adjusted: float
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures in um or urad."""
+        name = error_named(self.error)
+        sizes = {"unit": name.unit, "largest": self.largest / name.si_per_unit, "u": self.u / name.si_per_unit}
+        return {"error": self.error, **sizes, "p_value": self.p_value, "adjusted_p_value": self.adjusted}
+
+
+def changes(data: Aligned, new: int, old: int) -> tuple[ErrorChange, ...]:
+    """Return the change of every error from calibration ``old`` to ``new``; both are taken as independent."""
+    difference = data.value[new] - data.value[old]
+    factor = np.hstack([data.factor[new], data.factor[old]])
+    names = list(dict.fromkeys(data.error))
+    found = []
+    for name in names:
+        columns = data.columns(name)
+        part, spread = difference[columns], factor[columns]
+        k = int(np.argmax(np.abs(part)))
+        found.append((float(part[k]), float(np.linalg.norm(spread[k])), chi_square_p(part, spread)))
+    adjusted = holm([item[2] for item in found])
+    return tuple(ErrorChange(name, *item, each) for name, item, each in zip(names, found, adjusted, strict=True))
+
+
+def chi_square_p(difference: FloatArray, factor: FloatArray) -> float:
+    """Probability of at least this difference (m,) under a normal distribution with covariance F F^T (m, m)."""
+    vectors, sizes, _ = np.linalg.svd(factor, full_matrices=False)
+    kept = sizes > ROUNDING * sizes[0]
+    if not kept.any():
+        return 1.0
+    score = vectors[:, kept].T @ difference / sizes[kept]
+    return float(chi2.sf(score @ score, int(np.count_nonzero(kept))))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return the error probabilities that count all that were looked at.
+
+    >>> holm([0.01, 0.5, 0.02])
+    [0.03, 0.5, 0.04]
+    """
+    order = sorted(range(len(p_values)), key=lambda k: p_values[k])
+    result, highest = [1.0] * len(p_values), 0.0
+    for rank, k in enumerate(order):
+        highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[k]))
+        result[k] = highest
+    return result

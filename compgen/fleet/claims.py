@@ -1,0 +1,426 @@
+"""Leases on measurements, and the results that are stored when a lease ends.
+
+A lease (claim) says who works on a measurement. The claims of a measurement are a chain of rows, and only one runner can
+add the next row. A lease of a process of this host that no longer runs is free at once; every other one when its time is
+over, unless it is renewed, which :func:`renewal` does during the work. What the work adds to the store is kept in one
+transaction together with the release of the claim.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from compgen.data.files import json_values
+from compgen.errors import CompgenError
+from compgen.fleet import database, logs
+from compgen.fleet.database import put_blobs
+from compgen.fleet.decisions import add_decision, locked_decisions
+from compgen.fleet.records import (
+    AUTOMATIC,
+    OPEN,
+    MachineRecord,
+    MeasurementRecord,
+    NewResult,
+    TableRecord,
+    active_id,
+    state_of,
+)
+from compgen.fleet.store import Store
+
+#: How long a claim counts without being renewed, s.
+LEASE_S = 900.0
+#: A claim is renewed when this share of its time is over.
+RENEWED_AT = 1.0 / 3.0
+
+
+class ClaimLostError(CompgenError):
+    """Another runner took over; whatever was worked out must not be kept."""
+
+    exit_code = 1
+
+
+@dataclass(frozen=True)
+class Claim:
+    """The right to process one measurement; ``sequence`` is the number of its row in the chain."""
+
+    measurement_id: int
+    sequence: int
+    owner: str
+
+
+class _InHand:
+    """What this process works on in one store, by owner and measurement: two of its threads have the same owner.
+
+    A claim of this process that is not here was left behind, so that it may take it again.
+    """
+
+    def __init__(self) -> None:
+        self._keys: set[tuple[str, int]] = set()
+        self._lock = threading.Lock()
+
+    def begin(self, owner: str, measurement_id: int) -> bool:
+        """Note that the work begins; False if another thread is at it."""
+        with self._lock:
+            is_new = (owner, measurement_id) not in self._keys
+            self._keys.add((owner, measurement_id))
+            return is_new
+
+    def end(self, owner: str, measurement_id: int) -> None:
+        with self._lock:
+            self._keys.discard((owner, measurement_id))
+
+
+@cache
+def _in_hand(_store_url: str, _process: int) -> _InHand:
+    """Return the one object for a store and this process; as engines are, see :func:`compgen.fleet.database.engine_of`."""
+    return _InHand()
+
+
+def owner_name() -> str:
+    """Return the name of this process: host, process space, number, start."""
+    pid = os.getpid()
+    return f"{socket.gethostname()}/{_process_space()}/{pid}/{_start_of(pid)}"
+
+
+def take(
+    store: Store, measurement: MeasurementRecord, owner: str, lease_s: float | None = None, *, again: bool = False
+) -> Claim | None:
+    """Claim a measurement for ``lease_s`` (None: :data:`LEASE_S`); None if somebody works on it or it is done.
+
+    With ``again`` one that is done may be claimed too.
+    """
+    results = database.identifications
+
+    def action(connection: sa.Connection) -> Claim | None:
+        now = store.now(connection)
+        last = _last(connection, measurement.id)
+        identified = sa.select(results.c.id).where(results.c.measurement_id == measurement.id)
+        done = not again and connection.execute(identified).first() is not None
+        if done or (last is not None and last.owner != owner and _counts(last, now)):
+            return None
+        return _add(connection, measurement.id, 1 if last is None else last.sequence + 1, "take", owner, now, lease_s)
+
+    in_hand = _in_hand(store.url, os.getpid())
+    if not in_hand.begin(owner, measurement.id):
+        return None
+    claim = None
+    try:
+        claim = store.write(action)
+    except sa.exc.IntegrityError:  # another runner added this row first
+        pass
+    finally:
+        if claim is None:
+            in_hand.end(owner, measurement.id)
+    return claim
+
+
+def renew(store: Store, claim: Claim, lease_s: float | None = None) -> Claim:
+    """Prolong a claim; ClaimLostError if somebody else has taken over. The claim as it was stays valid too."""
+
+    def action(connection: sa.Connection) -> Claim:
+        last = check(connection, claim)
+        now = store.now(connection)
+        return _add(connection, claim.measurement_id, last + 1, "renew", claim.owner, now, lease_s)
+
+    try:
+        return store.write(action)
+    except sa.exc.IntegrityError as error:
+        raise ClaimLostError("another runner took this measurement over") from error
+
+
+@contextmanager
+def renewal(store: Store, claim: Claim, lease_s: float | None = None) -> Iterator[None]:
+    """Prolong a claim from a thread of its own for as long as the ``with`` block takes.
+
+    A store that is away is tried again; if somebody else took over meanwhile, whoever keeps the result notices it.
+    """
+    lease_s, over = LEASE_S if lease_s is None else lease_s, threading.Event()
+
+    def prolong() -> None:
+        while not over.wait(lease_s * RENEWED_AT):
+            try:
+                renew(store, claim, lease_s)
+            except ClaimLostError:
+                return
+            except (CompgenError, sa.exc.SQLAlchemyError) as error:
+                logs.warning("claim not renewed", measurement=claim.measurement_id, problem=str(error))
+
+    thread = threading.Thread(target=prolong, name="renewal of a claim", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def check(connection: sa.Connection, claim: Claim) -> int:
+    """Return the number of the last row of the chain; ClaimLostError unless it is the owner's and not released."""
+    last = _last(connection, claim.measurement_id)
+    if last is None or last.owner != claim.owner or last.kind == "release" or last.sequence < claim.sequence:
+        raise ClaimLostError("another runner took this measurement over")
+    return int(last.sequence)
+
+
+def release(store: Store, connection: sa.Connection, claim: Claim) -> None:
+    """Give a claim back in the transaction that keeps its result; ClaimLostError if it is somebody else's."""
+    last = check(connection, claim)
+    _add(connection, claim.measurement_id, last + 1, "release", claim.owner, store.now(connection), 0.0)
+
+
+def give_back(store: Store, claim: Claim) -> None:
+    """Give a claim back without a result; one that is lost needs none."""
+    try:
+        with suppress(ClaimLostError, sa.exc.IntegrityError):
+            store.write(lambda connection: release(store, connection, claim))
+    finally:
+        forget(store, claim)
+
+
+def forget(store: Store, claim: Claim) -> None:
+    """Say that this process no longer works on a measurement, whatever the store says."""
+    _in_hand(store.url, os.getpid()).end(claim.owner, claim.measurement_id)
+
+
+def left_by(store: Store, machine: MachineRecord, pid: int) -> list[MeasurementRecord]:
+    """Return the machine's measurements that a process of this computer had claimed when it ended."""
+    mark = f"{socket.gethostname()}/{_process_space()}/{pid}/"
+    measured = {item.id: item for item in store.measurements(machine)}
+    found = [
+        last.measurement_id
+        for last in _last_claims(store)
+        if last.kind != "release" and str(last.owner).startswith(mark) and _alive(str(last.owner)) is False
+    ]
+    return [measured[key] for key in found if key in measured]
+
+
+def unfinished(store: Store) -> set[int]:
+    """Return the ids of the machines that have a measurement whose claim a process left that no longer runs."""
+    left = [last for last in _last_claims(store) if last.kind != "release" and _alive(str(last.owner)) is False]
+    machines = {item.id: item.machine_id for item in store.measurements()} if left else {}
+    return {machines[last.measurement_id] for last in left}
+
+
+def _last_claims(store: Store) -> list[Any]:
+    """Return the last row of the chain of each measurement."""
+    table = database.claims
+    last = sa.select(sa.func.max(table.c.id)).group_by(table.c.measurement_id)
+    return store.read(lambda connection: list(connection.execute(sa.select(table).where(table.c.id.in_(last)))))
+
+
+def _last(connection: sa.Connection, measurement_id: int) -> sa.Row[tuple[object, ...]] | None:
+    table = database.claims
+    query = sa.select(table).where(table.c.measurement_id == measurement_id)
+    return connection.execute(query.order_by(table.c.sequence.desc()).limit(1)).first()
+
+
+def _counts(last: sa.Row[tuple[object, ...]], now: datetime) -> bool:
+    """Whether the last claim of a chain still counts; a clock that went back prolongs it at most by its own length."""
+    if last.kind == "release" or _alive(str(last.owner)) is False:
+        return False
+    return bool(now < last.until and last.at - now < last.until - last.at)
+
+
+def _alive(owner: str) -> bool | None:
+    """Whether the process runs; None if it belongs to another host or this system cannot tell."""
+    host, space, pid, start = owner.rsplit("/", 3)
+    if host != socket.gethostname() or space != _process_space() or space == "-" or not pid.isdigit():
+        return None
+    return _start_of(int(pid)) == start
+
+
+def _process_space() -> str:
+    """Say which numbering of processes this one belongs to: boot and name space; "-" where the system does not tell."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        return f"{boot}:{os.readlink('/proc/self/ns/pid')}".replace("/", "_")
+    except OSError:
+        return "-"
+
+
+def _start_of(pid: int) -> str:
+    """Start time of a process in the system's ticks, "-" if there is none."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return "-"
+    fields = text[text.rfind(")") + 2 :].split()
+    return "-" if fields[0] in "ZX" else fields[19]
+
+
+def _add(
+    connection: sa.Connection,
+    measurement_id: int,
+    sequence: int,
+    kind: str,
+    owner: str,
+    now: datetime,
+    lease_s: float | None,
+) -> Claim:
+    row = {"measurement_id": measurement_id, "sequence": sequence, "kind": kind, "owner": owner, "at": now}
+    until = now + timedelta(seconds=LEASE_S if lease_s is None else lease_s)
+    connection.execute(sa.insert(database.claims).values(**row, until=until))
+    return Claim(measurement_id, sequence, owner)
+
+
+# --- what processing a measurement adds to the store ---------------------------------------------------------------
+
+
+class ChangedMeanwhileError(ClaimLostError):
+    """Other tables became active while the measurement was judged; it has to be judged again."""
+
+
+def keep_result(
+    store: Store, machine: MachineRecord, claim: Claim, new: NewResult, judged_against: int | None
+) -> TableRecord:
+    """Keep errors, tables and the automatic decisions about them.
+
+    Parameters
+    ----------
+    claim : it is released; whoever lost it keeps nothing.
+    new : what processing gave.
+    judged_against : id of the tables that were active when it was judged; ChangedMeanwhileError if others are now.
+    """
+
+    def action(connection: sa.Connection) -> int:
+        decisions = locked_decisions(connection, machine)
+        release(store, connection, claim)
+        if active_id(decisions) != judged_against:
+            raise ChangedMeanwhileError(f"{machine.name}: other tables became active; the measurement is judged again")
+        table_id = _insert(store, connection, machine, claim, new)
+        if new.accepted and not new.hold:
+            for old in dict.fromkeys(item.table_id for item in decisions):
+                if old is not None and state_of(old, decisions) in OPEN:
+                    add_decision(store, connection, machine, "supersede", old, AUTOMATIC, "a newer proposal came")
+        _decide(store, connection, machine, table_id, new)
+        return table_id
+
+    try:
+        table_id = store.write(action)
+    except ClaimLostError:
+        stored = _stored_result(store, claim, new.revision)
+        if stored is None:
+            raise
+        table_id = stored
+    forget(store, claim)
+    return next(table for table in store.tables(machine) if table.id == table_id)
+
+
+def _stored_result(store: Store, claim: Claim, revision: int) -> int | None:
+    """Return the tables that this claim led to: the store may have kept a result and gone away before it said so."""
+    kept, tried = database.identifications, database.attempts
+    query = (
+        sa.select(database.tables.c.id)
+        .join(kept, kept.c.id == database.tables.c.identification_id)
+        .join(tried, tried.c.measurement_id == kept.c.measurement_id)
+        .where(kept.c.measurement_id == claim.measurement_id, kept.c.revision == revision)
+        .where(tried.c.outcome == "done", tried.c.owner == claim.owner)
+    )
+    return store.read(lambda connection: connection.execute(query).scalar())
+
+
+def _decide(store: Store, connection: sa.Connection, machine: MachineRecord, table_id: int, new: NewResult) -> None:
+    reason, actor = "; ".join(filter(None, [new.reason, *new.hold])), new.actor or AUTOMATIC
+    if not new.accepted:
+        add_decision(store, connection, machine, "refuse", table_id, actor, reason or "not accepted")
+    elif new.hold:
+        add_decision(store, connection, machine, "hold", table_id, actor, reason)
+    else:
+        shown = "; ".join(filter(None, [reason, *new.reservations]))
+        add_decision(store, connection, machine, "propose", table_id, actor, shown)
+        if new.approve:
+            add_decision(store, connection, machine, "approve", table_id, AUTOMATIC, "approval = auto")
+
+
+def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, claim: Claim, new: NewResult) -> int:
+    now = store.now(connection)
+    parts = [new.machine_text, new.errors_text, new.covariance, new.fitted_text]
+    digests = iter(put_blobs(connection, [part for part in parts if part is not None]))
+    machine_sha, errors_sha, covariance_sha, fitted_sha = (
+        next(digests) if part is not None else None for part in parts
+    )
+    identification = {
+        "machine_id": machine.id,
+        "measurement_id": claim.measurement_id,
+        "machine_version_id": _machine_version(connection, machine, str(machine_sha), now),
+        "active_table_id": new.active_table_id,
+        "errors_sha256": errors_sha,
+        "covariance_sha256": covariance_sha,
+        "fitted_sha256": fitted_sha,
+        "summary": clean(new.summary),
+        "program": new.program,
+        "at": now,
+        "revision": new.revision,
+    }
+    identification_id = _added(connection, database.identifications, identification)
+    versions = sa.select(sa.func.max(database.tables.c.version)).where(database.tables.c.machine_id == machine.id)
+    last = connection.execute(versions).scalar()
+    table = {
+        "machine_id": machine.id,
+        "version": (last or 0) + 1,
+        "identification_id": identification_id,
+        "accepted": new.accepted,
+        "controllers": list(dict.fromkeys(file.controller for file in new.files)),
+        "reasons": [*new.hold, *new.reservations],
+        "summary": clean(new.judgement),
+        "at": now,
+    }
+    table_id = _added(connection, database.tables, table)
+    for file, digest in zip(new.files, put_blobs(connection, [file.content for file in new.files]), strict=True):
+        row = {"table_id": table_id, "controller": file.controller, "name": file.name, "sha256": digest}
+        connection.execute(sa.insert(database.table_files).values(**row))
+    attempt = {"outcome": "done", "message": "", "settings_sha256": new.settings_sha256, "seconds": new.seconds}
+    _add_attempt(store, connection, machine, claim, attempt)
+    return table_id
+
+
+def _machine_version(connection: sa.Connection, machine: MachineRecord, sha256: str, now: datetime) -> int:
+    table = database.machine_versions
+    query = sa.select(table.c.id).where(table.c.machine_id == machine.id, table.c.sha256 == sha256)
+    known = connection.execute(query).scalar()
+    new = {"machine_id": machine.id, "sha256": sha256, "at": now}
+    return _added(connection, table, new) if known is None else int(known)
+
+
+def keep_failure(
+    store: Store, machine: MachineRecord, claim: Claim, message: str, settings_sha256: str, seconds: float
+) -> None:
+    """Keep that a measurement could not be processed, and why; it is tried again when settings or machine change."""
+
+    def action(connection: sa.Connection) -> None:
+        release(store, connection, claim)
+        attempt = {"outcome": "failed", "message": message, "settings_sha256": settings_sha256, "seconds": seconds}
+        _add_attempt(store, connection, machine, claim, attempt)
+
+    store.write(action)
+    forget(store, claim)
+
+
+def _add_attempt(
+    store: Store, connection: sa.Connection, machine: MachineRecord, claim: Claim, attempt: Mapping[str, object]
+) -> None:
+    about = {"machine_id": machine.id, "measurement_id": claim.measurement_id, "owner": claim.owner}
+    connection.execute(sa.insert(database.attempts).values(**about, **attempt, at=store.now(connection)))
+
+
+def _added(connection: sa.Connection, table: sa.Table, values: Mapping[str, Any]) -> int:
+    key = connection.execute(sa.insert(table).values(**values)).inserted_primary_key
+    assert key is not None
+    return int(key[0])
+
+
+def clean(value: Any) -> Any:
+    """Return what JSON can hold: a number that is not finite becomes null."""
+    return json.loads(json.dumps(json_values(value), default=str))

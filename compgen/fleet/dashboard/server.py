@@ -1,0 +1,118 @@
+"""The HTTP server of the dashboard; whoever sends a request byte by byte does not keep others out (slow loris)."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import time
+from types import FrameType
+from typing import Any
+
+from waitress.channel import HTTPChannel  # type: ignore[import-untyped]  # shipped without type information
+
+from compgen.errors import InputError
+from compgen.fleet import logs
+from compgen.fleet.dashboard.app import make_app
+from compgen.fleet.dashboard.settings import DashboardSettings
+
+#: A request must be complete this long after its first byte, s.
+REQUEST_S = 20.0
+#: While the connections are at their limit, those without a request end after this time, s.
+CROWDED_S = 2.0
+
+
+class TimedChannel(HTTPChannel):  # type: ignore[misc]
+    """A connection that ends when its request takes too long; asked by the server's loop about once a second."""
+
+    began: float | None = None
+
+    def readable(self) -> bool:
+        """Say whether more may be read; note when a request began, and end what takes too long."""
+        now = time.time()
+        if self.request is None or self.requests:
+            self.began = None
+        elif self.began is None:
+            self.began = now
+        if not self.requests and not self.total_outbufs_len:
+            crowded = self.server.in_connection_overflow
+            since = self.last_activity if self.began is None else self.began
+            if now - since > (CROWDED_S if crowded else REQUEST_S if self.began is not None else float("inf")):
+                self.will_close = True
+                return False
+        return bool(super().readable())
+
+
+def bounded(server: Any) -> Any:
+    """Return the server with connections that end in time."""
+    for each in [*getattr(server, "map", {}).values(), server]:
+        if hasattr(each, "channel_class"):
+            each.channel_class = TimedChannel
+    return server
+
+
+THREADS, LARGEST_BODY, LARGEST_HEADERS = 8, 65_536, 65_536
+#: Connections at the same time; so many that patient ones do not keep others out, see :mod:`compgen.fleet.dashboard.server`.
+CONNECTIONS = 1000
+#: Bytes of an answer that may wait for a slow reader, so that none keeps a thread.
+WAITING_BYTES = 2**30
+
+
+def make_server(settings: DashboardSettings) -> Any:
+    """Return a server that listens; InputError if the address cannot be used."""
+    import waitress  # type: ignore[import-untyped]  # shipped without type information
+
+    app = make_app(settings)
+    try:
+        server = waitress.create_server(
+            app,
+            host=settings.host,
+            port=settings.port,
+            threads=THREADS,
+            ident=None,
+            max_request_body_size=LARGEST_BODY,
+            max_request_header_size=LARGEST_HEADERS,
+            connection_limit=CONNECTIONS,
+            asyncore_use_poll=True,
+            outbuf_high_watermark=WAITING_BYTES,
+            channel_timeout=60,
+            url_scheme=settings.scheme,
+        )
+    except OSError as error:
+        place = f"{settings.host}:{settings.port}"
+        raise InputError(f"{place} cannot be used: {error.strerror or error}", field="--port") from error
+    return bounded(server)
+
+
+def run(settings: DashboardSettings) -> None:
+    """Serve until SIGTERM or SIGINT; requests that are being answered are finished."""
+    server = make_server(settings)
+    _log_server()
+    signal.signal(signal.SIGTERM, _stop)
+    host, port = getattr(server, "effective_listen", [(None, None)])[0]  # the first of several
+    host, port = (server.effective_host, server.effective_port) if host is None else (host, port)
+    address = f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+    logs.info("serving", address=address, decide=settings.decide)
+    try:
+        server.run()
+    finally:
+        server.close()
+        logs.info("stopped serving")
+
+
+class _Logged(logging.Handler):
+    """Puts what the server library says into our logs, so that all lines have one form."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log one message."""
+        logs.warning("server", problem=record.getMessage())
+
+
+def _log_server() -> None:
+    logger = logging.getLogger("waitress")
+    logger.setLevel(logging.WARNING)
+    logger.propagate = False
+    logger.handlers = [_Logged()]
+
+
+def _stop(_number: int, _frame: FrameType | None) -> None:
+    raise SystemExit(0)

@@ -1,0 +1,315 @@
+"""Decisions in the store: approve, reject, roll back a set of tables; exclude a measurement from the drift.
+
+Each adds one row with who, when and why; nothing else makes tables active. The files follow the store
+(:func:`compgen.fleet.publish.publish`), so a decision counts as soon as it is in the store.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from contextlib import closing
+
+import sqlalchemy as sa
+
+from compgen.errors import InputError
+from compgen.fleet import database
+from compgen.fleet.job import Job
+from compgen.fleet.records import (
+    AUTOMATIC,
+    OPEN,
+    WAS_ACTIVE,
+    DecisionKind,
+    DecisionRecord,
+    EventRecord,
+    MachineRecord,
+    TableRecord,
+    active_id,
+    active_of,
+    before_active,
+    state_of,
+)
+from compgen.fleet.store import Clock, Store, at_one_moment, files_of, open_store
+
+
+class DecisionError(InputError):
+    """The state of the tables does not allow this decision."""
+
+
+def pending(store: Store, machine: MachineRecord | None = None) -> list[TableRecord]:
+    """Return the sets of tables that wait for a person: proposed ones, and those that the policy holds back."""
+    return [table for table in store.tables(machine) if table.state in OPEN]
+
+
+def only_pending(store: Store, machine: MachineRecord) -> TableRecord:
+    """Return the only set of tables of a machine that waits for a person; DecisionError if none or several do."""
+    waiting = pending(store, machine)
+    if len(waiting) != 1:
+        listed = ", ".join(f"{table.version} ({table.state})" for table in waiting)
+        raise DecisionError(
+            f"{machine.name}: {f'versions {listed} wait; name one' if waiting else 'nothing waits for a decision'}"
+        )
+    return waiting[0]
+
+
+def active_table(store: Store, machine: MachineRecord) -> TableRecord | None:
+    """Return the set of tables that is active, None if none is."""
+    return active_of(store.tables(machine))
+
+
+def approve(
+    store: Store,
+    machine: MachineRecord,
+    version: int,
+    actor: str,
+    reason: str = "",
+    *,
+    override: bool = False,
+    seen: int | None = None,
+) -> DecisionRecord:
+    """Make a proposed version active.
+
+    Parameters
+    ----------
+    version : version of the machine's tables.
+    actor, reason : who, and why; both are kept.
+    override : also for tables that the policy holds back; then a reason is required. Files that the round trip did not
+        accept can never be approved.
+    seen : version that was active (0: none) when the person looked; DecisionError if another one is by now.
+
+    Raises
+    ------
+    DecisionError
+        for an unknown version, one that is not open, one that is held back without ``override``.
+    StoreError
+        if the contents of its files are missing or damaged in the store.
+    """
+    check_person(actor)
+
+    def action(connection: sa.Connection) -> DecisionRecord:
+        decisions, table_id, accepted = _open(connection, machine, version)
+        _check_seen(connection, machine, decisions, seen)
+        state = state_of(table_id, decisions)
+        if not accepted:
+            raise DecisionError(_place(machine, version) + " was not accepted by the round trip; it cannot be approved")
+        if state == "held" and not override:
+            raise DecisionError(
+                _place(machine, version) + " is held back by the policy; override it with a reason, or reject it"
+            )
+        if state == "held" and not reason.strip():
+            raise DecisionError(
+                _place(machine, version) + " is held back by the policy; say the reason why it is right"
+            )
+        files_of(connection, table_id)  # nobody decides for files that nobody can write any more
+        return add_decision(store, connection, machine, "approve", table_id, actor, reason)
+
+    return store.write(action)
+
+
+def reject(
+    store: Store, machine: MachineRecord, version: int, actor: str, reason: str, *, seen: int | None = None
+) -> DecisionRecord:
+    """Refuse a proposed version or one that is held back; DecisionError where it is not open or no reason is given.
+
+    ``seen`` as for :func:`approve`.
+    """
+    check_person(actor)
+
+    def action(connection: sa.Connection) -> DecisionRecord:
+        decisions, table_id, _ = _open(connection, machine, version)
+        _check_seen(connection, machine, decisions, seen)
+        if not reason.strip():
+            raise DecisionError("rejecting tables needs a reason")
+        return add_decision(store, connection, machine, "reject", table_id, actor, reason)
+
+    return store.write(action)
+
+
+def rollback(
+    store: Store, machine: MachineRecord, actor: str, reason: str, *, to: int | None = None, seen: int | None = None
+) -> DecisionRecord:
+    """Make an earlier version active again.
+
+    Parameters
+    ----------
+    to : version that was active before; 0 for no tables at all; None for the one that was active before this one.
+    seen : as for :func:`approve`.
+
+    Raises
+    ------
+    DecisionError
+        where nothing is active, the version was never active, or no reason is given.
+    StoreError
+        if the contents of its files are missing or damaged in the store.
+    """
+    check_person(actor)
+
+    def action(connection: sa.Connection) -> DecisionRecord:
+        decisions = locked_decisions(connection, machine)
+        _check_seen(connection, machine, decisions, seen)
+        if not reason.strip():
+            raise DecisionError("a rollback needs a reason")
+        if active_id(decisions) is None and not to:
+            raise DecisionError(f"{machine.name}: no tables are active, so there is nothing to undo")
+        table_id = before_active(decisions) if to is None else _earlier(connection, machine, decisions, to)
+        if table_id is not None:
+            files_of(connection, table_id)
+        return add_decision(store, connection, machine, "rollback", table_id, actor, reason)
+
+    return store.write(action)
+
+
+def check_person(actor: str) -> None:
+    """Raise DecisionError unless this can be the name of a person: one line that shows all of itself, not "automatic"."""
+    if not actor.strip():
+        raise DecisionError("a decision needs the name of who makes it")
+    plain = unicodedata.normalize("NFKC", actor)  # wide letters, ligatures and hard spaces as the usual ones
+    if not plain.isprintable():
+        shown = actor.encode("unicode_escape").decode("ascii")
+        raise DecisionError(f"the name of who decides contains control characters or invisible ones: {shown}")
+    if plain.strip().casefold() == AUTOMATIC:
+        raise DecisionError(f"{AUTOMATIC!r} signs decisions that no person made; give your own name")
+
+
+def _earlier(
+    connection: sa.Connection, machine: MachineRecord, decisions: list[DecisionRecord], version: int
+) -> int | None:
+    if version == 0:
+        return None
+    table_id, _ = _table_of(connection, machine, version)
+    state = state_of(table_id, decisions)
+    if state not in WAS_ACTIVE:
+        raise DecisionError(f"{_place(machine, version)} is {state}; only a version that was active can come back")
+    return table_id
+
+
+def _check_seen(
+    connection: sa.Connection, machine: MachineRecord, decisions: list[DecisionRecord], seen: int | None
+) -> None:
+    """Raise DecisionError unless the version that was seen as the active one still is, under the machine's lock."""
+    if seen is None:
+        return
+    active = active_id(decisions)
+    query = sa.select(database.tables.c.version).where(database.tables.c.id == active)
+    if seen != (0 if active is None else connection.execute(query).scalar()):
+        raise DecisionError(
+            f"{machine.name}: other tables became active since you looked; look again before you decide"
+        )
+
+
+def locked_decisions(connection: sa.Connection, machine: MachineRecord) -> list[DecisionRecord]:
+    """Return the decisions of a machine and keep others from deciding until this transaction ends."""
+    connection.execute(sa.select(database.machines.c.id).where(database.machines.c.id == machine.id).with_for_update())
+    table = database.decisions
+    query = sa.select(table).where(table.c.machine_id == machine.id).order_by(table.c.sequence)
+    return [DecisionRecord(*row) for row in connection.execute(query)]
+
+
+def add_decision(
+    store: Store,
+    connection: sa.Connection,
+    machine: MachineRecord,
+    kind: DecisionKind,
+    table_id: int | None,
+    actor: str,
+    reason: str,
+) -> DecisionRecord:
+    """Add one decision; its time is never before that of the one before it, whatever the clock says."""
+    table = database.decisions
+    own = table.c.machine_id == machine.id
+    last = connection.execute(sa.select(table).where(own).order_by(table.c.sequence.desc()).limit(1)).first()
+    now = store.now(connection)
+    row = {
+        "machine_id": machine.id,
+        "sequence": 1 if last is None else last.sequence + 1,
+        "table_id": table_id,
+        "kind": kind,
+        "actor": actor,
+        "reason": reason,
+        "at": now if last is None else max(now, last.at),
+    }
+    connection.execute(sa.insert(table).values(**row))
+    stored = sa.select(table).where(own, table.c.sequence == row["sequence"])
+    return DecisionRecord(*connection.execute(stored).one())
+
+
+def _open(connection: sa.Connection, machine: MachineRecord, version: int) -> tuple[list[DecisionRecord], int, bool]:
+    """Return decisions, id and acceptance of a version that is open, under the machine's lock."""
+    decisions = locked_decisions(connection, machine)
+    table_id, accepted = _table_of(connection, machine, version)
+    state = state_of(table_id, decisions)
+    if state not in (*OPEN, "refused"):
+        raise DecisionError(f"{_place(machine, version)} is {state}; only pending or held tables can be decided on")
+    return decisions, table_id, accepted
+
+
+def _table_of(connection: sa.Connection, machine: MachineRecord, version: int) -> tuple[int, bool]:
+    table = database.tables
+    own = table.c.machine_id == machine.id
+    row = connection.execute(sa.select(table.c.id, table.c.accepted).where(own, table.c.version == version)).first()
+    if row is None:
+        known = connection.execute(sa.select(sa.func.max(table.c.version)).where(own)).scalar()
+        having = f"it has 1 to {known}" if known else "it has none"
+        raise DecisionError(f"{machine.name} has no tables of version {version}; {having}")
+    return int(row.id), bool(row.accepted)
+
+
+def _place(machine: MachineRecord, version: int) -> str:
+    return f"{machine.name}: version {version}"
+
+
+# --- measurements that a person found to be wrong ------------------------------------------------------------------
+#
+# They are kept, but the drift of the machine leaves them out. An exclusion and its withdrawal are events of the store.
+
+#: Kind of the events by which a measurement is excluded, or that is taken back.
+EXCLUSION = "exclusion"
+_SAID = re.compile(r"(excluded|taken back) by (.*?): (.*)", re.DOTALL)
+
+
+def exclude(
+    job: Job, name: str, version: int, actor: str, reason: str, *, undo: bool = False, clock: Clock | None = None
+) -> None:
+    """Leave the measurement behind a version of tables out of the drift, or with ``undo`` take that back.
+
+    Raises
+    ------
+    InputError
+        for an unknown version, the active one (roll it back first), or without name or reason.
+    """
+    check_person(actor)
+    if ": " in actor or not reason.strip():
+        raise InputError("an exclusion needs who says it (a name without ': ') and a reason")
+    job.machine(name)
+    with closing(open_store(job.store, clock=clock)) as store:
+        machine = store.machine(name)
+        states = {table.version: table.state for table in store.tables(machine, figures=False)}
+        if version not in states:
+            raise InputError(f"{machine.name} has no tables of version {version}; it has 1 to {len(states)}")
+        if states[version] == "active" and not undo:
+            raise InputError(f"{name}: version {version} is active; if its measurement is wrong, roll it back first")
+        said = "taken back" if undo else "excluded"
+        store.add_event(EXCLUSION, f"version {version}", f"{said} by {actor}: {reason}", machine)
+
+
+def said_of(event: EventRecord) -> tuple[str, str, str]:
+    """Return what ("excluded", "taken back"), who and why of an event of this kind."""
+    found = _SAID.fullmatch(event.message)
+    return (found[1], found[2], found[3]) if found else ("excluded", "", event.message)
+
+
+@at_one_moment
+def excluded(store: Store, machine: MachineRecord) -> dict[int, str]:
+    """Return who excluded what and why, in words, by the id of the measurement, whichever version was named."""
+    measured = {item.id: item.measurement_id for item in store.identifications(machine)}
+    tables = store.tables(machine, figures=False)
+    behind = {f"version {table.version}": measured[table.identification_id] for table in tables}
+    found: dict[int, str] = {}
+    for event in store.events(machine):
+        if event.kind == EXCLUSION:
+            what, actor, reason = said_of(event)
+            measurement_id = behind[event.subject]
+            found.pop(measurement_id, None)
+            if what == "excluded":
+                found[measurement_id] = f"{event.subject} is left out ({actor}: {reason})"
+    return found

@@ -1,0 +1,273 @@
+"""The inbox of a machine: each file that fits is one measurement, each sub-folder with such files another one."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import os
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from compgen.data.csv_files import MOST_COLUMNS
+from compgen.data.files import sha256_of
+from compgen.data.messages import visible
+from compgen.errors import InputError
+from compgen.fleet.job import MachineJob, OtherInbox
+from compgen.fleet.records import NewMeasurement
+
+#: Comments of a measurement file that say when it was made, and with which tables (a version, or "none").
+TIME_KEYS = ("measured_at", "date")
+ACTIVE_KEY = "active_table"
+#: Files of one measurement, and characters of a comment that says something about it.
+MOST_FILES, LONGEST_COMMENT = 1000, 200
+
+
+@dataclass(frozen=True)
+class InboxProblem:
+    """Something in the inbox that cannot be taken now; it stays where it is and is looked at again."""
+
+    subject: str
+    message: str
+
+
+@dataclass(frozen=True)
+class InboxContents:
+    """What an inbox contains: measurements by the paths of their files, and problems."""
+
+    groups: tuple[tuple[Path, ...], ...]
+    problems: tuple[InboxProblem, ...]
+
+
+def scan(job: MachineJob, now: datetime) -> InboxContents:
+    """List the measurements of an inbox by name; nothing is read yet. A folder that is missing is a problem."""
+    try:
+        entries = sorted(job.inbox.iterdir())
+    except OSError as error:
+        return InboxContents(
+            (), (InboxProblem(str(job.inbox), f"the inbox cannot be read: {error.strerror or error}"),)
+        )
+    groups: list[tuple[Path, ...]] = []
+    problems: list[InboxProblem] = []
+    for entry in entries:
+        if entry.name.startswith("."):
+            continue
+        try:
+            if entry.is_symlink() and entry.is_dir():
+                problems.append(InboxProblem(str(entry), "is a link to a folder; put the folder itself into the inbox"))
+                continue
+            files = sorted(entry.iterdir()) if entry.is_dir() else [entry]
+            named = [path for path in files if not path.name.startswith(".") and _is_named(path, job.patterns)]
+            # a link, a pipe, a device is reported when it is read
+            group = tuple(path for path in named if path.is_symlink() or not path.is_dir())
+            # a file that is so new may still be written; one from the future (a clock that went back) is not
+            ages = [now.timestamp() - path.lstat().st_mtime for path in group]
+            if group and not any(0.0 <= age < job.settle_s for age in ages):
+                groups.append(group)
+        except OSError as error:
+            problems.append(InboxProblem(str(entry), f"cannot be read: {error.strerror or error}"))
+    return InboxContents(tuple(groups), tuple(problems))
+
+
+def _is_named(path: Path, patterns: Iterable[str]) -> bool:
+    return any(fnmatchcase(path.name, pattern) for pattern in patterns)
+
+
+def load(job: MachineJob, group: tuple[Path, ...]) -> NewMeasurement:
+    """Read the files of one measurement.
+
+    Raises
+    ------
+    InputError
+        if one cannot be read, changes at this moment, is a link or no file, or all are larger than the job allows.
+    """
+    if len(group) > MOST_FILES:
+        raise InputError(f"holds {len(group)} files; one measurement has at most {MOST_FILES}", file=group[0].parent)
+    contents: dict[str, bytes] = {}
+    times = []
+    left = round(job.max_size_mb * 1e6)
+    for path in group:
+        content, state = _read_regular(path, left, folder_is_real=path.parent != job.inbox)
+        contents[path.name], left = content, left - len(content)
+        times.append(state.st_mtime)
+    name = group[0].name if len(group) == 1 else group[0].parent.name
+    return measurement_of(visible(name, flat=True), contents, datetime.fromtimestamp(max(times), UTC))
+
+
+def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes, os.stat_result]:
+    """Return contents and state of a file that anybody may have put there: regular, at most ``most`` bytes, no link.
+
+    Nothing is waited for (a pipe that nobody writes to) and nothing without end is read (a device). With
+    ``folder_is_real`` the folder of the file must not be a link either.
+
+    Raises
+    ------
+    InputError
+        for anything else, a file that is too large, and one that changes while it is read.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        kind = path.lstat().st_mode
+        if stat.S_ISLNK(kind) or (folder_is_real and path.parent.is_symlink()):
+            raise InputError("cannot be read: it is a link; put the file itself there", file=path)
+        if not stat.S_ISREG(kind):  # not even opened: a device may do something then
+            raise InputError("cannot be read: it is a pipe or a device, not a file", file=path)
+        with _opened_folder(path.parent, real=folder_is_real) as folder:
+            handle = os.open(path if folder is None else path.name, flags, dir_fd=folder)
+        with os.fdopen(handle, "rb") as stream:
+            before = os.fstat(handle)
+            if not stat.S_ISREG(before.st_mode):
+                raise InputError("cannot be read: another thing took its place meanwhile", file=path)
+            if before.st_size > most:
+                size, allowed = before.st_size / 1e6, most / 1e6
+                message = f"is too large: {size:.3g} MB where {allowed:.3g} MB are left for this measurement"
+                raise InputError(f"{message}; max_size_mb of the job file is the limit", file=path)
+            content = stream.read(most + 1)
+            after = os.fstat(handle)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from error
+    if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns) or len(content) != after.st_size:
+        raise InputError("is being written at this moment; it is taken by the next run", file=path)
+    return content, after
+
+
+def with_twins(chosen: Iterable[MachineJob], every: Iterable[MachineJob]) -> list[MachineJob]:
+    """Return the jobs, each with the other machines whose inboxes hold one of its files as well as ``others``.
+
+    Only files of the same size are read. What cannot be read is reported by the pass over its machine.
+    """
+    boxes = {job.name: OtherInbox(job.name, job.inbox, job.patterns) for job in every}
+    by_size: dict[int, list[tuple[str, Path]]] = {}
+    for box in boxes.values():
+        for path, size in _listed(box):
+            by_size.setdefault(size, []).append((box.name, path))
+    sharing: dict[str, set[str]] = {}
+    for size, files in by_size.items():
+        if len({name for name, _ in files}) < 2:
+            continue
+        same: dict[str, set[str]] = {}
+        for name, path in files:
+            with contextlib.suppress(InputError):
+                content, _ = _read_regular(path, size, folder_is_real=path.parent != boxes[name].inbox)
+                same.setdefault(sha256_of(content), set()).add(name)
+        for names in same.values():
+            for name in names:
+                sharing.setdefault(name, set()).update(names - {name})
+    found = []
+    for job in chosen:
+        known = {item.name for item in job.others}
+        more = tuple(boxes[name] for name in sorted(sharing.get(job.name, set()) - known))
+        found.append(replace(job, others=(*job.others, *more)))
+    return found
+
+
+def holds_one_of(other: OtherInbox, contents: Iterable[bytes]) -> bool:
+    """Whether a file that fits, in another machine's inbox or a sub-folder, holds one of these contents, empty ones apart."""
+    searched = {(len(content), sha256_of(content)) for content in contents if content}
+    sizes = {size for size, _ in searched}
+    for path, size in _listed(other):
+        if size in sizes:
+            with contextlib.suppress(InputError):
+                content, _ = _read_regular(path, size, folder_is_real=path.parent != other.inbox)
+                if (len(content), sha256_of(content)) in searched:
+                    return True
+    return False
+
+
+def _listed(box: OtherInbox) -> list[tuple[Path, int]]:
+    """Return path and size of the regular files that fit, in an inbox and its sub-folders; nothing where it is not read."""
+    found = []
+    with contextlib.suppress(OSError):
+        entries = sorted(box.inbox.iterdir())
+        folders = [entry for entry in entries if entry.is_dir() and not entry.is_symlink()]
+        for path in [*entries, *(path for folder in folders for path in sorted(folder.iterdir()))]:
+            state = path.lstat()
+            if _is_named(path, box.patterns) and stat.S_ISREG(state.st_mode) and state.st_size > 0:
+                found.append((path, state.st_size))
+    return found
+
+
+@contextlib.contextmanager
+def _opened_folder(folder: Path, *, real: bool) -> Iterator[int | None]:
+    """Open a folder, so that nobody can put another one in its place; None on a system that cannot."""
+    if os.open not in os.supports_dir_fd:
+        yield None
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | (os.O_NOFOLLOW if real else 0))
+    try:
+        yield handle
+    finally:
+        os.close(handle)
+
+
+def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime) -> NewMeasurement:
+    """Return a measurement from the contents of its files; names of files do not count for its hash."""
+    digests = sorted(sha256_of(content) for content in contents.values())
+    digest = digests[0] if len(digests) == 1 else sha256_of("\n".join(digests).encode())
+    comments: dict[str, str] = {}
+    for content in contents.values():
+        comments = {**_comments(content), **comments}
+    times = [found for key in TIME_KEYS if (found := _time(comments.get(key, ""))) is not None]
+    temperatures: dict[str, dict[str, float]] = {}
+    for content in contents.values():
+        temperatures |= _temperatures(content)
+    return NewMeasurement(
+        sha256=digest,
+        name=name,
+        measured_at=times[0][0] if times else file_time,
+        measured_at_source=times[0][1] if times else "file time",
+        contents=contents,
+        active_table=comments.get(ACTIVE_KEY) or None,
+        temperatures_c=temperatures,
+    )
+
+
+def _comments(content: bytes) -> dict[str, str]:
+    """Return the comments ``# key = value`` of a file that this module looks at, cut at a sensible length."""
+    found = {}
+    for line in content.splitlines():
+        key, equals, value = line.strip().partition(b"=")
+        name = key[1:].strip().decode("utf-8", "replace") if key.startswith(b"#") else ""
+        if equals and name in (*TIME_KEYS, ACTIVE_KEY):
+            found[name] = value.decode("utf-8", "replace").strip()[:LONGEST_COMMENT]
+    return found
+
+
+def _time(text: str) -> tuple[datetime, str] | None:
+    """Read an ISO time and say how sure it is: "file", or "file, no zone" for one that is taken as local time."""
+    try:
+        found = datetime.fromisoformat(text.strip())
+        return found.astimezone(UTC), "file" if found.tzinfo is not None else "file, no zone"
+    except (ValueError, OverflowError, OSError):
+        return None
+
+
+def _temperatures(content: bytes) -> dict[str, dict[str, float]]:
+    """Return lowest, mean and highest value of each ``temp_..._c`` column; cells that are not numbers are left out."""
+    if b"temp_" not in content:
+        return {}
+    lines = [line for line in content.decode("utf-8-sig", "replace").splitlines() if line.strip() and line[0] != "#"]
+    try:
+        rows = list(csv.reader(lines))
+    except csv.Error:  # the reader of the measurement says what is wrong, and where
+        return {}
+    if not rows or len(rows[0]) > MOST_COLUMNS:
+        return {}
+    found = {}
+    for column, name in enumerate(cell.strip() for cell in rows[0]):
+        if fnmatchcase(name, "temp_*_c"):
+            values = [value for row in rows[1:] if len(row) > column and (value := _number(row[column])) is not None]
+            if values:
+                found[name] = {"low": min(values), "mean": sum(values) / len(values), "high": max(values)}
+    return found
+
+
+def _number(cell: str) -> float | None:
+    try:
+        value = float(cell)
+    except ValueError:
+        return None
+    return value if abs(value) < 1e6 else None

@@ -1,0 +1,567 @@
+"""The job file ``recal.toml``: which machines are recalibrated, from which files, when and by which rules.
+
+Schedules come first, then the file itself (each key is declared once, with its check, as a field of :class:`Policy` or
+:class:`MachineJob`), then what is made from a job: an added machine, and the files of the system's own scheduler.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from compgen.controls import CONTROLLERS
+from compgen.data import toml_files
+from compgen.data.files import read_bytes, read_text, sha256_of, write_file
+from compgen.data.machine import load_machine
+from compgen.data.messages import nearest
+from compgen.data.names import ERROR_NAMES, MM_PER_UM, error_named
+from compgen.data.toml_files import Section
+from compgen.errors import InputError
+
+T = TypeVar("T")
+D = TypeVar("D")
+
+# --- schedules -----------------------------------------------------------------------------------------------------
+#
+# An expression means what it means to cron: Sunday is 0 or 7; where both the day of the month and the day of the week
+# are restricted, a day fits that fits either of them. Times are local.
+
+MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+DAYS = ("sun", "mon", "tue", "wed", "thu", "fri", "sat")
+MACROS = {
+    "@hourly": "0 * * * *",
+    "@daily": "0 0 * * *",
+    "@weekly": "0 0 * * 0",
+    "@monthly": "0 0 1 * *",
+    "@yearly": "0 0 1 1 *",
+}
+#: Field: lowest and highest number, first number of its names, names.
+FIELDS = (
+    ("minute", 0, 59, ()),
+    ("hour", 0, 23, ()),
+    ("day of the month", 1, 31, ()),
+    ("month", 1, 12, MONTHS),
+    ("day of the week", 0, 7, DAYS),
+)
+
+
+@dataclass(frozen=True)
+class Cron:
+    """A cron expression: the numbers that fit each field; Sunday is 0. ``any_day``, ``any_weekday``: the field is ``*``."""
+
+    expression: str
+    minutes: tuple[int, ...]
+    hours: tuple[int, ...]
+    days: tuple[int, ...]
+    months: tuple[int, ...]
+    weekdays: tuple[int, ...]
+    any_day: bool
+    any_weekday: bool
+
+
+@dataclass(frozen=True)
+class Every:
+    """Every so many minutes."""
+
+    minutes: int
+
+
+Schedule = Cron | Every
+
+
+def cron(value: object) -> Cron:
+    """Return a cron expression as numbers; ValueError says what is wrong with which field."""
+    if not isinstance(value, str):
+        raise ValueError("a cron expression, for example '30 6 * * mon', is expected")
+    words = MACROS.get(value.strip().lower(), value).split()
+    if len(words) != 5:
+        raise ValueError(
+            f"a cron expression has five fields (minute hour day month weekday), this one has {len(words)}"
+        )
+    fields = [_field(word.lower(), k) for k, word in enumerate(words)]
+    weekdays = tuple(sorted({day % 7 for day in fields[4]}))
+    minutes, hours, days, months = fields[:4]
+    any_day, any_weekday = words[2].startswith("*"), words[4].startswith("*")
+    found = Cron(" ".join(words), minutes, hours, days, months, weekdays, any_day, any_weekday)
+    longest = {2: 29, 4: 30, 6: 30, 9: 30, 11: 30}
+    if found.any_weekday and not any(day <= longest.get(month, 31) for month in found.months for day in found.days):
+        raise ValueError("a cron expression whose day exists in one of its months is expected")
+    return found
+
+
+def _field(word: str, number: int) -> tuple[int, ...]:
+    name, low, high, names = FIELDS[number]
+    found: set[int] = set()
+    for part in word.split(","):
+        match = re.fullmatch(r"(\*|\w+)(?:-(\w+))?(?:/(\d+))?", part)
+        if match is None or (match[1] == "*" and match[2]):
+            raise ValueError(f"{part!r} is not a {name}; numbers, a-b, lists and /step are expected")
+        first = low if match[1] == "*" else _number(match[1], number)
+        last = high if match[1] == "*" or (match[3] and not match[2]) else _number(match[2] or match[1], number)
+        step = int(match[3] or 1)
+        if names is DAYS and match[1] == "*":
+            last = 6
+        if first > last or step == 0:
+            raise ValueError(f"{part!r} does not contain a {name}; give the lower number first and a step above 0")
+        found.update(range(first, last + 1, step))
+    return tuple(sorted(found))
+
+
+def _number(word: str, number: int) -> int:
+    name, low, high, names = FIELDS[number]
+    if word in names:
+        return names.index(word) + (low if names is MONTHS else 0)
+    if not word.isascii() or not word.isdigit() or not low <= int(word) <= high:
+        raise ValueError(f"{word!r} is not a {name}; {low} to {high} is expected")
+    return int(word)
+
+
+def systemd_lines(schedule: Schedule) -> list[str]:
+    """Return the lines of a systemd timer that mean the schedule."""
+    if isinstance(schedule, Every):
+        return ["OnBootSec=1min", f"OnUnitActiveSec={schedule.minutes}min"]
+    clock = f"{_comma_separated_numbers(schedule.hours, 24)}:{_comma_separated_numbers(schedule.minutes, 60)}:00"
+    months, days = _comma_separated_numbers(schedule.months, 12), _comma_separated_numbers(schedule.days, 31)
+    weekdays = ",".join(DAYS[day].capitalize() for day in schedule.weekdays)
+    by_day, by_weekday = f"*-{months}-{days} {clock}", f"{weekdays} *-{months}-* {clock}"
+    if schedule.any_weekday and len(schedule.weekdays) == 7:
+        return [f"OnCalendar={by_day}"]
+    if schedule.any_day or schedule.any_weekday:  # cron: only if neither begins with * does one of them suffice
+        return [f"OnCalendar={weekdays} *-{months}-{days} {clock}"]
+    return [f"OnCalendar={by_day}", f"OnCalendar={by_weekday}"]
+
+
+def _comma_separated_numbers(numbers: tuple[int, ...], all_of_them: int) -> str:
+    return "*" if len(numbers) == all_of_them else ",".join(f"{number:02d}" for number in numbers)
+
+
+def cron_expression(schedule: Schedule) -> str | None:
+    """Return the five fields of a crontab; None where cron cannot express the interval."""
+    if isinstance(schedule, Cron):
+        return schedule.expression
+    minutes = schedule.minutes
+    if minutes < 60:
+        return f"*/{minutes} * * * *" if 60 % minutes == 0 else None
+    if minutes % 60 == 0 and 24 % (minutes // 60) == 0:
+        return "0 0 * * *" if minutes == 1440 else f"0 */{minutes // 60} * * *"
+    return None
+
+
+# --- the job file --------------------------------------------------------------------------------------------------
+
+PATTERNS = ("*.lengths.csv", "*.deviations.csv", "*.sixdof.csv")
+MACHINE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+def _confidence(value: Any) -> float:
+    result = toml_files.number(value)
+    if not 0.5 <= result < 1.0:
+        raise ValueError("a confidence from 0.5 to below 1, for example 0.95, is expected")
+    return result
+
+
+def _controllers(value: Any) -> tuple[str, ...]:
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise ValueError("a list of controls, for example ['siemens-cec'], is expected")
+    for name in names:
+        if name not in CONTROLLERS:
+            raise ValueError(f"{name!r} is not a controller; {nearest(name, CONTROLLERS)}")
+    return tuple(dict.fromkeys(names))
+
+
+def _patterns(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not value or not all(isinstance(item, str) and item for item in value):
+        raise ValueError("a list of file patterns, for example ['*.lengths.csv'], is expected")
+    if any("/" in item or item.startswith("..") for item in value):
+        raise ValueError("patterns of file names, without folders, are expected")
+    return tuple(value)
+
+
+def command_words(value: Any) -> tuple[str, ...]:
+    """Return a command as its words: a list, or one text that is split as a shell does."""
+    words = shlex.split(value) if isinstance(value, str) else value
+    if not isinstance(words, list) or not words or not all(isinstance(word, str) and word for word in words):
+        raise ValueError("a command, as a list of its words, is expected")
+    return tuple(words)
+
+
+def _key(check: Callable[[Any], Any], default: Any = None) -> Any:
+    """A key of the job file: its default, and the check that returns the clean value."""
+    return field(default=default, metadata={"check": check})
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What new tables must fulfil to be proposed; lengths in um.
+
+    Parameters
+    ----------
+    max_age_days : a measurement may be at most this old when it is judged.
+    temperature_c : lowest and highest temperature that any logged channel may show; without a log it is held back.
+    confidence : with which the change must exceed its uncertainty.
+    min_shrink_um : by how much the remaining rms must shrink against the active tables; more than 0 in any case.
+    max_change_um : largest change of the correction anywhere, against the active tables.
+    max_reference_um : largest change of the correction at the reference point; for a first table against none.
+    max_step_um : largest step of the correction between neighbouring table nodes.
+    clock_minutes : how near to a decision that changed the active tables a measurement may be made without saying itself
+        which tables were on; for clocks that differ.
+    """
+
+    max_age_days: float | None = _key(toml_files.positive, 30.0)
+    temperature_c: tuple[float, float] | None = _key(toml_files.interval)
+    confidence: float = _key(_confidence, 0.95)
+    min_shrink_um: float = _key(toml_files.not_negative, 0.0)
+    max_change_um: float | None = _key(toml_files.positive)
+    max_reference_um: float | None = _key(toml_files.positive)
+    max_step_um: float | None = _key(toml_files.positive)
+    clock_minutes: float = _key(toml_files.not_negative, 30.0)
+
+
+@dataclass(frozen=True)
+class OtherInbox:
+    """The inbox of another machine of the job file, for files that came for both."""
+
+    name: str
+    inbox: Path
+    patterns: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MachineJob:
+    """How one machine is recalibrated; paths are absolute.
+
+    ``measured_with`` says what was active while the machine was measured: the tables that were active then ("active")
+    or none ("bare"); a measurement file may say otherwise for itself. ``tolerances`` are those of the drift, mm or rad,
+    by error or "volume". ``others`` are the machines whose
+    inbox is the same, or holds a file of this one's as well (:func:`compgen.fleet.inbox.with_twins`).
+    """
+
+    name: str
+    machine: str
+    inbox: Path
+    controllers: tuple[str, ...]
+    out: Path
+    measured_with: str
+    patterns: tuple[str, ...] = _key(_patterns, PATTERNS)
+    schedule: Schedule | None = None
+    approval: str = _key(toml_files.choice("manual", "auto"), "manual")
+    instrument: Path | None = None
+    templates: Path | None = None
+    allow_unverified: bool = _key(toml_files.flag, False)
+    notify: tuple[str, ...] = _key(command_words, ())
+    settle_s: float = _key(toml_files.not_negative, 0.0)
+    max_size_mb: float = _key(toml_files.positive, 100.0)
+    max_minutes: float = _key(toml_files.positive, 60.0)
+    policy: Policy = Policy()
+    identify: Mapping[str, Any] = field(default_factory=dict)
+    tolerances: Mapping[str, float] = field(default_factory=dict)
+    others: tuple[OtherInbox, ...] = field(default=(), compare=False, repr=False)
+
+    def settings_sha256(self) -> str:
+        """Return the SHA-256 of everything but the measurement that a result depends on."""
+        files = [load_machine(self.machine).source, self.instrument]
+        digests = [sha256_of(read_bytes(path)) for path in files if path is not None]
+        own = {"controllers": self.controllers, "measured_with": self.measured_with, "identify": dict(self.identify)}
+        rules = {"policy": asdict(self.policy), "unverified": self.allow_unverified, "templates": str(self.templates)}
+        if self.max_minutes != MachineJob.max_minutes:  # who allows more time wants what took too long tried again
+            rules["max_minutes"] = self.max_minutes
+        return sha256_of(json.dumps([digests, own, rules], sort_keys=True).encode())
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job file: where the store is, and the machines by name."""
+
+    path: Path
+    store: str
+    machines: Mapping[str, MachineJob]
+
+    def with_notify(self, command: tuple[str, ...]) -> Job:
+        """Return the job with this notification command for all machines; an empty one changes nothing."""
+        if not command:
+            return self
+        return replace(self, machines={name: replace(item, notify=command) for name, item in self.machines.items()})
+
+    def machine(self, name: str) -> MachineJob:
+        """Return one machine; InputError names the nearest if there is none of that name."""
+        if name not in self.machines:
+            raise InputError(f"no machine is named {name!r}; {nearest(name, self.machines)}", file=self.path)
+        return self.machines[name]
+
+
+class _Keys:
+    """Takes each key from the machine's section, else from ``[defaults]``."""
+
+    def __init__(self, own: Section, defaults: Section) -> None:
+        self.own, self.defaults = own, defaults
+
+    def take(self, key: str, check: Callable[[Any], T], default: D) -> T | D:
+        fallback = self.defaults.take(key, check, default)
+        return self.own.take(key, check, fallback) if key in self.own else fallback
+
+    def need(self, key: str, check: Callable[[Any], T]) -> T:
+        """Take a key that one of the two sections must contain."""
+        found = self.take(key, check, None)
+        return self.own.take(key, check) if found is None else found
+
+    def section(self, key: str) -> _Keys:
+        return _Keys(self.own.section(key, required=False), self.defaults.section(key, required=False))
+
+    def fields(self, declared: type[Policy | MachineJob]) -> dict[str, Any]:
+        """Take every key that the fields of a dataclass declare by :func:`_key`."""
+        known = [item for item in fields(declared) if "check" in item.metadata]
+        return {item.name: self.take(item.name, item.metadata["check"], item.default) for item in known}
+
+    def finish(self) -> None:
+        self.own.finish()
+        self.defaults.finish()
+
+
+def read_job(path: str | Path) -> Job:
+    """Read a job file strictly; InputError with file, line and key for whatever is unknown, missing or impossible."""
+    return _job_of(toml_files.read_toml(path), Path(path).absolute())
+
+
+def job_of_text(text: str, path: Path) -> Job:
+    """Return the job that ``text`` would be as the file ``path``; errors as :func:`read_job` has them."""
+    import tomllib
+
+    try:
+        return _job_of(Section(tomllib.loads(text), path=path, text=text), path.absolute())
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"is not valid TOML: {error}", file=path) from error
+
+
+def _job_of(root: Section, path: Path) -> Job:
+    folder = path.parent
+    store = root.take("store", toml_files.text_of_path, "recal.sqlite")
+    defaults = root.section("defaults", required=False)
+    every = root.section("machines", required=False)
+    machines = {}
+    for name in every.data:
+        if not MACHINE_NAME.fullmatch(name):
+            raise every.fail(name, "is not a name: letters, digits, '.', '_' and '-', at most 64, are allowed")
+        machines[name] = _machine(name, _Keys(every.section(name), defaults), folder)
+    if not machines:
+        _options(_Keys(Section({}, path=path), defaults), folder, "")
+    root.finish()
+    _check_folders(every, machines)
+    shared: dict[str, list[OtherInbox]] = {}
+    for name, machine in machines.items():
+        shared.setdefault(os.path.realpath(machine.inbox), []).append(OtherInbox(name, machine.inbox, machine.patterns))
+    for group in shared.values():
+        for own in group if len(group) > 1 else ():
+            machines[own.name] = replace(machines[own.name], others=tuple(item for item in group if item != own))
+    return Job(path, store if "://" in store else f"sqlite:///{folder / store}", machines)
+
+
+def _check_folders(every: Section, machines: Mapping[str, MachineJob]) -> None:
+    """Refuse folders ``out`` that are the same or lie in each other, whatever links and ``..`` lead there."""
+    real = {name: Path(os.path.realpath(machine.out)) for name, machine in machines.items()}
+    known = {path: name for name, path in reversed(real.items())}
+    for name, path in real.items():
+        if known[path] != name:
+            raise every.fail(name, f"has the same folder out as {known[path]} ({path}); give each machine its own")
+        around = next((parent for parent in path.parents if parent in known), None)
+        if around is not None:
+            raise every.fail(
+                name,
+                f"has its folder out ({path}) inside that of {known[around]} ({around}); give each machine its own, beside "
+                "each other",
+            )
+
+
+def _machine(name: str, keys: _Keys, folder: Path) -> MachineJob:
+    def path(value: Any) -> str:
+        return toml_files.text_of_path(value).replace("{name}", name)
+
+    options = _options(keys, folder, name)
+    machine = keys.need("machine", path)
+    is_file = machine.endswith(".toml") or len(Path(machine).parts) > 1
+    active_or_bare = toml_files.choice("active", "bare")
+    if keys.take("measured_with", active_or_bare, None) is None:
+        raise keys.own.fail(
+            "measured_with",
+            "is missing; say 'active' if the compensation stays on while the machine is measured, 'bare' if it is "
+            "switched off. The wrong one compensates twice or not at all",
+        )
+    job = MachineJob(
+        name=name,
+        machine=str(folder / machine) if is_file else machine,
+        inbox=folder / keys.need("inbox", path),
+        controllers=keys.need("controllers", _controllers),
+        out=folder / keys.need("out", path),
+        measured_with=keys.need("measured_with", active_or_bare),
+        **options,
+    )
+    keys.finish()
+    return job
+
+
+def _options(keys: _Keys, folder: Path, name: str) -> dict[str, Any]:
+    def path(value: Any) -> Path:
+        return folder / toml_files.text_of_path(value).replace("{name}", name)
+
+    options = keys.fields(MachineJob) | {
+        "schedule": _schedule(keys),
+        "instrument": keys.take("instrument", path, None),
+        "templates": keys.take("templates", path, None),
+    }
+    policy = keys.section("policy")
+    options["policy"] = Policy(**policy.fields(Policy))
+    policy.finish()
+    return options | {
+        "identify": _identify(keys.section("identify")),
+        "tolerances": _tolerances(keys.section("tolerances")),
+    }
+
+
+def _schedule(keys: _Keys) -> Schedule | None:
+    every = keys.take("every_minutes", toml_files.whole(1, 527040), None)
+    expression = keys.take("schedule", cron, None)
+    both_own = "every_minutes" in keys.own and "schedule" in keys.own
+    if both_own or (every and expression and not {"every_minutes", "schedule"} & set(keys.own.data)):
+        raise keys.own.fail("schedule", "cannot be combined with every_minutes; give one of the two")
+    if every is not None and (expression is None or "every_minutes" in keys.own):
+        return Every(every)
+    return expression
+
+
+def _identify(keys: _Keys) -> dict[str, Any]:
+    names = ("u_length_um", "u_length_um_per_m", "u_deviation_um")
+    found: dict[str, Any] = {name: keys.take(name, toml_files.not_negative, None) for name in names}
+    found["temperature"] = keys.take("temperature", toml_files.flag, True)
+    found["small_deviations"] = keys.take("small_deviations", toml_files.flag, False) or None  # so that the hash stays
+    keys.finish()
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _tolerances(keys: _Keys) -> dict[str, float]:
+    units = {f"{name}_{error_named(name).unit}": (name, error_named(name).si_per_unit) for name in ERROR_NAMES}
+    units["volume_um"] = ("volume", MM_PER_UM)
+    given = {units[key][0]: (keys.take(key, toml_files.positive, None), units[key][1]) for key in units}
+    keys.finish()
+    return {name: size * unit for name, (size, unit) in given.items() if size is not None}
+
+
+# --- what is made from a job ---------------------------------------------------------------------------------------
+
+
+def add_machine(path: Path, name: str, keys: Mapping[str, Any]) -> MachineJob:
+    """Append ``[machines.NAME]`` with the keys that are not None; nothing is written if the result is not a valid job.
+
+    Raises
+    ------
+    InputError
+        for a machine that is there already, a machine file that does not load, a value that the job file refuses.
+    """
+    before = read_text(path) if path.exists() else ""
+    if before and name in job_of_text(before, path).machines:
+        raise InputError(f"has a machine {name!r} already; edit it there", file=path)
+    # texts, numbers and lists of texts: JSON's escapes are TOML's as well
+    lines = [f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None]
+    head = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
+    gap = "" if not before else "\n" if before.endswith("\n") else "\n\n"
+    text = before + gap + "\n".join([f"[machines.{head}]", *lines]) + "\n"
+    added = job_of_text(text, path).machine(name)
+    load_machine(added.machine)
+    write_file(path, text)
+    return added
+
+
+#: For machines without a schedule.
+HOURLY = Every(60)
+UNIT_NAME = "compgen-recal"
+
+
+def units(job: Job, program: str) -> Mapping[str, str]:
+    """Return the files by which a scheduler of the system drives ``volcomp recal run``: texts by name.
+
+    They are systemd services and timers and the lines of a crontab. Machines with the same schedule share one timer; a
+    machine without one is looked at every hour. ``program`` is the path of the ``compgen`` command.
+    """
+    groups: dict[Schedule, list[str]] = {}
+    for name, machine in job.machines.items():
+        groups.setdefault(machine.schedule or HOURLY, []).append(name)
+    files: dict[str, str] = {}
+    lines = ["# crontab of volcomp recal; exit code 1: something is held back or failed, see `volcomp recal status`"]
+    for number, (schedule, names) in enumerate(groups.items(), start=1):
+        whole = len(groups) == 1
+        unit = UNIT_NAME if whole else f"{UNIT_NAME}-{number}"
+        words = [program, "recal", "run", *([] if whole else names), "--job", str(job.path)]
+        files[f"{unit}.service"] = _service(job, words, names)
+        files[f"{unit}.timer"] = _timer(schedule, unit, names)
+        command, expression = shlex.join(words).replace("%", r"\%"), cron_expression(schedule)
+        if expression is None:
+            minutes = schedule.minutes if isinstance(schedule, Every) else 0
+            expression = f"# every {minutes} minutes cannot be expressed by cron; use {unit}.timer:"
+        lines.append(f"{expression} {command}")
+    files["crontab"] = "\n".join(lines) + "\n"
+    files[f"{UNIT_NAME}-watch.service"] = _watch(job, program)
+    return files
+
+
+def _service(job: Job, words: Sequence[str], names: Sequence[str]) -> str:
+    return f"""[Unit]
+Description=compgen recalibration of {_first_names(names)}
+After=network-online.target
+
+[Service]
+Type=oneshot
+{_command_lines(job, words)}
+"""
+
+
+def _watch(job: Job, program: str) -> str:
+    return f"""# in place of the timers: one process that keeps the schedules of the job file itself
+[Unit]
+Description=compgen recalibration, watching
+After=network-online.target
+
+[Service]
+{_command_lines(job, [program, "recal", "watch", "--job", str(job.path)])}
+Restart=on-failure
+TimeoutStopSec=15min
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+def _command_lines(job: Job, words: Sequence[str]) -> str:
+    """Say where and what to run; words are quoted as systemd reads them."""
+    command = []
+    for word in words:
+        text = _escaped(word).replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
+        command.append(f'"{text}"' if any(char in word for char in " \t'\";") else text)
+    return f"WorkingDirectory={_escaped(str(job.path.parent))}\nExecStart={' '.join(command)}"
+
+
+def _timer(schedule: Schedule, unit: str, names: list[str]) -> str:
+    lines = "\n".join(systemd_lines(schedule))
+    persistent = "" if isinstance(schedule, Every) else "Persistent=true\n"
+    return f"""[Unit]
+Description=when {_first_names(names)} is recalibrated
+
+[Timer]
+{lines}
+{persistent}Unit={unit}.service
+
+[Install]
+WantedBy=timers.target
+"""
+
+
+def _first_names(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= 5 else f"{', '.join(names[:5])} and {len(names) - 5} more"
+
+
+def _escaped(text: str) -> str:
+    return text.replace("%", "%%")

@@ -1,0 +1,666 @@
+"""One measurement through the pipeline, judged by the acceptance policy against the active tables.
+
+:func:`process` runs the chain in a temporary folder and returns what is to be kept. The ``judge_...`` functions are the rules
+of the policy: each adds to a :class:`Judgement` why the tables are held back, with the figures behind it.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.files import FOLDERS, read_bytes, working_folder
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine, load_machine
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import CompgenWarning, InputError
+from compgen.fleet.change import Change, change_between, likeness, volume_points
+from compgen.fleet.inbox import holds_one_of
+from compgen.fleet.job import MachineJob, Policy
+from compgen.fleet.records import (
+    AFTER,
+    RESERVATION,
+    DecisionRecord,
+    EventRecord,
+    IdentificationRecord,
+    MachineRecord,
+    MeasurementRecord,
+    NewResult,
+    StoredTableFile,
+    TableRecord,
+    active_id,
+    active_of,
+)
+from compgen.fleet.store import Store
+from compgen.identify import IdentifyOptions, joint_covariance
+from compgen.identify.covariance import FILE_NAME as COVARIANCE
+from compgen.identify.covariance import covariance_or_independent
+from compgen.pipeline import RunResult, identified_reversal, run
+from compgen.tables import ReadTables, parse_tables, program_version, read_tables, verify
+from compgen.tables.active import ActiveTables
+from compgen.tables.diff import difference
+from compgen.tables.safety import SafetyLimits
+from compgen.tables.verification import MISFIT_CODES
+
+#: A measurement that is dated more than this in the future has a wrong time.
+FUTURE = timedelta(days=1)
+#: Kinds of events: the clock of the store went back; the folder of a machine was given to this store.
+CLOCK, ADOPTED = "clock", "adopted"
+#: Key of the figures of a version: which tables a file or a person says were on.
+STATED = "active_table_stated"
+
+
+@dataclass
+class Judgement:
+    """Reasons to hold tables back, reservations that are shown only, and figures by name; all grow while rules are looked at."""
+
+    hold: list[str] = field(default_factory=list)
+    reservations: list[str] = field(default_factory=list)
+    figures: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ActiveState:
+    """The tables that are active now: parsed by control, their version, and the errors that they were made from."""
+
+    version: int
+    tables: Mapping[str, ReadTables]
+    identification: IdentificationRecord
+
+
+def judge_measurement(
+    judgement: Judgement, policy: Policy, measurement: MeasurementRecord, now: datetime, latest: datetime | None
+) -> None:
+    """Look at age and temperature; ``latest`` is when the newest measurement behind an active table was made."""
+    age = now - measurement.measured_at
+    judgement.figures["age_days"] = age.total_seconds() / 86400.0
+    if age < -FUTURE:
+        judgement.hold.append(f"the measurement is dated {_day(measurement.measured_at)}, which is in the future")
+    elif policy.max_age_days is not None and age > timedelta(days=policy.max_age_days):
+        days = judgement.figures["age_days"]
+        judgement.hold.append(f"the measurement is {days:.1f} days old; at most {policy.max_age_days:g} are allowed")
+    if latest is not None and measurement.measured_at < latest:
+        judgement.hold.append(f"the active tables come from a newer measurement ({_day(latest)})")
+    if policy.temperature_c is not None:
+        judgement.hold += _temperature(policy.temperature_c, measurement.temperatures_c)
+
+
+def judge_misfit(judgement: Judgement, result: RunResult) -> None:
+    """Hold what a large misfit speaks against, and note what else keeps the verdict from a plain "accepted".
+
+    A person may approve over a misfit, as `--allow-misfit` does; residuals above their uncertainty alone are shown only.
+    """
+    for item in result.results:
+        found = item.verification
+        if not found.accepted:
+            continue
+        misfit = [objection.text for objection in found.objections if objection.code in MISFIT_CODES]
+        judgement.hold += [text for text in misfit if text not in judgement.hold]
+        measured = found.objections or not found.volumetric or found.worse_as_it_stands
+        if measured and not misfit:
+            judgement.reservations.append(f"{RESERVATION}{found.controller}: {found.headline}")
+
+
+def judge_order(
+    judgement: Judgement, store: Store, measurement: MeasurementRecord, tables: Sequence[TableRecord]
+) -> None:
+    """Hold what was measured before a proposal that waits, so that it does not take that proposal's place."""
+    for table in tables:
+        if table.state == "pending":
+            made = store.identification(table.identification_id).measured_at
+            if measurement.measured_at < made:
+                judgement.hold.append(
+                    f"version {table.version}, which waits, comes from a newer measurement ({_day(made)})"
+                )
+
+
+# --- which tables were on while the machine was measured --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Past:
+    """What the store knows about a machine: decisions, tables with figures, measurements, events; all of them."""
+
+    decisions: Sequence[DecisionRecord]
+    tables: Sequence[TableRecord]
+    measurements: Sequence[MeasurementRecord]
+    events: Sequence[EventRecord]
+
+    @property
+    def swaps(self) -> list[DecisionRecord]:
+        """Decisions that changed the active tables, since the folder was given to this store."""
+        return [item for item in self.decisions if AFTER[item.kind] == "active" and item.at >= self._since]
+
+    @property
+    def stated(self) -> str | None:
+        """What a file or a person said last of the tables that were on, since the folder was given to this store."""
+        said = [(item.received_at, item.active_table) for item in self.measurements if item.active_table is not None]
+        said += [(item.at, str(item.summary[STATED])) for item in self.tables if STATED in item.summary]
+        return max((item for item in said if item[0] >= self._since), default=(None, None))[1]
+
+    @property
+    def _since(self) -> datetime:
+        adopted = [item.at for item in self.events if item.kind == ADOPTED]
+        return max(adopted, default=datetime.min.replace(tzinfo=UTC))
+
+
+def judge_assumption(
+    judgement: Judgement, job: MachineJob, measurement: MeasurementRecord, past: Past, now: datetime, taken: int | None
+) -> None:
+    """Hold where the time of the measurement does not say which tables were on; ``taken`` is the version taken out.
+
+    Only for a measurement that does not say it itself, of a machine that is measured with its tables on. A wrong
+    assumption goes into the errors in full: the new tables then undo the compensation, or apply it twice.
+    """
+    swaps, margin = past.swaps, timedelta(minutes=job.policy.clock_minutes)
+    if not swaps:
+        said = past.stated
+        if said is None or version_said(said) != taken:
+            judgement.hold.append(
+                "the store does not know which tables were on while the machine was measured: it never made any of "
+                f"{job.name} active. If none were on: {how_to_state(job.name, measurement, 'none')}; if tables were on, "
+                "switch them off and measure again"
+            )
+        return
+    doubts = []
+    if measurement.measured_at_source == "file time":
+        doubts.append("the file does not say when it was measured, and the time of a file changes when it is copied")
+    elif measurement.measured_at_source == "file, no zone":
+        doubts.append("the time of the measurement has no zone")
+    for before, swap in zip([None, *swaps], swaps, strict=False):
+        since = None if before is None else before.at
+        near = abs(measurement.measured_at - swap.at) < margin
+        inside = (
+            since is None or since - margin < measurement.measured_at
+        ) and measurement.measured_at < swap.at + margin
+        if near:
+            away = abs(measurement.measured_at - swap.at).total_seconds() / 60.0
+            doubts.append(
+                f"it was measured {away:.0f} min from the decision of {_day(swap.at)} that changed the active tables; "
+                f"{job.policy.clock_minutes:g} min are required, because clocks differ"
+            )
+        elif inside and _doubtful(swap, past, now):
+            doubts.append(f"the clock went back, so the time of the decision of {_day(swap.at)} is not certain")
+    if doubts:
+        judgement.hold.append(
+            "it is not certain which tables were on while the machine was measured, and "
+            f"{'no table' if taken is None else f'version {taken}'} was taken out: "
+            f"{'; '.join(dict.fromkeys(doubts))}; {how_to_state(job.name, measurement, 'VERSION|none')}"
+        )
+
+
+def version_said(text: str) -> int | str | None:
+    """Return the version that ``active_table`` names, None for "none" or "bare", another text as it is."""
+    word = text.lower()
+    number = word.removeprefix("v")
+    return None if word in ("none", "bare") else int(number) if number.isdecimal() and number.isascii() else text
+
+
+def how_to_state(name: str, measurement: MeasurementRecord, tables: str) -> str:
+    """Say how a person states which tables were on; ``tables`` is a version, "none" or how to write either."""
+    return (
+        f"state it: `volcomp recal reprocess {name} --measurement {measurement.id} --active-table {tables} --reason TEXT`, "
+        f"or `# active_table = {tables}` in the next file"
+    )
+
+
+def _doubtful(decision: DecisionRecord, past: Past, now: datetime) -> bool:
+    """Whether the clock was ahead when this was decided: something that came later has an earlier time."""
+    if decision.at > now:
+        return True
+    if any(item.at < decision.at <= _seen(item) for item in past.events if item.kind == CLOCK):
+        return True
+    known = {item.table_id for item in past.decisions if item.sequence <= decision.sequence}
+    return any(table.at < decision.at for table in past.tables if table.id not in known)
+
+
+def _seen(event: EventRecord) -> datetime:
+    """Time of the newest entry when the clock was found to have gone back, from the end of the message."""
+    try:
+        return datetime.fromisoformat(event.message.rsplit(" ", 1)[-1]) + timedelta(seconds=1)
+    except ValueError:
+        return event.at
+
+
+def judge_likeness(
+    judgement: Judgement,
+    store: Store,
+    about: tuple[MachineJob, Machine, MeasurementRecord],
+    result: RunResult,
+    past: Past,
+    taken: int | None,
+) -> None:
+    """Hold where the machine seems to have changed by what some tables add, or by the opposite.
+
+    The change is that against the errors behind the active tables, or behind the last ones that were; it is compared with
+    what each version adds that is or was active. ``taken`` is the version that was taken out of the readings.
+    """
+    job, machine, measurement = about
+    were_active, last = _were_active(store, job, machine, past)
+    if last is None:
+        return
+    identified, old_errors = result.identification, store.errors_of(last)
+    if not set(old_errors.names) <= set(identified.errors.names):
+        return  # held for that; a part of the errors has no field to compare
+    points = Points(volume_points(machine))
+    adds = {version: _added(machine, tables, points) for version, tables in were_active.items()}
+    added = {f"version {version}": field for version, field in adds.items()}
+    order, now = list(adds), active_of(past.tables)
+    active = None if now is None else now.version
+    if taken in adds:  # the clock may be late: a later version was on already
+        later = order[order.index(taken) + 1 :]
+        added |= {f"version {version} in place of version {taken}": adds[version] - adds[taken] for version in later}
+    missing = {f"version {version}": adds[version] for version in order if version in (taken, active)}
+    new = (identified.errors, joint_covariance(identified) if identified.has_covariance else None)
+    found = likeness(machine, new, (old_errors, store.covariance_of(last)), added, missing)
+    if found is None:
+        return
+    judgement.figures["likeness"] = found.summary()
+    was = "nothing was" if taken is None else f"version {taken} was"
+    seems, what = ("was on", "what") if found.sign > 0 else ("was off", "the opposite of what")
+    version = f"v{found.field.split()[1]}" if found.sign > 0 else "none"
+    judgement.hold.append(
+        f"the machine seems to have changed by {what} {found.field} adds ({found.words()}): as if {found.field} {seems} "
+        f"while the machine was measured, but {was} taken out; "
+        f"{how_to_state(job.name, measurement, version)}; if the machine has really changed, approve with --override"
+    )
+
+
+def _were_active(
+    store: Store, job: MachineJob, machine: Machine, past: Past
+) -> tuple[dict[int, ReadTables], IdentificationRecord | None]:
+    """Return the tables that are or were active, by version in the order in which they became so, and the last errors."""
+    by_id = {table.id: table for table in past.tables}
+    order = [item.table_id for item in past.decisions if AFTER[item.kind] == "active" and item.table_id is not None]
+    known = [by_id[key] for key in dict.fromkeys(order[::-1])][:LOOKED_BACK][::-1]
+    found: dict[int, ReadTables] = {}
+    for table in known:
+        control = next((name for name in job.controllers if name in table.controllers), table.controllers[0])
+        read = _tables_read(store, machine, table, control)
+        if read is not None:
+            found[table.version] = read
+    return found, store.identification(known[-1].identification_id) if found else None
+
+
+def _added(machine: Machine, tables: ReadTables, points: Points) -> FloatArray:
+    """What tables add to the commands, mean of both directions of travel, (n, 3), mm."""
+    sides = [np.full_like(points.position_mm, side) for side in (1.0, -1.0)]
+    return np.asarray(
+        0.5 * sum(tables.correction(machine, Points(points.position_mm, approach=side)) for side in sides)
+    )
+
+
+def judge_twins(
+    judgement: Judgement, store: Store, job: MachineJob, machine: MachineRecord, measurement: MeasurementRecord
+) -> None:
+    """Hold what came for another machine as well: readings belong to one machine."""
+    found = [f"{name} ({what})" for name, what in store.same_files_of_others(machine, measurement)]
+    contents = store.contents_of(measurement)
+    for other in job.others:
+        if not any(text.startswith(f"{other.name} (") for text in found) and holds_one_of(other, contents.values()):
+            where = "the same inbox" if other.inbox.resolve() == job.inbox.resolve() else "its inbox"
+            found.append(f"{other.name} ({where})")
+    if found:
+        judgement.figures["also_came_for"] = found
+        judgement.hold.append(
+            f"the same file also came for {', '.join(found)}; readings belong to one machine. Give each machine an inbox of "
+            "its own and remove the file from the wrong one; then reject the version of the wrong machine with `compgen "
+            "recal reject` and approve that of the right one with --override"
+        )
+
+
+def _temperature(window_c: tuple[float, float], channels: Mapping[str, Mapping[str, float]]) -> list[str]:
+    low, high = window_c
+    if not channels:
+        return [f"no temperature was logged, but the policy requires {low:g} to {high:g} degC"]
+    outside: dict[str, list[str]] = {}
+    for name, figures in channels.items():
+        if figures["low"] < low or figures["high"] > high:
+            outside.setdefault(f"went from {figures['low']:.2f} to {figures['high']:.2f} degC", []).append(name)
+    allowed = f"{low:g} to {high:g} degC are allowed"
+    return [f"{', '.join(names)} {went}; {allowed}" for went, names in outside.items()]
+
+
+def _day(time: datetime) -> str:
+    return time.isoformat(timespec="minutes")
+
+
+def shows_all(judgement: Judgement, store: Store, result: RunResult, active: ActiveState) -> bool:
+    """Whether the measurement shows every error that the active tables take out; otherwise the new ones would drop some.
+
+    A laser along one axis shows its positioning only: tables from that alone forget squareness, straightness and angles,
+    and nothing in that measurement says so.
+    """
+    known = {*result.identification.errors.names}
+    missing = [name for name in store.errors_of(active.identification).names if name not in known]
+    if missing:
+        judgement.figures["errors_not_shown"] = missing
+        judgement.hold.append(
+            f"the measurement does not show {', '.join(missing)}, which version {active.version} takes out and the new "
+            "tables would not; measure them all"
+        )
+    return not missing
+
+
+def judge_change(
+    judgement: Judgement, store: Store, machine: Machine, result: RunResult, active: ActiveState, policy: Policy
+) -> Change | None:
+    """Compare with the errors behind the active tables: the change must exceed its uncertainty."""
+    identified = result.identification
+    new = covariance_or_independent(
+        identified.errors, joint_covariance(identified) if identified.has_covariance else None
+    )
+    old_errors = store.errors_of(active.identification)
+    old = covariance_or_independent(old_errors, store.covariance_of(active.identification))
+    if new is None or old is None:
+        judgement.hold.append("the uncertainty of the errors is not known, so the change cannot be judged")
+        return None
+    change = change_between(machine, (identified.errors, new), (old_errors, old), policy.confidence)
+    judgement.figures["change"] = change.summary()
+    if not change.significant:
+        judgement.hold.append(
+            f"the change against version {active.version} ({change.rms_um:.2f} um rms) is within its uncertainty "
+            f"({change.expected_rms_um:.2f} um rms expected, p = {change.p_value:.3f})"
+        )
+    return change
+
+
+def judge_tables(
+    judgement: Judgement, machine: Machine, result: RunResult, new: Mapping[str, ReadTables], active: ActiveState
+) -> None:
+    """Compare what the new tables leave with what the active ones leave now, and how far the axes move."""
+    remaining: dict[str, Any] = {}
+    moved: dict[str, Any] = {}
+    reversal = identified_reversal(result.identification)
+    for item in result.results:
+        control = item.verification.controller
+        if control not in active.tables:
+            continue
+        now = verify(machine, active.tables[control], result.identification.errors, reversal=reversal)
+        remaining[control] = {
+            "active": {"as_it_stands": now.after.as_dict(), "rigid_removed": now.after_rigid_removed.as_dict()},
+            "proposed": {
+                "as_it_stands": item.verification.after.as_dict(),
+                "rigid_removed": item.verification.after_rigid_removed.as_dict(),
+            },
+        }
+        moved[control] = {"max_change_um": difference(machine, new[control], active.tables[control]).max_um}
+    judgement.figures["remaining"] = remaining
+    judgement.figures["correction"] = moved
+
+
+def apply_limits(
+    judgement: Judgement,
+    machine: Machine,
+    new: Mapping[str, ReadTables],
+    active: Mapping[str, ReadTables],
+    policy: Policy,
+) -> None:
+    """Hold back what does not shrink the residual, or moves the axes by more than the limits."""
+    moved = judgement.figures.setdefault("correction", {})
+    for control, tables in new.items():
+        shift = _at_reference(machine, tables, active.get(control))
+        moved.setdefault(control, {})["reference_change_um"] = dict(zip("xyz", shift, strict=True))
+        for axis, value in zip(AXES, shift, strict=True):
+            if policy.max_reference_um is not None and abs(value) > policy.max_reference_um:
+                judgement.hold.append(
+                    f"{control}: the correction {axis} at the reference point changes by {value:+.1f} um; "
+                    f"the limit is {policy.max_reference_um:g} um"
+                )
+        largest = moved[control].get("max_change_um")
+        if largest is not None and policy.max_change_um is not None and largest > policy.max_change_um:
+            judgement.hold.append(
+                f"{control}: the correction changes by up to {largest:.1f} um; the limit is {policy.max_change_um:g} um"
+            )
+    for control, figures in judgement.figures.get("remaining", {}).items():
+        before, after = (figures[key]["rigid_removed"]["rms_um"] for key in ("active", "proposed"))
+        if not after < before - policy.min_shrink_um:
+            judgement.hold.append(
+                f"{control}: the residual does not shrink enough: {before:.2f} um rms with the active tables, {after:.2f} "
+                "with the new ones"
+            )
+
+
+def _at_reference(machine: Machine, new: ReadTables, active: ReadTables | None) -> Sequence[float]:
+    """Change of the correction at the reference point, um, x, y, z; the larger one of both directions of travel."""
+    position = np.array([machine.reference_point_mm], dtype=np.float64)
+    found = np.zeros(3)
+    for side in (1.0, -1.0):
+        points = Points(position, approach=np.full_like(position, side))
+        shift = new.correction(machine, points)[0]
+        if active is not None:
+            shift = shift - active.correction(machine, points)[0]
+        found = np.where(np.abs(shift) > np.abs(found), shift, found)
+    return [float(value) / MM_PER_UM + 0.0 for value in found]
+
+
+# --- the whole chain -----------------------------------------------------------------------------------------------
+
+#: Files of a run that belong to the identification; with one control they are in the same folder as its own.
+NOT_OF_A_CONTROL = (
+    "identified.errors.csv",
+    COVARIANCE,
+    "identified.reversal.csv",
+    "measured.deviations.csv",
+    "stations.csv",
+    "identify.json",
+    "fitted.errors.csv",
+    "fit.json",
+)
+#: The newest of the versions that were active with which a change is compared.
+LOOKED_BACK = 20
+#: How temporary folders begin; their names say nothing to a reader.
+FOLDER = "compgen-recal-"
+_TEMPORARY = re.compile(rf"\S*{FOLDER}[^/\\]+[/\\]measurement[/\\]")
+
+
+@dataclass(frozen=True)
+class Processed:
+    """What is to be kept, and the id of the tables that it was judged against."""
+
+    result: NewResult
+    judged_against: int | None
+
+
+def process(
+    store: Store, job: MachineJob, record: MachineRecord, measurement: MeasurementRecord, stated: str | None = None
+) -> Processed:
+    """Run the chain for one measurement and judge the outcome; nothing outside a temporary folder is written.
+
+    Parameters
+    ----------
+    stated : the tables that were on while the machine was measured, by a person: a version or "none". It counts before
+        what the file says; None if nobody says so.
+
+    Raises
+    ------
+    CompgenError
+        for a measurement that cannot be used, or does not determine the errors.
+    """
+    said = measurement.active_table if stated is None else stated
+    started = time.monotonic()
+    settings = job.settings_sha256()
+    machine = load_machine(job.machine)
+    tables = store.tables(record)
+    now = store.read(store.now)
+    with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", CompgenWarning)
+        paths = _write_files(Path(folder) / "measurement", store.contents_of(measurement))
+        past = Past(store.decisions(record), tables, store.measurements(record), store.events(record))
+        measured = _active_then(job, measurement, past, said)
+        was_active = None if measured is None else _tables_read(store, machine, measured, job.controllers[0])
+        if measured is not None and was_active is None:
+            holds = f"version {measured.version} was active, but holds no tables of {job.controllers[0]}"
+            raise InputError(f"{holds}; is the control right?")
+        outcome = run(
+            machine,
+            paths,
+            job.controllers,
+            Path(folder) / "out",
+            identify_options=IdentifyOptions(**job.identify),
+            templates=job.templates,
+            allow_unverified=job.allow_unverified,
+            active=None if was_active is None else ActiveTables(was_active),
+            instrument=job.instrument,
+            limits=SafetyLimits(job.policy.max_step_um),
+            allow_misfit=True,  # a misfit that refuses the tables of `run` holds them back here: judge_misfit
+        )
+        active = _active_now(store, machine, tables)
+        judgement = _judged(store, job, machine, measurement, (outcome, active, now))
+        judge_order(judgement, store, measurement, tables)
+        taken = None if measured is None else measured.version
+        if said is not None:
+            judgement.figures[STATED] = said
+        elif job.measured_with == "active":
+            judge_assumption(judgement, job, measurement, past, now, taken)
+        if outcome.accepted:
+            judge_likeness(judgement, store, (job, machine, measurement), outcome, past, taken)
+        judge_twins(judgement, store, job, record, measurement)
+        told = [str(item.message) for item in caught if issubclass(item.category, CompgenWarning)]
+        judgement.figures["warnings"] = [without_folder(text) for text in told]
+        files = _tables_of(outcome, Path(folder) / "out")
+        result = _result(Path(folder) / "out", machine, outcome, files, judgement)
+    kept = NewResult(
+        **result,
+        active_table_id=None if measured is None else measured.id,
+        approve=job.approval == "auto",
+        settings_sha256=settings,
+        seconds=time.monotonic() - started,
+    )
+    return Processed(kept, None if (current := active_of(tables)) is None else current.id)
+
+
+def without_folder(message: str) -> str:
+    """Return a message that names files of a measurement as the inbox has them."""
+    return _TEMPORARY.sub("", message)
+
+
+def _write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
+    """Write files into a temporary folder and return their paths."""
+    paths = []
+    for name, content in contents.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        paths.append(path)
+    return paths
+
+
+# --- active tables -------------------------------------------------------------------------------------------------
+
+
+def _active_then(job: MachineJob, measurement: MeasurementRecord, past: Past, said: str | None) -> TableRecord | None:
+    """Return the tables that were active while the machine was measured: what is said, else what the job says."""
+    tables = past.tables
+    version = None if said is None else version_said(said)
+    if said is not None and version is None:
+        return None
+    if said is not None:
+        found = next((table for table in tables if table.version == version), None)
+        if found is None or not found.accepted:
+            of_file = said == measurement.active_table
+            raise InputError(
+                f"says active_table = {said}, but {job.name} has no such tables; give a version or none",
+                file=measurement.name if of_file else None,
+                field=None if of_file else "--active-table",
+            )
+        return found
+    if job.measured_with == "bare":
+        return None
+    then = active_id([decision for decision in past.decisions if decision.at <= measurement.measured_at])
+    return next((table for table in tables if table.id == then), None)
+
+
+def _tables_read(store: Store, machine: Machine, table: TableRecord, control: str) -> ReadTables | None:
+    """Parse the table files proper of one control (no manifest, no notes); None if there are none."""
+    names = table.summary.get("tables", {}).get(control, [])
+    files = {file.name: file.content for file in store.table_files(table) if file.controller == control}
+    return parse_tables(machine, {name: files[name] for name in names}, control) if names else None
+
+
+def _active_now(store: Store, machine: Machine, tables: Sequence[TableRecord]) -> ActiveState | None:
+    table = active_of(tables)
+    if table is None:
+        return None
+    read = {control: _tables_read(store, machine, table, control) for control in table.controllers}
+    known = {control: tables for control, tables in read.items() if tables is not None}
+    return ActiveState(table.version, known, store.identification(table.identification_id))
+
+
+# --- judgement -----------------------------------------------------------------------------------------------------
+
+
+def _judged(
+    store: Store,
+    job: MachineJob,
+    machine: Machine,
+    measurement: MeasurementRecord,
+    state: tuple[RunResult, ActiveState | None, datetime],
+) -> Judgement:
+    result, active, now = state
+    judgement = Judgement()
+    latest = None if active is None else active.identification.measured_at
+    judge_measurement(judgement, job.policy, measurement, now, latest)
+    new: dict[str, ReadTables] = {}
+    for item in result.results:
+        if item.verification.accepted:
+            control = item.verification.controller
+            names = {path.name: path for path in item.paths}
+            new[control] = read_tables(machine, [names[Path(name).name] for name in item.export.files], control)
+    if active is not None and result.accepted and shows_all(judgement, store, result, active):
+        judge_change(judgement, store, machine, result, active, job.policy)
+        judge_tables(judgement, machine, result, new, active)
+    if result.accepted:
+        apply_limits(judgement, machine, new, {} if active is None else active.tables, job.policy)
+    judge_misfit(judgement, result)
+    judgement.figures["active_version"] = None if active is None else active.version
+    judgement.figures["result"] = {item.verification.controller: item.verification.summary() for item in result.results}
+    if not result.accepted:
+        reasons = [reason for item in result.results for reason in item.verification.reasons]
+        judgement.hold[:0] = list(dict.fromkeys(reasons))
+    return judgement
+
+
+def _tables_of(result: RunResult, folder: Path) -> list[StoredTableFile]:
+    """Return the files of every control by their names below the control's own folder."""
+    files = []
+    for item in result.results:
+        control = item.verification.controller
+        root = folder / control if len(result.results) > 1 else folder
+        names = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
+        files += [
+            StoredTableFile(control, name, read_bytes(root / name)) for name in names if name not in NOT_OF_A_CONTROL
+        ]
+    return files
+
+
+def _result(
+    folder: Path, machine: Machine, outcome: RunResult, files: Sequence[StoredTableFile], judgement: Judgement
+) -> dict[str, Any]:
+    """Return the fields of a :class:`NewResult` that come from the chain."""
+    judgement.figures["tables"] = {item.verification.controller: list(item.export.files) for item in outcome.results}
+    covariance = folder / COVARIANCE
+    assert machine.source is not None
+    return {
+        "machine_text": read_bytes(machine.source),
+        "errors_text": read_bytes(folder / "identified.errors.csv"),
+        "covariance": read_bytes(covariance) if covariance.is_file() else None,
+        "fitted_text": read_bytes(folder / "fitted.errors.csv"),
+        "summary": outcome.identification.summary(),
+        "program": program_version(),
+        "files": tuple(files),
+        "accepted": outcome.accepted,
+        "hold": tuple(judgement.hold),
+        "reservations": tuple(judgement.reservations),
+        "judgement": judgement.figures,
+    }

@@ -1,0 +1,507 @@
+"""Publication: the output folder of a machine follows the store, and a command is notified of every decision and failure."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import tempfile
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+from typing import IO, Any
+
+from compgen.data.files import OutputFolder, sha256_of, write_file
+from compgen.errors import InputError
+from compgen.fleet import logs
+from compgen.fleet.records import HELD_BACK, MachineRecord, TableRecord, TableState, active_of
+from compgen.fleet.store import Store
+
+# The output folder of a machine follows the store: one folder for each version, and the pointer ``active``.
+#
+#     OUT/v0001/ ...                 versions that are or were active
+#     OUT/active -> v0001            symbolic link, swapped atomically; absent while no tables are active
+#     OUT/proposed/v0002/            waits for approval
+#     OUT/proposed/HELD-v0003/       held back by the policy
+#     OUT/proposed/NOT-ACCEPTED-v0004/   refused by the round trip
+#     OUT/.store.json                whose folder this is: machine, number of decisions, and their hash
+#
+# Everything is made under another name and renamed; doing it again changes nothing. It is done under a lock of the folder,
+# after the decision is in the store, so the last one to come always leaves the folder as the store says.
+#
+# Folder and store know each other by the history of the machine: the hash of all decisions with the contents of their
+# tables. A store in which that history is shorter (an older backup) or another one never writes here. What this program did
+# not write is never deleted and nothing is written through a link.
+
+
+POINTER = "active"
+PROPOSED = "proposed"
+LEDGER = ".store.json"
+#: Prefix of the folder below ``proposed`` by state; tables in other states are not there.
+PREFIX: dict[TableState, str] = {"pending": "", "held": "HELD-", "refused": "NOT-ACCEPTED-"}
+#: Prefixes of what is left of a folder that holds files of others, and of a folder that belonged to another store.
+LEFT, SET_ASIDE = "LEFT-", "SET-ASIDE-"
+#: Refused and held tables of which the folder keeps the newest; all of them are in the store.
+KEPT = 3
+_VERSION = re.compile(r"v([0-9]{4,})")
+_PROPOSED = re.compile(r"(?:HELD-|NOT-ACCEPTED-)?v([0-9]{4,})")
+_TEMPORARY = re.compile(r"\.((?:HELD-|NOT-ACCEPTED-)?v([0-9]{4,}))\.tmp")
+
+
+def check_folder(store: Store, machine: MachineRecord, folder: Path) -> None:
+    """Raise InputError unless the folder is that of this machine and this store; nothing is changed.
+
+    Called before a measurement is processed and before a decision, so that no wrong store goes on with a history that is
+    not that of the machine.
+    """
+    try:
+        seen = _look(folder)  # before the store: what another process does meanwhile, it adds there first
+        _compare(store, machine, store.tables(machine, figures=False), folder, seen)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=folder) from error
+
+
+def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord | None:
+    """Make the folder what the store says and return the active tables.
+
+    Files of the active and the proposed versions that are missing or altered are put back; those of a retired version
+    when it becomes active again.
+
+    Raises
+    ------
+    InputError
+        if it cannot be written, or is not the folder of this machine and store (:func:`check_folder`).
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _locked(folder):
+            seen = _look(folder)
+            tables = store.tables(machine, figures=False)
+            _compare(store, machine, tables, folder, seen)
+            past = lineage(store, machine)
+            about = {"machine": machine.name, "decisions": len(past), "sha256": past[-1] if past else ""}
+            ledger = json.dumps(about, indent=2) + "\n"
+            _remove_leftovers(store, machine, tables, folder)
+            for table in tables:
+                required = folder / version_name(table)
+                if table.state == "active" or (table.state == "retired" and not required.exists()):
+                    _complete(store, machine, table, required)
+            active = active_of(tables)
+            _point(folder, active)
+            _propose(store, machine, tables, folder / PROPOSED)
+            if ledger != seen.ledger_text:
+                write_file(folder / LEDGER, ledger)
+        return active
+    except OSError as error:
+        raise InputError(f"the tables cannot be written: {error.strerror or error}", file=folder) from error
+
+
+def set_aside(folder: Path) -> Path | None:
+    """Move everything that an earlier store published into a folder of its own and return that; None if there is nothing."""
+    if not folder.is_dir():
+        return None
+    with _locked(folder):
+        names = [path for path in sorted(folder.iterdir()) if _VERSION.fullmatch(path.name)]
+        names += [folder / name for name in (PROPOSED, LEDGER) if (folder / name).exists()]
+        pointer = folder / POINTER
+        if not names and not pointer.is_symlink():
+            return None
+        number = next(k for k in range(1, 10**6) if not (folder / f"{SET_ASIDE}{k}").exists())
+        target = folder / f"{SET_ASIDE}{number}"
+        target.mkdir()
+        for path in [*([pointer] if pointer.is_symlink() else []), *names]:  # first what a control may read
+            path.rename(target / path.name)
+        _sync(folder)
+        return target
+
+
+# --- whose folder it is --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What a folder holds: where the pointer leads (None: nowhere), the text of the ledger, names of version folders."""
+
+    pointer: str | None
+    ledger_text: str | None
+    versions: tuple[str, ...]
+
+
+def lineage(store: Store, machine: MachineRecord) -> list[str]:
+    """Return the hash of the machine's history after each decision: what was decided about which contents.
+
+    Times, persons and reasons do not count: two stores with the same lineage publish the same bytes.
+    """
+    files = store.file_hashes(machine)
+    numbers: dict[int, int] = {}
+    found, last = [], ""
+    for decision in store.decisions(machine):
+        about = None
+        if decision.table_id is not None:
+            number = numbers.setdefault(decision.table_id, len(numbers) + 1)
+            about = [number, *files.get(decision.table_id, [])]
+        last = sha256_of(json.dumps([last, decision.kind, about]).encode())
+        found.append(last)
+    return found
+
+
+def _look(folder: Path) -> _Seen:
+    pointer = folder / POINTER
+    if not pointer.is_symlink() and pointer.exists():
+        raise InputError("is not a link to a version, so this program did not make it; move it away", file=pointer)
+    if (folder / PROPOSED).is_symlink():
+        raise InputError("is a link; nothing is written through it, so put a folder there", file=folder / PROPOSED)
+    ledger = folder / LEDGER
+    names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    versions = tuple(name for name in names if _VERSION.fullmatch(name))
+    for name in versions:
+        if (folder / name).is_symlink():
+            raise InputError(
+                "is a link; nothing is written through it, so put the folder itself there", file=folder / name
+            )
+    text = ledger.read_text(encoding="utf-8", errors="replace") if ledger.is_file() else None
+    return _Seen(os.readlink(pointer) if pointer.is_symlink() else None, text, versions)
+
+
+def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord], folder: Path, seen: _Seen) -> None:
+    """Leave a folder alone whose store or machine is another one, or whose store was newer than this one."""
+    known = {version_name(table): table for table in tables if table.state in ("active", "retired")}
+    then = (
+        f"give the right store (`store` in the job file) or a newer backup; if this store is right, `volcomp recal adopt "
+        f"{machine.name} --reason TEXT` sets aside what the folder holds"
+    )
+    if seen.pointer is not None and seen.pointer not in known:
+        raise InputError(
+            f"leads to {seen.pointer}, which was never active by this store, so it is not the store of this folder; {then}",
+            file=folder / POINTER,
+        )
+    unknown = [name for name in seen.versions if name not in known]
+    if unknown:
+        raise InputError(f"holds {', '.join(unknown)}, which this store never made active; {then}", file=folder)
+    ledger = _read_ledger(seen.ledger_text)
+    if ledger is None:  # of an older program: by the contents
+        for name in seen.versions:
+            if _is_of_others(folder / name, _about(store, machine, known[name])):
+                raise InputError(
+                    f"{name} was published from another measurement than this store says; {then}", file=folder
+                )
+        return
+    if ledger["machine"] != machine.name:
+        raise InputError(
+            f"is the folder of machine {ledger['machine']}, not of {machine.name}; give {machine.name} a folder of its own, "
+            f"or, if the machine was renamed, `volcomp recal adopt {machine.name} --reason TEXT`",
+            file=folder,
+        )
+    history, count = lineage(store, machine), ledger["decisions"]
+    if count > len(history):
+        raise InputError(
+            f"follows {count} decisions about {machine.name}, but this store has {len(history)}: it is another one, was "
+            f"emptied, or is an older backup; {then}",
+            file=folder,
+        )
+    if count and history[count - 1] != ledger["sha256"]:
+        raise InputError(f"follows other decisions and tables than those of this store; {then}", file=folder)
+
+
+def _read_ledger(text: str | None) -> dict[str, Any] | None:
+    """Return what the ledger says, None for one that is missing or damaged."""
+    try:
+        found = json.loads(text or "")
+    except ValueError:
+        return None
+    kinds = {"machine": str, "decisions": int, "sha256": str}
+    whole = isinstance(found, dict) and all(isinstance(found.get(key), kind) for key, kind in kinds.items())
+    return found if whole else None
+
+
+def _is_of_others(folder: Path, about: Mapping[str, Any]) -> bool:
+    """Whether the folder of a version says that it was made by another store; a damaged or missing note says nothing."""
+    path = folder / "version.json"
+    if not path.is_file():  # nor a pipe, which would be waited for
+        return False
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    keys = ("machine", "version", "made_at", "measurement")
+    return not isinstance(found, dict) or any(found.get(key) != about[key] for key in keys)
+
+
+def version_name(table: TableRecord) -> str:
+    """Return the name of the folder of a version."""
+    return f"v{table.version:04d}"
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes out; the system gives the lock back whatever happens to this one."""
+    with (folder / ".lock").open("a") as stream:
+        try:
+            import fcntl
+        except ImportError:  # a system without such locks
+            yield
+            return
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            logs.warning("waiting for another process that works in this folder", folder=str(folder))
+            fcntl.flock(stream, fcntl.LOCK_EX)
+        yield
+
+
+def _remove_leftovers(store: Store, machine: MachineRecord, tables: Sequence[TableRecord], folder: Path) -> None:
+    """Remove what a process that was killed left behind; nobody else works here now."""
+    (folder / f".{POINTER}.tmp").unlink(missing_ok=True)
+    by_version = {table.version: table for table in tables}
+    for path in [*folder.glob(".*.tmp"), *(folder / PROPOSED).glob(".*.tmp")]:
+        found = _TEMPORARY.fullmatch(path.name)
+        table = None if found is None else by_version.get(int(found[2]))
+        if found is not None and table is not None and path.is_dir() and not path.is_symlink():
+            _clear(path, _contents(store, machine, table), found[1])
+
+
+def _clear(folder: Path, contents: Mapping[str, bytes], name: str) -> None:
+    """Delete the files that this program wrote into a folder, then the folder; what others put there stays as LEFT-NAME."""
+    for path in sorted(folder.rglob("*"), reverse=True):  # what lies inside a folder comes before the folder
+        if path.is_dir() and not path.is_symlink():
+            with contextlib.suppress(OSError):  # not empty: something of others
+                path.rmdir()
+            continue
+        place = path.relative_to(folder).as_posix()
+        half = re.fullmatch(r"(.*/)?\.(.+)\.[^.]+\.tmp", place)  # of an OutputFolder that was killed
+        own = place in contents if half is None else f"{half[1] or ''}{half[2]}" in contents
+        if own and not path.is_symlink() and (half is not None or path.read_bytes() == contents[place]):
+            path.unlink()
+    try:
+        folder.rmdir()
+    except OSError:
+        number = next(k for k in range(1, 10**6) if not (folder.parent / f"{LEFT}{name}-{k}").exists())
+        folder.rename(folder.parent / f"{LEFT}{name}-{number}")
+
+
+def _contents(store: Store, machine: MachineRecord, table: TableRecord) -> dict[str, bytes]:
+    """Return the files of a version by name; with several controls each has its own sub-folder."""
+    several = len(table.controllers) > 1
+    files = {f"{f.controller}/{f.name}" if several else f.name: f.content for f in store.table_files(table)}
+    files["version.json"] = (json.dumps(_about(store, machine, table), indent=2) + "\n").encode()
+    return files
+
+
+def _about(store: Store, machine: MachineRecord, table: TableRecord) -> dict[str, Any]:
+    """Return what ``version.json`` says."""
+    measurement = store.measurement_behind(table)
+    return {
+        "machine": machine.name,
+        "version": table.version,
+        "made_at": table.at.isoformat(),
+        "measurement": {"name": measurement.name, "sha256": measurement.sha256},
+        "measured_at": measurement.measured_at.isoformat(),
+        "reasons": list(table.reasons),
+    }
+
+
+def _complete(store: Store, machine: MachineRecord, table: TableRecord, target: Path) -> None:
+    """Make the folder of one version, or put back what is missing or altered in it."""
+    contents = _contents(store, machine, table)
+    if target.is_symlink() or (target.exists() and not target.is_dir()):
+        raise InputError("is not a folder that this program made; move it away", file=target)
+    if not target.exists():
+        _make(target, contents)
+        return
+    if _is_of_others(target, json.loads(contents["version.json"])):
+        raise InputError("was made by another store; move it away", file=target)
+    for name, content in contents.items():
+        path = target / name
+        if path.is_symlink():
+            raise InputError("is a link; nothing is written through it, so remove it", file=path)
+        if not path.is_file() or path.read_bytes() != content:
+            write_file(path, content)
+
+
+def _make(target: Path, contents: dict[str, bytes]) -> None:
+    temporary = target.with_name(f".{target.name}.tmp")
+    output = OutputFolder(temporary)
+    for name, content in contents.items():
+        output.add(name, content)
+    output.commit()
+    for inner in {temporary, *((temporary / name).parent for name in contents)}:
+        _sync(inner)
+    temporary.rename(target)
+    _sync(target.parent)
+
+
+def _point(folder: Path, active: TableRecord | None) -> None:
+    """Swap the pointer in one step."""
+    pointer = folder / POINTER
+    if active is None:
+        pointer.unlink(missing_ok=True)
+    elif not pointer.is_symlink() or os.readlink(pointer) != version_name(active):
+        temporary = folder / f".{POINTER}.tmp"
+        temporary.unlink(missing_ok=True)
+        temporary.symlink_to(version_name(active), target_is_directory=True)
+        temporary.replace(pointer)
+    _sync(folder)
+
+
+def _propose(store: Store, machine: MachineRecord, tables: Sequence[TableRecord], folder: Path) -> None:
+    closed = [table for table in tables if table.state in HELD_BACK][:-KEPT]
+    required = {
+        f"{PREFIX[table.state]}{version_name(table)}": table
+        for table in tables
+        if table.state in PREFIX and table not in closed
+    }
+    if not required and not folder.exists():
+        return
+    folder.mkdir(exist_ok=True)
+    by_version = {table.version: table for table in tables}
+    for path in sorted(folder.iterdir()):
+        found = _PROPOSED.fullmatch(path.name)
+        table = None if found is None else by_version.get(int(found[1]))
+        if path.name in required or table is None or path.is_symlink() or not path.is_dir():
+            continue
+        if not _is_of_others(path, _about(store, machine, table)):
+            gone = path.with_name(f".{path.name}.tmp")  # renamed first: nobody sees half of it
+            path.rename(gone)
+            _clear(gone, _contents(store, machine, table), path.name)
+    for name, table in required.items():
+        _complete(store, machine, table, folder / name)
+
+
+def _sync(folder: Path) -> None:
+    """Make the names in a folder last through a power failure, where the system can."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+# The notification command: it gets one JSON object on stdin for every decision and every failure, at least once.
+#
+# What was told already is kept in the store as events, after the command ended well: a command that fails is tried
+# again by the next run. So one whose process is killed in between, or two at the same time, tell it twice: the same object.
+
+
+#: How long a notification command may take, s.
+TIMEOUT_S = 60.0
+#: What is older than this is not told any more, for example when notifications are switched on.
+OLDEST = timedelta(days=1)
+#: Kind of the events that say what was told.
+NOTIFIED = "notified"
+#: Bytes of its stderr that are kept.
+MOST_SAID = 2000
+
+
+def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list[str]:
+    """Tell what was not told yet, oldest first; return why it could not be told (empty: all was)."""
+    if not command:
+        return []
+
+    def told() -> set[str]:
+        return {event.subject for event in store.events(machine) if event.kind == NOTIFIED}
+
+    known, since = told(), (store.read(store.now) - OLDEST).isoformat()
+    for subject, message in _news(store, machine):
+        if subject in known or message["at"] < since or subject in told():  # another runner may tell it meanwhile
+            continue
+        problem = _send(command, message)
+        if problem:
+            logs.error("notification failed", machine=machine.name, subject=subject, problem=problem)
+            return [problem]
+        store.add_event(NOTIFIED, subject, str(message["event"]), machine)
+    return []
+
+
+def _news(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any]]]:
+    """Return everything that may be told, in the order of time, by a name that stays."""
+    known, decisions, attempts = store.together(
+        lambda: (store.tables(machine, figures=False), store.decisions(machine), store.attempts(machine))
+    )
+    tables = {table.id: table for table in known}
+    found: list[tuple[str, dict[str, Any]]] = []
+    for decision in decisions:
+        table = None if decision.table_id is None else tables[decision.table_id]
+        message = {
+            "machine": machine.name,
+            "event": decision.kind,
+            "version": None if table is None else table.version,
+            "state": None if table is None else table.state,
+            "actor": decision.actor,
+            "reason": decision.reason,
+            "at": decision.at.isoformat(),
+        }
+        found.append((f"decision {decision.sequence}", message))
+    for attempt in attempts:
+        if attempt.outcome == "failed":
+            message = {"machine": machine.name, "event": "failed", "reason": attempt.message}
+            found.append((f"attempt {attempt.id}", {**message, "at": attempt.at.isoformat()}))
+    return sorted(found, key=lambda item: str(item[1]["at"]))
+
+
+def _send(command: Sequence[str], message: dict[str, Any]) -> str:
+    """Run the command with the message on stdin; return what went wrong, empty if nothing.
+
+    However long it hangs, however much it prints and whatever it leaves running, this ends in time: its output is read
+    and dropped but for the beginning of stderr, and a command that takes too long is ended with its children.
+    """
+    try:
+        process = _started(command, (json.dumps(message) + "\n").encode())
+    except (OSError, ValueError) as error:
+        return f"{command[0]}: {error}"
+    said = _Said(process.stderr)
+    try:
+        code = process.wait(TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return f"{command[0]} did not end within {TIMEOUT_S:g} s and was stopped"
+    finally:
+        _end(process)
+        text = said.text()
+    return "" if code == 0 else f"{command[0]} ended with {code}: {text}"
+
+
+def _started(command: Sequence[str], given: bytes) -> subprocess.Popen[bytes]:
+    """Start the command with ``given`` on stdin, from a file: it may read as slowly as it likes, or not at all."""
+    with tempfile.TemporaryFile() as stream:
+        stream.write(given)
+        stream.seek(0)
+        return subprocess.Popen(
+            list(command), stdin=stream, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+        )
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a command that still runs, with its children."""
+    if process.poll() is None:
+        with contextlib.suppress(OSError):
+            if os.name == "posix":
+                os.killpg(process.pid, signal.SIGKILL)
+            else:
+                process.kill()
+        process.wait()
+
+
+class _Said:
+    """Reads a stream to its end in a thread and keeps its beginning."""
+
+    def __init__(self, stream: IO[bytes] | None) -> None:
+        self._kept = bytearray()
+        self._stream = stream
+        self._thread = threading.Thread(target=self._read, name="stderr of a notification", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self._stream is not None
+        with self._stream:
+            while part := self._stream.read1(65536):  # type: ignore[attr-defined]
+                self._kept += part[: MOST_SAID - len(self._kept)]
+
+    def text(self) -> str:
+        """Return what came; a child that went on running may keep the stream open for ever."""
+        self._thread.join(1.0)
+        return " ".join(bytes(self._kept).decode("utf-8", "replace").split())[:200]

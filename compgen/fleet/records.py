@@ -1,0 +1,255 @@
+"""Records that the store returns (frozen, times in UTC), and the states of a set of tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Literal
+
+#: State of a set of tables, from the last decision about it.
+TableState = Literal["pending", "held", "refused", "superseded", "rejected", "active", "retired"]
+DecisionKind = Literal["propose", "hold", "refuse", "supersede", "approve", "reject", "rollback"]
+
+#: Beginning of a reason that is shown with the tables but does not hold them back.
+RESERVATION = "reservation: "
+
+
+@dataclass(frozen=True)
+class MachineRecord:
+    """A machine by the name that the job file gives it."""
+
+    id: int
+    name: str
+    at: datetime
+
+
+@dataclass(frozen=True)
+class MeasurementRecord:
+    """One measurement, known by the SHA-256 of its files.
+
+    ``measured_at`` comes from the file's comment ``measured_at`` (``measured_at_source`` = "file"; "file, no zone" if it
+    names no zone and is taken as local time) or from the time of the file itself ("file time"). ``active_table`` is the
+    comment ``active_table``: a version or "none"; None if the
+    file says nothing. ``temperatures_c`` holds lowest, mean and highest value of each channel. ``files`` are name and
+    SHA-256.
+    """
+
+    id: int
+    machine_id: int
+    sha256: str
+    name: str
+    measured_at: datetime
+    measured_at_source: str
+    received_at: datetime
+    active_table: str | None
+    temperatures_c: Mapping[str, Mapping[str, float]]
+    files: Sequence[tuple[str, str]] = ()
+
+
+@dataclass(frozen=True)
+class AttemptRecord:
+    """One attempt to process a measurement: ``outcome`` "done" or "failed"; ``message`` says why."""
+
+    id: int
+    machine_id: int
+    measurement_id: int
+    outcome: str
+    message: str
+    settings_sha256: str
+    owner: str
+    seconds: float
+    at: datetime
+
+
+@dataclass(frozen=True)
+class IdentificationRecord:
+    """Errors of the bare machine from one measurement; contents through ``Store.errors_of`` and ``covariance_of``.
+
+    ``active_table_id`` is the set of tables that was active while the machine was measured and was taken out;
+    ``revision`` counts how often the measurement was identified.
+    """
+
+    id: int
+    machine_id: int
+    measurement_id: int
+    machine_version_id: int
+    active_table_id: int | None
+    errors_sha256: str
+    covariance_sha256: str | None
+    fitted_sha256: str | None
+    summary: Mapping[str, Any]
+    program: str
+    at: datetime
+    measured_at: datetime
+    revision: int = 1
+
+
+@dataclass(frozen=True)
+class TableRecord:
+    """A set of tables of one machine; ``version`` counts from 1.
+
+    ``accepted`` says whether the round trip accepted the files, ``reasons`` why the policy holds them back, and the
+    reservations of the verdict, which begin with :data:`RESERVATION` and hold nothing back; ``summary`` holds the figures
+    of the judgement, ``state`` what the last decision made of it.
+    """
+
+    id: int
+    machine_id: int
+    version: int
+    identification_id: int
+    accepted: bool
+    controllers: Sequence[str]
+    reasons: Sequence[str]
+    summary: Mapping[str, Any]
+    at: datetime
+    state: TableState
+
+
+@dataclass(frozen=True)
+class DecisionRecord:
+    """Who decided what, when and why; ``table_id`` is None where a rollback leaves no table active."""
+
+    id: int
+    machine_id: int
+    sequence: int
+    table_id: int | None
+    kind: DecisionKind
+    actor: str
+    reason: str
+    at: datetime
+
+
+@dataclass(frozen=True)
+class EventRecord:
+    """Something that happened and is not a decision: an unreadable file, a clock that went backwards."""
+
+    id: int
+    machine_id: int | None
+    kind: str
+    subject: str
+    message: str
+    at: datetime
+
+
+@dataclass(frozen=True)
+class StoredTableFile:
+    """One file of a set of tables: the control that it belongs to, its name and contents."""
+
+    controller: str
+    name: str
+    content: bytes
+
+
+@dataclass(frozen=True)
+class NewMeasurement:
+    """A measurement to be kept: contents by file name, and what is known about it, see :class:`MeasurementRecord`."""
+
+    sha256: str
+    name: str
+    measured_at: datetime
+    measured_at_source: str
+    contents: Mapping[str, bytes]
+    active_table: str | None = None
+    temperatures_c: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class NewResult:
+    """What processing a measurement gave, kept in one transaction.
+
+    ``hold`` lists why the policy holds the tables back, ``reservations`` what is shown with them; with ``approve`` they
+    become active at once unless held or not accepted. ``revision`` counts how often the measurement is identified; from
+    the second time on ``actor`` and ``reason`` say who requested it and why.
+    """
+
+    machine_text: bytes
+    errors_text: bytes
+    covariance: bytes | None
+    fitted_text: bytes | None
+    summary: Mapping[str, Any]
+    program: str
+    active_table_id: int | None
+    files: Sequence[StoredTableFile]
+    accepted: bool
+    hold: Sequence[str]
+    judgement: Mapping[str, Any]
+    approve: bool
+    settings_sha256: str
+    seconds: float
+    revision: int = 1
+    actor: str = ""
+    reason: str = ""
+    reservations: Sequence[str] = ()
+
+
+def reservations_of(reasons: Sequence[str]) -> list[str]:
+    """Return the reasons that do not hold the tables back, without their beginning."""
+    return [text.removeprefix(RESERVATION) for text in reasons if text.startswith(RESERVATION)]
+
+
+# --- states of a set of tables: what the decisions make of it ------------------------------------------------------
+#
+# propose -> pending        approve -> active       another approved -> retired    rollback to it -> active
+# hold    -> held           reject  -> rejected     a newer proposal -> superseded
+# refuse  -> refused        (the round trip did not accept the files: for good)
+
+
+#: Who decides where no person does.
+AUTOMATIC = "automatic"
+#: State right after a decision about a set of tables.
+AFTER: dict[DecisionKind, TableState] = {
+    "propose": "pending",
+    "hold": "held",
+    "refuse": "refused",
+    "supersede": "superseded",
+    "approve": "active",
+    "reject": "rejected",
+    "rollback": "active",
+}
+#: States in which a person may decide.
+OPEN: tuple[TableState, ...] = ("pending", "held")
+#: States in which the policy or the round trip speaks against the tables.
+HELD_BACK: tuple[TableState, ...] = ("held", "refused")
+#: States that a rollback may bring back.
+WAS_ACTIVE: tuple[TableState, ...] = ("retired",)
+
+
+def active_id(decisions: Sequence[DecisionRecord]) -> int | None:
+    """Return the id of the tables that are active after the decisions of one machine, None if none are."""
+    for decision in reversed(decisions):
+        if decision.kind in ("approve", "rollback"):
+            return decision.table_id
+    return None
+
+
+def active_of(tables: Iterable[TableRecord]) -> TableRecord | None:
+    """Return the one of a machine's sets of tables that is active, None if none is."""
+    return next((table for table in tables if table.state == "active"), None)
+
+
+def state_of(table_id: int, decisions: Sequence[DecisionRecord]) -> TableState:
+    """Return the state of one set of tables after the decisions of its machine."""
+    about_it = [decision for decision in decisions if decision.table_id == table_id]
+    if not about_it:
+        return "held"
+    state = AFTER[about_it[-1].kind]
+    return "retired" if state == "active" and active_id(decisions) != table_id else state
+
+
+def before_active(decisions: Sequence[DecisionRecord]) -> int | None:
+    """Return the id of the tables that were active before the active ones were first approved, None if none were.
+
+    A rollback counts as if what it undid had never been: after versions 1, 2, 3 and a rollback to 2 the one before is 1.
+    """
+    stack: list[int | None] = [None]
+    for decision in decisions:
+        if decision.kind == "approve":
+            stack.append(decision.table_id)
+        elif decision.kind == "rollback":
+            if decision.table_id in stack:
+                last = len(stack) - 1 - stack[::-1].index(decision.table_id)
+                del stack[last + 1 :]
+            else:
+                stack.append(decision.table_id)
+    return stack[-2] if len(stack) > 1 else None

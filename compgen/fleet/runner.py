@@ -1,0 +1,451 @@
+"""One pass over the machines of a job: take what is new in the inboxes, process it, keep it, publish it.
+
+Machines do not disturb each other: whatever goes wrong with one becomes part of its outcome. The passes are made in this
+process (:func:`run_jobs`), or in processes of this machine or on a cluster (:func:`run_fleet`), with the same results.
+"""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import Any
+
+import sqlalchemy as sa
+
+from compgen.data.messages import visible
+from compgen.errors import CompgenError
+from compgen.fleet import claims, inbox, logs
+from compgen.fleet.claims import ChangedMeanwhileError, Claim, ClaimLostError, keep_failure, keep_result
+from compgen.fleet.database import StoreError, plain, sqlite_path
+from compgen.fleet.job import Job, MachineJob
+from compgen.fleet.process import process, without_folder
+from compgen.fleet.publish import check_folder, notify, publish
+from compgen.fleet.records import HELD_BACK, OPEN, MachineRecord, MeasurementRecord, TableRecord
+from compgen.fleet.store import Clock, Store, open_store
+from compgen.kinematics.kernel_switch import one_thread
+from compgen.kinematics.parallel import Packed, Processes, Stop, StoppedError, Workers, limited, spread, stopping
+from compgen.plugins import WithPlugins, with_plugins
+
+#: Causes that may pass by themselves, so that a measurement is tried again instead of being given up: a full disk or one
+#: with a limit, a file that cannot be read now, too many open files.
+PASSING = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EIO,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOMEM,
+    errno.EROFS,
+    errno.ESTALE,
+    errno.EBUSY,
+)
+
+
+def passes(error: BaseException) -> bool:
+    """Whether the cause may pass by itself: one of :data:`PASSING`, too little memory, a store that is away."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, MemoryError | StoreError) or (isinstance(cause, OSError) and cause.errno in PASSING):
+            return True
+        cause = cause.__cause__
+    return False
+
+
+#: How often a measurement is judged again because other tables became active meanwhile.
+JUDGED_AT_MOST = 5
+
+StopCheck = Callable[[], bool]
+Mapper = Callable[[Callable[[MachineJob], "MachineOutcome"], Iterable[MachineJob]], Iterable["MachineOutcome"]]
+
+
+@dataclass(frozen=True)
+class MachineOutcome:
+    """What one pass did for one machine; it can be sent between processes.
+
+    ``state`` is "ok", "held" (the newest tables are held back or refused), "failed" (something could not be taken or
+    processed) or "stopped" (the pass ended before its turn: nothing is known of it); ``messages`` say why. ``processed``
+    names the measurements of this pass, ``active`` is the active version, ``waiting`` are the versions that wait for a
+    person. With ``again`` something may pass by itself (a full disk, an unreadable file, another runner, a store that is
+    away), with ``unreachable`` it is the store.
+    """
+
+    machine: str
+    state: str
+    messages: tuple[str, ...] = ()
+    processed: tuple[str, ...] = ()
+    active: int | None = None
+    waiting: tuple[int, ...] = ()
+    internal: bool = False
+    seconds: float = 0.0
+    again: bool = False
+    unreachable: bool = False
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """Outcome of a pass over all machines, in the order of the job file."""
+
+    outcomes: tuple[MachineOutcome, ...]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether nothing failed and nothing is held back."""
+        return all(item.state in ("ok", "stopped") for item in self.outcomes)
+
+    @property
+    def exit_code(self) -> int:
+        """0: all is well; 1: something is held back or failed; 2: the store went away; 3: an internal error."""
+        if any(item.internal for item in self.outcomes):
+            return 3
+        return 2 if any(item.unreachable for item in self.outcomes) else 0 if self.accepted else 1
+
+    def summary(self) -> dict[str, Any]:
+        """Return the object that ``--json`` prints."""
+        return {"accepted": self.accepted, "machines": [asdict(item) for item in self.outcomes]}
+
+
+def run_jobs(
+    job: Job,
+    names: Sequence[str] = (),
+    *,
+    mapper: Mapper = map,
+    stop: StopCheck = lambda: False,
+    clock: Clock | None = None,
+) -> RunOutcome:
+    """Make one pass over the machines ``names`` (default all); ``mapper`` may spread them over processes.
+
+    ``clock`` tells the time of a simulated factory; None: that of the computer or the database.
+
+    Raises
+    ------
+    StoreError
+        if the store cannot be reached at all.
+    """
+    chosen = [job.machine(name) for name in names] if names else list(job.machines.values())
+    chosen = inbox.with_twins(chosen, job.machines.values())
+    open_store(job.store).close()
+    work = partial(run_machine, url=job.store, clock=clock)
+    if mapper is map:
+        work = partial(work, stop=stop)
+    return RunOutcome(tuple(mapper(work, chosen)))
+
+
+def run_machine(
+    job: MachineJob, url: str, stop: StopCheck = lambda: False, clock: Clock | None = None
+) -> MachineOutcome:
+    """Make one pass over one machine; whatever goes wrong is part of the outcome, nothing is raised."""
+    started = time.monotonic()
+    if stop():
+        return MachineOutcome(job.name, "stopped", ("not looked at: stopped",))
+    try:
+        with closing(open_store(url, clock=clock)) as store, one_thread():
+            outcome = _Pass(store, job, store.add_machine(job.name), stop).run()
+    except CompgenError as error:
+        lost = isinstance(error, StoreError)
+        outcome = MachineOutcome(job.name, "failed", (plain(str(error)),), again=passes(error), unreachable=lost)
+    except Exception as error:  # a bug here must not stop the other machines
+        outcome = MachineOutcome(
+            job.name, "failed", (f"internal error: {type(error).__name__}: {error}",), internal=True
+        )
+    outcome = replace(outcome, seconds=time.monotonic() - started)
+    write = logs.info if outcome.state == "ok" else logs.warning
+    write("machine done", **{key: value for key, value in asdict(outcome).items() if value not in (None, (), False)})
+    return outcome
+
+
+class _Pass:
+    """One pass over one machine; collects messages as it goes."""
+
+    def __init__(self, store: Store, job: MachineJob, machine: MachineRecord, stop: StopCheck) -> None:
+        self.store, self.job, self.machine, self.stop = store, job, machine, stop
+        self.messages: list[str] = []
+        self.processed: list[str] = []
+        self.present: set[str] = set()
+        self.failed = False
+        self.internal = False
+        self.again = False
+
+    def run(self) -> MachineOutcome:
+        """Take, process, publish, notify."""
+        check_folder(self.store, self.machine, self.job.out)
+        known = self.store.newest_entry(self.machine)
+        if known is not None and known > self.store.read(self.store.now):
+            behind = known.isoformat(timespec="seconds")
+            text = f"the clock went backwards: the store holds an entry of {behind}"
+            self._problem("clock", "clock", text, fail=False)
+        self._take()
+        settings = self.job.settings_sha256()  # a machine file that is missing ends here; what came in is kept
+        self._process_all(settings)
+        active = publish(self.store, self.machine, self.job.out)
+        problems = notify(self.store, self.machine, self.job.notify)
+        self.messages += problems
+        self.again = self.again or bool(problems)
+        return self._outcome(active, settings)
+
+    def _problem(self, kind: str, subject: str, message: str, *, fail: bool = True) -> None:
+        """Report something; it is kept in the store if it is news there."""
+        self.failed = self.failed or fail
+        self.again = self.again or fail
+        subject, message = visible(plain(subject), flat=True), plain(message)
+        self.messages.append(f"{subject}: {message}" if kind == "inbox" else message)
+        if self.store.add_event(kind, subject, message, self.machine):
+            logs.warning(kind, machine=self.job.name, subject=subject, message=message)
+
+    def _take(self) -> None:
+        """Keep everything that is new in the inbox."""
+        found = inbox.scan(self.job, self.store.read(self.store.now))
+        for problem in found.problems:
+            self._problem("inbox", problem.subject, problem.message)
+        for group in found.groups:
+            try:
+                new = inbox.load(self.job, group)
+            except CompgenError as error:
+                place = str(getattr(error, "file", None) or group[0])
+                self._problem("inbox", place, str(getattr(error, "message", error)))
+                continue
+            self.store.add_measurement(self.machine, new)
+            self.present.add(new.sha256)
+
+    def _process_all(self, settings: str) -> None:
+        """Process what has no result yet in the order of measurement; what failed comes again only with other settings.
+
+        Where another runner has a measurement, the later ones are left to it as well.
+        """
+        seen: set[int] = set()
+        while True:
+            attempts = [item for item in self.store.attempts(self.machine) if item.settings_sha256 == settings]
+            failed = {item.measurement_id for item in attempts if item.outcome == "failed"}
+            passed_over = seen | failed | self.store.identified(self.machine)
+            waiting = [item for item in self.store.measurements(self.machine) if item.id not in passed_over]
+            if not waiting:
+                return
+            for measurement in waiting:
+                if self.stop():
+                    self.messages.append("stopped; the rest is processed by the next run")
+                    return
+                seen.add(measurement.id)
+                if not self._process(measurement, settings):
+                    return
+
+    def _process(self, measurement: MeasurementRecord, settings: str) -> bool:
+        """Process one measurement; return whether the next one may follow."""
+        for _ in range(JUDGED_AT_MOST):
+            claim = claims.take(self.store, measurement, claims.owner_name())
+            if claim is None:
+                return self._leave(measurement, "another runner has it")
+            try:
+                self._keep(measurement, claim, settings)
+                return True
+            except ChangedMeanwhileError:
+                claims.give_back(self.store, claim)
+            except (ClaimLostError, sa.exc.IntegrityError):
+                claims.forget(self.store, claim)
+                return self._leave(measurement, "another runner took it over")
+            except BaseException:
+                try:
+                    claims.give_back(self.store, claim)
+                except (CompgenError, sa.exc.SQLAlchemyError) as error:  # must not hide the error on its way
+                    logs.error("claim not given back", problem=str(error))
+                raise
+        return self._leave(measurement, "other tables became active again and again; it is judged by the next run")
+
+    def _leave(self, measurement: MeasurementRecord, why: str) -> bool:
+        """Say why a measurement is not processed now."""
+        self.messages.append(f"{measurement.name}: {why}")
+        self.again = True
+        return False
+
+    def _keep(self, measurement: MeasurementRecord, claim: Claim, settings: str) -> None:
+        started = time.monotonic()
+        try:
+            with claims.renewal(self.store, claim), limited(60.0 * self.job.max_minutes):
+                done = process(self.store, self.job, self.machine, measurement)
+        except ClaimLostError:
+            raise
+        except Exception as error:
+            if isinstance(error, CompgenError | OSError | MemoryError):
+                if passes(error):
+                    claims.give_back(self.store, claim)
+                    self._problem("passing", measurement.name, f"{measurement.name}: {error}; it is tried again")
+                    return
+                message = without_folder(str(error))
+            else:
+                self.internal, message = True, f"internal error: {type(error).__name__}: {error}"
+            keep_failure(self.store, self.machine, claim, message, settings, time.monotonic() - started)
+            return
+        table = keep_result(self.store, self.machine, claim, done.result, done.judged_against)
+        self.processed.append(measurement.name)
+        fields = {"version": table.version, "state": table.state, "reasons": list(table.reasons)}
+        logs.info("measurement processed", machine=self.job.name, measurement=measurement.name, **fields)
+
+    def _outcome(self, active: TableRecord | None, settings: str) -> MachineOutcome:
+        """Judge by what the store holds, so that the same inbox gives the same outcome however often it is run."""
+        tables = self.store.tables(self.machine, figures=False)
+        # what failed is reported as long as it is in the inbox: who removed or mended it knows of it
+        names = {item.id: item.name for item in self.store.measurements(self.machine) if item.sha256 in self.present}
+        for attempt in self.store.attempts(self.machine):
+            name = names.get(attempt.measurement_id)
+            if name is not None and attempt.outcome == "failed" and attempt.settings_sha256 == settings:
+                self.failed, text = True, attempt.message
+                self.messages.append(text if text.startswith(f"{name}:") else f"{name}: {text}")
+        last = tables[-1] if tables else None
+        held = last is not None and last.state in HELD_BACK
+        if last is not None and held:
+            self.messages.append(f"version {last.version} is {last.state}: {'; '.join(last.reasons)}")
+        return MachineOutcome(
+            machine=self.job.name,
+            state="failed" if self.failed else "held" if held else "ok",
+            messages=tuple(dict.fromkeys(self.messages)),
+            processed=tuple(self.processed),
+            active=None if active is None else active.version,
+            waiting=tuple(table.version for table in tables if table.state in OPEN),
+            internal=self.internal,
+            again=self.again,
+        )
+
+
+# --- passes in other processes -------------------------------------------------------------------------------------
+
+#: Events about processes that ended over a measurement, and after how many of them it is set aside.
+DIED, TRIES = "process ended", 3
+#: Why a cluster has to be on this machine.
+LOCAL_STORE = "the store is an SQLite file, which only processes of one machine may share; use postgresql://HOST/NAME"
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One pass over a machine as another process makes it; it brings the form of the logs along."""
+
+    url: str
+    log: logs.Format
+
+    def __repr__(self) -> str:
+        return "Pass()"  # the URL may hold a password
+
+    def __call__(self, job: MachineJob) -> MachineOutcome:
+        """Make the pass."""
+        logs.configure(self.log)
+        return run_machine(job, self.url, stopping)
+
+
+def pass_of(url: str) -> WithPlugins:
+    """Return the pass on the store ``url`` with this process's logs and plug-ins."""
+    return with_plugins(Pass(url, logs.form()))
+
+
+def open_fleet(url: str, workers: int, cluster: str | None, *, copied: bool = False) -> Workers:
+    """Return what works on the machines of the store ``url``: a cluster, or processes of this computer.
+
+    Even one worker is a process of its own: a measurement that brings it down, or takes too long, takes nothing with it
+    but its own pass. ``copied`` as for :class:`compgen.kinematics.parallel.Processes`.
+
+    Raises
+    ------
+    ClusterError
+        if the cluster cannot be used, for example not with this store.
+    """
+    if cluster is not None:
+        from compgen.kinematics.parallel import Cluster  # the library is an optional one
+
+        return Cluster(cluster, same_host=LOCAL_STORE if sqlite_path(url) is not None else "")
+    return Processes(workers, copied=copied and workers == 1, died=partial(note_death, url))
+
+
+def note_death(url: str, job: MachineJob, pid: int, late: bool) -> None:
+    """Keep that the process ``pid`` ended while it worked on a measurement; after three times it is set aside.
+
+    With ``late`` it was ended because it took too long, and the measurement is set aside at once.
+    """
+    try:
+        with closing(open_store(url)) as store:
+            machine = store.machine(job.name)
+            for measurement in claims.left_by(store, machine, pid):
+                _note(store, job, machine, measurement, late)
+    except CompgenError as error:  # the next run tries the measurement again
+        logs.error("end of a process not noted", machine=job.name, problem=str(error))
+
+
+def _note(store: Store, job: MachineJob, machine: MachineRecord, measurement: MeasurementRecord, late: bool) -> None:
+    since = [item.at for item in store.attempts(machine) if item.measurement_id == measurement.id]
+    subject = f"measurement {measurement.id}"
+    deaths = [item.at for item in store.events(machine) if item.kind == DIED and item.subject == subject]
+    number = 1 + sum(not since or at >= since[-1] for at in deaths)
+    if late:
+        message = f"{measurement.name}: took longer than {job.max_minutes:g} minutes and was ended"
+    else:
+        message = f"{measurement.name}: the process that worked on it was killed or crashed, {number} of {TRIES} times"
+    store.add_event(DIED, subject, message, machine)
+    logs.error("process ended", machine=machine.name, measurement=measurement.name, problem=message)
+    claim = claims.take(store, measurement, claims.owner_name()) if late or number >= TRIES else None
+    if claim is not None:
+        text = f"{message}; it is set aside until job, machine file or instrument file change"
+        keep_failure(store, machine, claim, text, job.settings_sha256(), 0.0)
+
+
+def run_fleet(
+    job: Job,
+    names: Sequence[str] = (),
+    *,
+    workers: int = 1,
+    cluster: str | None = None,
+    stop: Stop = lambda: False,
+) -> RunOutcome:
+    """Make one pass over the machines ``names`` (default all) with so many processes, or on a Dask cluster.
+
+    Raises
+    ------
+    StoreError
+        if the store cannot be reached at all.
+    ClusterError
+        if the cluster cannot be used.
+    """
+    fleet = open_fleet(job.store, workers, cluster, copied=True)
+    with closing(fleet):
+        return run_with(fleet, job, names, stop=stop)
+
+
+def run_with(fleet: Workers, job: Job, names: Sequence[str] = (), *, stop: Stop = lambda: False) -> RunOutcome:
+    """Make one pass over the machines ``names`` (default all) with workers that are there; see :func:`run_fleet`."""
+
+    def mapper(_: Callable[[MachineJob], MachineOutcome], chosen: Iterable[MachineJob]) -> list[MachineOutcome]:
+        jobs = ordered = list(chosen)
+        if len(jobs) > 1:
+            # The others go before a machine whose last measurement was left by a runner that was killed: so one that
+            # brings down all that runs here (too little memory) does not keep the machines behind it waiting for ever.
+            with closing(open_store(job.store)) as store:
+                left = claims.unfinished(store)
+                names = {machine.name for machine in store.machines() if machine.id in left}
+            ordered = sorted(jobs, key=lambda item: item.name in names)
+        found = {item.machine: item for item in spread(fleet, pass_of(job.store), ordered, lost=_lost, stop=stop)}
+        return [found[item.name] for item in jobs]
+
+    return run_jobs(job, names, mapper=mapper)
+
+
+def _lost(job: MachineJob, error: CompgenError) -> MachineOutcome:
+    """Return the outcome of a machine whose pass did not come to an end."""
+    if isinstance(error, StoppedError):
+        return MachineOutcome(job.name, "stopped", (f"not looked at: {error}",))
+    outcome = MachineOutcome(job.name, "failed", (str(error),), again=True)
+    logs.error("machine lost", machine=job.name, problem=str(error))
+    return outcome
+
+
+def work_of(fleet: Workers) -> Callable[[MachineJob, str, Stop], MachineOutcome]:
+    """Return the work of a :class:`compgen.fleet.watch.Watch` whose passes are made by ``fleet``."""
+
+    def work(job: MachineJob, url: str, stop: Stop) -> MachineOutcome:
+        try:
+            found: MachineOutcome = fleet.call(Packed(pass_of(url)), Packed(job), stop)
+            return found
+        except CompgenError as error:  # lost, stopped, or a worker that cannot be used
+            return _lost(job, error)
+
+    return work

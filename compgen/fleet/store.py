@@ -1,0 +1,644 @@
+"""The store: machines, measurements, identified errors, tables and decisions; rows are only ever added.
+
+Open it with :func:`open_store`. Decisions are made in :mod:`compgen.fleet.decisions`; leases, and what the processing of a
+measurement adds, are in :mod:`compgen.fleet.claims`.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import sqlite3
+import zlib
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from functools import wraps
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+import sqlalchemy as sa
+
+from compgen.data.error_table import ErrorTable, parse_errors
+from compgen.data.files import decoded, sha256_of, working_folder
+from compgen.data.machine import Machine, parse_machine
+from compgen.errors import CompgenError, InputError
+from compgen.fleet import database
+from compgen.fleet.database import StoreError, engine_of, first_line, put_blobs, retried, shown, upgrade
+from compgen.fleet.records import (
+    AttemptRecord,
+    DecisionRecord,
+    EventRecord,
+    IdentificationRecord,
+    MachineRecord,
+    MeasurementRecord,
+    NewMeasurement,
+    StoredTableFile,
+    TableRecord,
+    state_of,
+)
+from compgen.identify.covariance import Covariance, parse_covariance
+
+Result = TypeVar("Result")
+Arguments = ParamSpec("Arguments")
+Clock = Callable[[], datetime]
+#: The store whose reads go through one connection at the moment, and that connection.
+_together: ContextVar[tuple[Store, sa.Connection] | None] = ContextVar("compgen_store_together", default=None)
+
+#: Identifications, each with the time of its measurement.
+_IDENTIFICATIONS: sa.Select[Any] = sa.select(database.identifications, database.measurements.c.measured_at).join(
+    database.measurements, database.measurements.c.id == database.identifications.c.measurement_id
+)
+
+
+def at_one_moment(
+    function: Callable[Concatenate[Store, Arguments], Result],
+) -> Callable[Concatenate[Store, Arguments], Result]:
+    """Let a function whose first argument is the store read everything as it is at one moment (:meth:`Store.together`)."""
+
+    @wraps(function)
+    def wrapper(store: Store, /, *args: Arguments.args, **options: Arguments.kwargs) -> Result:
+        return store.together(lambda: function(store, *args, **options))
+
+    return wrapper
+
+
+class Store:
+    """A store that is open; every method is one transaction. ``clock`` is for tests.
+
+    A method raises StoreError once the file of an SQLite store was moved, removed, replaced or overwritten: what is written
+    to an open file that nobody finds any more is lost, and what goes into another store spoils both.
+    """
+
+    def __init__(self, engine: sa.Engine, url: str, clock: Clock | None = None, number: int = 0) -> None:
+        self.engine, self.url, self._clock = engine, url, clock
+        self._file = _StoreFile(Path(str(engine.url.database)), number) if engine.dialect.name == "sqlite" else None
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self.engine.dispose()
+
+    def now(self, connection: sa.Connection) -> datetime:
+        """Return the time by which leases count: that of the PostgreSQL server, or of this machine."""
+        if self._clock is not None:
+            return self._clock()
+        if connection.dialect.name == "postgresql":
+            found: datetime = connection.execute(sa.select(sa.func.clock_timestamp())).scalar_one()
+            return found.astimezone(UTC)
+        return datetime.now(UTC)
+
+    def read(self, action: Callable[[sa.Connection], Result]) -> Result:
+        """Do ``action`` in a transaction that only reads; again while the store cannot be reached."""
+
+        def once() -> Result:
+            self._check_file()
+            with self.engine.connect().execution_options(reading=True) as connection:
+                return action(connection)
+
+        current = _together.get()
+        try:
+            if current is not None and current[0] is self:
+                return action(current[1])
+            return retried(once, self.url)
+        except (CompgenError, UnicodeDecodeError):
+            raise
+        except ValueError as error:  # no time, no JSON
+            raise StoreError(f"the store {shown(self.url)} is damaged: {error}; restore a backup") from error
+
+    def together(self, action: Callable[[], Result]) -> Result:
+        """Do ``action``, which reads several times, on the store as it is at one moment: its reads fit together."""
+        current = _together.get()
+        if current is not None and current[0] is self:
+            return action()
+
+        def once() -> Result:
+            self._check_file()
+            options: dict[str, Any] = {"reading": True}
+            if self.engine.dialect.name == "postgresql":
+                options["isolation_level"] = "REPEATABLE READ"
+            with self.engine.connect().execution_options(**options) as connection:
+                token = _together.set((self, connection))
+                try:
+                    return action()
+                finally:
+                    _together.reset(token)
+
+        return retried(once, self.url)
+
+    def write(self, action: Callable[[sa.Connection], Result]) -> Result:
+        """Do ``action`` in a transaction, all of it or nothing; again while the store cannot be reached."""
+
+        def once() -> Result:
+            self._check_file()
+            with self.engine.begin() as connection:
+                found = action(connection)
+                self._check_file()  # again, right before it counts
+                return found
+
+        return retried(once, self.url)
+
+    def _check_file(self) -> None:
+        """Raise StoreError unless the path still leads to the store that was opened."""
+        if self._file is not None and not self._file.is_same():
+            raise StoreError(
+                f"the store {shown(self.url)} was moved, removed or replaced while it was open; nothing was written: "
+                "put the file back, or start again with the right one"
+            )
+
+    def version(self) -> tuple[object, ...]:
+        """Return something that is another one after every change: what was read before may be shown while it is equal.
+
+        Rows are only added. SQLite numbers them in the order in which they count; on PostgreSQL a lower number may
+        come later, so they are counted as well.
+        """
+        counted = self.engine.dialect.name == "postgresql"
+        tables = [table for table in database.ALL if "id" in table.c and table is not database.claims]
+        columns = [sa.select(sa.func.max(table.c.id)).scalar_subquery() for table in tables]
+        columns += [sa.select(sa.func.count()).select_from(table).scalar_subquery() for table in tables if counted]
+        return tuple(self.read(lambda connection: connection.execute(sa.select(*columns)).one()))
+
+    # --- machines ---------------------------------------------------------------------------------------------------
+
+    def add_machine(self, name: str) -> MachineRecord:
+        """Return the machine ``name``, which is added if it is not known."""
+        found = self.read(lambda connection: _machine_named(connection, name))
+        if found is not None:
+            return found
+        with suppress(sa.exc.IntegrityError):  # somebody else was faster
+            self.write(lambda c: c.execute(sa.insert(database.machines).values(name=name, at=self.now(c))))
+        return self.machine(name)
+
+    def machine(self, name: str) -> MachineRecord:
+        """Return the machine ``name``; InputError if the store does not know it."""
+        found = self.read(lambda connection: _machine_named(connection, name))
+        if found is None:
+            raise InputError(f"the store has no machine {name!r}; it is added by its first `volcomp recal run`")
+        return found
+
+    def machines(self) -> list[MachineRecord]:
+        """Return all machines by name."""
+        query = sa.select(database.machines).order_by(database.machines.c.name)
+        return [MachineRecord(*row) for row in self._rows(query)]
+
+    def machine_of(self, identification: IdentificationRecord) -> Machine:
+        """Return the machine as its file described it when the errors were identified."""
+        table = database.machine_versions
+        query = sa.select(table.c.sha256).where(table.c.id == identification.machine_version_id)
+        content = self.blob(self.read(lambda c: c.execute(query).scalar_one()))
+        return parse_machine(decoded(content, "machine.toml"), Path("machine.toml"))
+
+    # --- measurements -----------------------------------------------------------------------------------------------
+
+    def add_measurement(self, machine: MachineRecord, new: NewMeasurement) -> MeasurementRecord:
+        """Keep a measurement with its contents and return it; the same contents are kept once."""
+        known = self.find_measurement(machine, new.sha256)
+        if known is not None:
+            return known
+        with suppress(sa.exc.IntegrityError):  # somebody else was faster
+            self.write(lambda c: _insert_measurement(c, machine.id, new, self.now(c)))
+        found = self.find_measurement(machine, new.sha256)
+        if found is None:
+            raise StoreError(f"measurement {new.name} cannot be kept in {shown(self.url)}")
+        return found
+
+    def find_measurement(self, machine: MachineRecord, sha256: str) -> MeasurementRecord | None:
+        """Return the machine's measurement with this hash, or None."""
+        return next(iter(self.measurements(machine, sha256=sha256)), None)
+
+    @at_one_moment
+    def measurements(
+        self, machine: MachineRecord | None = None, *, sha256: str | None = None
+    ) -> list[MeasurementRecord]:
+        """Return the measurements of a machine (or of all) in the order in which they were made."""
+        table, listed = database.measurements, database.measurement_files
+        query = _where(sa.select(table).order_by(table.c.measured_at, table.c.id), table, machine)
+        inner = sa.select(listed.c.measurement_id, listed.c.name, listed.c.sha256).order_by(listed.c.id)
+        if machine is not None or sha256 is not None:
+            inner = _where(inner.join(table, table.c.id == listed.c.measurement_id), table, machine)
+        if sha256 is not None:
+            query, inner = query.where(table.c.sha256 == sha256), inner.where(table.c.sha256 == sha256)
+        files: dict[int, list[tuple[str, str]]] = {}
+        for measurement_id, name, digest in self._rows(inner):
+            files.setdefault(measurement_id, []).append((name, digest))
+        return [MeasurementRecord(**row._mapping, files=tuple(files.get(row.id, ()))) for row in self._rows(query)]
+
+    def contents_of(self, measurement: MeasurementRecord) -> dict[str, bytes]:
+        """Return the contents of a measurement's files by name."""
+        return {name: self.blob(digest) for name, digest in measurement.files}
+
+    def measurement_behind(self, table: TableRecord) -> MeasurementRecord:
+        """Return the measurement from which a set of tables was made; its files are left out."""
+        measured, found = database.measurements, database.identifications
+        query = sa.select(measured).join(found, found.c.measurement_id == measured.c.id)
+        (row,) = self._rows(query.where(found.c.id == table.identification_id))
+        return MeasurementRecord(**row._mapping, files=())
+
+    def same_files_of_others(self, machine: MachineRecord, measurement: MeasurementRecord) -> list[tuple[str, str]]:
+        """Return (machine, measurement in words) of other machines to which one of the measurement's files came too.
+
+        What a person rejected there does not count: that is how the wrong machine lets go of it.
+        """
+        files, measured, found = database.measurement_files, database.measurements, database.identifications
+        own = {digest for _, digest in measurement.files}
+        query = sa.select(
+            measured.c.id, measured.c.machine_id, measured.c.name, database.machines.c.name.label("machine")
+        )
+        query = query.join(files, files.c.measurement_id == measured.c.id)
+        query = query.join(database.machines, database.machines.c.id == measured.c.machine_id)
+        query = query.where(files.c.sha256.in_(own), measured.c.machine_id != machine.id)
+        others: list[tuple[str, str]] = []
+        for row in self._rows(query.distinct().order_by(measured.c.id)):
+            made = sa.select(database.tables.c.version, database.tables.c.id).join(
+                found, found.c.id == database.tables.c.identification_id
+            )
+            versions = {key: version for version, key in self._rows(made.where(found.c.measurement_id == row.id))}
+            decided = self.decisions(self.machine(row.machine)) if versions else []
+            states = {version: state_of(key, decided) for key, version in versions.items()}
+            if states and all(state in ("rejected", "refused") for state in states.values()):
+                continue
+            said = ", ".join(f"version {version} is {state}" for version, state in states.items())
+            others.append((row.machine, said or f"measurement {row.id}, {row.name}"))
+        return others
+
+    def identified(self, machine: MachineRecord) -> set[int]:
+        """Return the ids of the machine's measurements that have a result."""
+        table = database.identifications
+        return {row[0] for row in self._rows(_where(sa.select(table.c.measurement_id), table, machine))}
+
+    def newest_entry(self, machine: MachineRecord) -> datetime | None:
+        """Return the time of the machine's last measurement received or decision, None if there is none."""
+        times = {"received_at": database.measurements, "at": database.decisions}
+        queries = [_where(sa.select(sa.func.max(table.c[name])), table, machine) for name, table in times.items()]
+        found = [row[0] for query in queries for row in self._rows(query)]
+        return max((time for time in found if time is not None), default=None)
+
+    def attempts(self, machine: MachineRecord | None = None) -> list[AttemptRecord]:
+        """Return all attempts to process measurements, oldest first."""
+        query = sa.select(database.attempts).order_by(database.attempts.c.id)
+        return [AttemptRecord(*row) for row in self._rows(_where(query, database.attempts, machine))]
+
+    # --- identified errors and tables -------------------------------------------------------------------------------
+
+    def identifications(self, machine: MachineRecord | None = None) -> list[IdentificationRecord]:
+        """Return the identified errors of a machine (or of all) in the order in which they were measured."""
+        table, measured = database.identifications, database.measurements
+        query = _where(_IDENTIFICATIONS, table, machine).order_by(measured.c.measured_at, table.c.id)
+        return [IdentificationRecord(**row._mapping) for row in self._rows(query)]
+
+    def identification(self, identification_id: int) -> IdentificationRecord:
+        """Return the identified errors with this id."""
+        rows = self._rows(_IDENTIFICATIONS.where(database.identifications.c.id == identification_id))
+        if not rows:
+            raise InputError(f"the store has no identification {identification_id}")
+        return IdentificationRecord(**rows[0]._mapping)
+
+    def errors_of(self, identification: IdentificationRecord, *, fitted: bool = False) -> ErrorTable:
+        """Return the identified errors of the bare machine (or the fitted ones), mm and rad."""
+        digest = identification.fitted_sha256 if fitted else identification.errors_sha256
+        if digest is None:
+            raise InputError("this identification keeps no fitted errors")
+        return parse_errors(decoded(self.blob(digest), "identified.errors.csv"), Path("identified.errors.csv"))
+
+    def covariance_of(self, identification: IdentificationRecord) -> Covariance | None:
+        """Return the joint covariance of the identified errors, None if there is none."""
+        if identification.covariance_sha256 is None:
+            return None
+        return parse_covariance(self.blob(identification.covariance_sha256), Path("identified.covariance.npz"))
+
+    @at_one_moment
+    def tables(self, machine: MachineRecord | None = None, *, figures: bool = True) -> list[TableRecord]:
+        """Return the sets of tables of a machine (or of all) by version, with their states.
+
+        Without ``figures`` their summaries stay empty, which saves much where the whole fleet is looked at.
+        """
+        decided: dict[int, list[DecisionRecord]] = {}
+        for decision in self.decisions(machine):
+            decided.setdefault(decision.machine_id, []).append(decision)
+        table = database.tables
+        columns = [column for column in table.c if figures or column.name != "summary"]
+        query = _where(sa.select(*columns), table, machine).order_by(table.c.machine_id, table.c.version)
+        found = []
+        for row in self._rows(query):
+            state = state_of(row.id, decided.get(row.machine_id, []))
+            found.append(TableRecord(**{"summary": {}, **row._mapping}, state=state))
+        return found
+
+    def table_files(self, table: TableRecord) -> list[StoredTableFile]:
+        """Return the files of a set of tables, byte for byte; StoreError if any is missing or damaged."""
+        return self.read(lambda connection: files_of(connection, table.id))
+
+    def file_hashes(self, machine: MachineRecord) -> dict[int, list[tuple[str, str, str]]]:
+        """Return control, name and SHA-256 of the files of every set of tables of a machine, by its id, in a fixed order."""
+        files, tables = database.table_files, database.tables
+        query = sa.select(files.c.table_id, files.c.controller, files.c.name, files.c.sha256)
+        query = query.join(tables, tables.c.id == files.c.table_id).where(tables.c.machine_id == machine.id)
+        found: dict[int, list[tuple[str, str, str]]] = {}
+        for table_id, *file in self._rows(query):
+            found.setdefault(table_id, []).append((file[0], file[1], file[2]))
+        return {table_id: sorted(listed) for table_id, listed in found.items()}
+
+    def decisions(self, machine: MachineRecord | None = None) -> list[DecisionRecord]:
+        """Return all decisions in their order: who, what, when, why."""
+        table = database.decisions
+        query = _where(sa.select(table), table, machine).order_by(table.c.machine_id, table.c.sequence)
+        return [DecisionRecord(*row) for row in self._rows(query)]
+
+    # --- events and contents ----------------------------------------------------------------------------------------
+
+    def add_event(self, kind: str, subject: str, message: str, machine: MachineRecord | None = None) -> bool:
+        """Keep an event unless the last one of this machine, kind and subject says the same; return whether it is new."""
+        table, machine_id, message = database.events, None if machine is None else machine.id, database.plain(message)
+        same = sa.and_(
+            table.c.machine_id.is_not_distinct_from(machine_id), table.c.kind == kind, table.c.subject == subject
+        )
+        query = sa.select(table.c.message).where(same).order_by(table.c.id.desc()).limit(1)
+
+        def insert(connection: sa.Connection) -> bool:
+            if connection.execute(query).scalar() == message:
+                return False
+            row = {"machine_id": machine_id, "kind": kind, "subject": subject, "message": message}
+            connection.execute(sa.insert(table).values(**row, at=self.now(connection)))
+            return True
+
+        return False if self.read(lambda c: c.execute(query).scalar()) == message else self.write(insert)
+
+    def events(self, machine: MachineRecord | None = None) -> list[EventRecord]:
+        """Return the events of a machine (or all), oldest first."""
+        query = sa.select(database.events).order_by(database.events.c.id)
+        return [EventRecord(*row) for row in self._rows(_where(query, database.events, machine))]
+
+    def blob(self, sha256: str) -> bytes:
+        """Return contents by their SHA-256; StoreError if they are damaged."""
+        query = sa.select(database.blobs.c.deflated).where(database.blobs.c.sha256 == sha256)
+        return inflated(sha256, self.read(lambda connection: connection.execute(query).scalar()))
+
+    def _rows(self, query: sa.Select[Any]) -> list[Any]:
+        return self.read(lambda connection: list(connection.execute(query).all()))
+
+
+class _StoreFile:
+    """The file of an SQLite store as it was opened, for finding out whether another one came into its place.
+
+    A copy may also be written over it (``cp``), which leaves its place on the disk. Every file has a number of its own, also
+    a backup; and in a store rows are only added, so those that were in the file must still be there as they were, which an
+    older raw copy does not have. The file is looked into when its time changed.
+    """
+
+    #: Tables whose newest rows are compared.
+    TABLES = ("measurements", "decisions", "events")
+
+    def __init__(self, path: Path, number: int) -> None:
+        self._path, self._number = path, number
+        self._place, self._written = self._look()
+        self._rows: dict[str, Any] = {}
+        self._has_rows()
+
+    def is_same(self) -> bool:
+        """Whether the path leads to the file that was opened, and that still holds the rows that it held."""
+        place, written = self._look()
+        if place != self._place:
+            return False
+        if written == self._written:
+            return True
+        same = self._has_rows()
+        if same:
+            self._written = written
+        return same is not False
+
+    def _look(self) -> tuple[Any, Any]:
+        try:
+            found = os.stat(self._path)
+        except OSError:
+            return None, None
+        return (found.st_dev, found.st_ino), (found.st_mtime_ns, found.st_size)
+
+    def _has_rows(self) -> bool | None:
+        """Whether the rows that are known are in the file itself; None where that cannot be told while it is written.
+
+        The file is read without its write-ahead log, and by SQLite: to open and close it in another way would give the
+        locks of this process away.
+        """
+        if self._written is None:
+            return None
+        newest = {}
+        try:
+            address = f"{self._path.absolute().as_uri()}?mode=ro&immutable=1"
+            with closing(sqlite3.connect(address, uri=True)) as connection:
+                number = connection.execute("PRAGMA user_version").fetchone()[0]
+                if number not in (0, self._number):  # 0: it is in the log still
+                    return False
+                if connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
+                    return not self._rows  # a new store whose tables are in the log still
+                for table in self.TABLES:
+                    known = self._rows.get(table)
+                    query = f"SELECT * FROM {table} WHERE id = ?"
+                    if known is not None:
+                        found = connection.execute(query, known[:1]).fetchone()
+                        if found is None or found[: len(known)] != known:  # a newer program may have added columns
+                            return False
+                    newest[table] = connection.execute(f"SELECT * FROM {table} ORDER BY id DESC LIMIT 1").fetchone()
+        except sqlite3.DatabaseError as error:
+            return False if error.sqlite_errorcode == sqlite3.SQLITE_NOTADB else None
+        self._rows = {table: row for table, row in newest.items() if row is not None}
+        return True
+
+
+def files_of(connection: sa.Connection, table_id: int) -> list[StoredTableFile]:
+    """Return the files of a set of tables, byte for byte; StoreError if any is missing or damaged."""
+    files, blobs = database.table_files, database.blobs
+    query = sa.select(files.c.controller, files.c.name, files.c.sha256, blobs.c.deflated)
+    query = query.join(blobs, blobs.c.sha256 == files.c.sha256, isouter=True).where(files.c.table_id == table_id)
+    rows = connection.execute(query.order_by(files.c.id)).all()
+    return [StoredTableFile(controller, name, inflated(digest, packed)) for controller, name, digest, packed in rows]
+
+
+def inflated(sha256: str, packed: bytes | None) -> bytes:
+    """Return contents as they were kept; StoreError unless they are those of this SHA-256."""
+    try:
+        content = zlib.decompress(packed or b"")
+    except zlib.error:
+        content = b""
+    if sha256_of(content) != sha256:
+        raise StoreError(f"the contents {sha256[:12]}... are missing or damaged in the store; restore a backup")
+    return content
+
+
+def open_store(url: str, *, clock: Clock | None = None) -> Store:
+    """Open a store, make it if it does not exist, upgrade it if it is old.
+
+    Parameters
+    ----------
+    url : ``sqlite:///FILE``, a bare path, or ``postgresql://USER:PASSWORD@HOST/NAME``.
+    clock : for tests: the time, with its zone.
+
+    Raises
+    ------
+    InputError
+        for a URL that is none, or a store of a newer program.
+    StoreError
+        if it cannot be reached after some attempts.
+    """
+    engine = engine_of(url)
+    number = retried(lambda: upgrade(engine), url)
+    return Store(engine, url, clock, number)
+
+
+def _where(query: sa.Select[Any], table: sa.Table, machine: MachineRecord | None) -> sa.Select[Any]:
+    return query if machine is None else query.where(table.c.machine_id == machine.id)
+
+
+def _machine_named(connection: sa.Connection, name: str) -> MachineRecord | None:
+    row = connection.execute(sa.select(database.machines).where(database.machines.c.name == name)).first()
+    return None if row is None else MachineRecord(*row)
+
+
+def _insert_measurement(connection: sa.Connection, machine_id: int, new: NewMeasurement, now: datetime) -> None:
+    values: Mapping[str, Any] = {
+        "machine_id": machine_id,
+        "sha256": new.sha256,
+        "name": new.name,
+        "measured_at": new.measured_at,
+        "measured_at_source": new.measured_at_source,
+        "received_at": now,
+        "active_table": new.active_table,
+        "temperatures_c": {name: dict(figures) for name, figures in new.temperatures_c.items()},
+    }
+    key = connection.execute(sa.insert(database.measurements).values(**values)).inserted_primary_key
+    digests = put_blobs(connection, new.contents.values())
+    rows = [
+        {"measurement_id": key[0] if key else None, "name": name, "sha256": digest}
+        for name, digest in zip(new.contents, digests, strict=True)
+    ]
+    connection.execute(sa.insert(database.measurement_files), rows)
+
+
+@at_one_moment
+def counting(store: Store, machine: MachineRecord) -> list[IdentificationRecord]:
+    """Return for each measurement the identification that speaks for it, in the order in which they were measured.
+
+    It is the one behind the active tables; else the newest whose tables nobody rejected and the round trip accepted; else
+    the newest.
+    """
+    states = {table.identification_id: table.state for table in store.tables(machine, figures=False)}
+    every: dict[int, list[IdentificationRecord]] = {}
+    for item in store.identifications(machine):
+        every.setdefault(item.measurement_id, []).append(item)
+
+    def rank(item: IdentificationRecord) -> tuple[int, int]:
+        state = states.get(item.id)
+        return {"active": 2, "rejected": 0, "refused": 0}.get(state or "", 1), item.revision
+
+    return [max(group, key=rank) for group in every.values()]
+
+
+# Backup and restore: all rows of a store into a new SQLite file and back, whatever the database; also to move a store.
+
+
+#: Rows that are held in memory at once.
+ROWS = 200
+MAGIC = b"SQLite format 3\0"
+#: How a file system says that it knows no links.
+NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
+
+
+def backup(url: str, path: Path) -> dict[str, int]:
+    """Write a copy of the store to a new file as it is at one moment; return the number of rows by table.
+
+    Raises
+    ------
+    InputError
+        if the file exists or cannot be written.
+    StoreError
+        if contents are damaged: a copy of them would be found out when it is needed.
+    """
+    if path.exists():
+        raise InputError("exists already; a backup is never written over another one", file=path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with closing(open_store(url)) as source, closing(open_store(f"sqlite:///{temporary}")) as target:
+            counts = _copy(source, target)
+            retried(lambda: _end_log(target), target.url)
+        _publish(temporary, path)
+        return counts
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror or error}", file=path) from error
+    finally:
+        for left in (temporary, *(temporary.with_name(temporary.name + end) for end in ("-wal", "-shm", "-journal"))):
+            left.unlink(missing_ok=True)
+
+
+def _end_log(store: Store) -> None:
+    """Leave nothing in the write-ahead log."""
+    with store.engine.connect() as connection:
+        connection.exec_driver_sql("COMMIT")
+        connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
+
+
+def _publish(temporary: Path, path: Path) -> None:
+    """Give the file its name; never over another one that came meanwhile, where the file system can promise that."""
+    try:
+        os.link(temporary, path)
+    except OSError as error:
+        if error.errno not in NO_LINKS or path.exists():
+            raise
+        temporary.rename(path)
+
+
+def restore(path: Path, url: str) -> dict[str, int]:
+    """Fill an empty store from a backup, which stays as it is; return the number of rows by table.
+
+    Raises
+    ------
+    InputError
+        if there is no such backup, or the store is not empty.
+    StoreError
+        if contents of the backup are damaged.
+    """
+    if not path.is_file():
+        raise InputError("no such backup", file=path)
+    with working_folder("restore-") as folder:
+        # a backup of an older program is upgraded, and may be on a read-only medium
+        copy = folder / "copy.sqlite"
+        try:
+            with path.open("rb") as stream:
+                if stream.read(len(MAGIC)) != MAGIC:
+                    raise InputError("is not a backup (written by `volcomp recal backup`)", file=path)
+            shutil.copyfile(path, copy)
+        except OSError as error:
+            raise InputError(f"cannot be copied: {error.strerror or error}", file=path) from error
+        with closing(open_store(url)) as target, closing(open_store(f"sqlite:///{copy}")) as source:
+            if target.machines():
+                raise InputError(f"the store {shown(url)} is not empty; restore into a new one")
+            return _copy(source, target)
+
+
+def _copy(source: Store, target: Store) -> dict[str, int]:
+    """Copy all rows as they were at one moment, in one transaction."""
+    try:
+        reading = source.engine.connect().execution_options(reading=True)
+        if source.engine.dialect.name == "postgresql":
+            reading = reading.execution_options(isolation_level="REPEATABLE READ")
+        with reading, target.engine.begin() as writing:
+            return {table.name: _copy_table(reading, writing, table) for table in database.ALL}
+    except sa.exc.DBAPIError as error:
+        place = f"{shown(source.url)} to {shown(target.url)}"
+        raise StoreError(f"nothing was copied from {place}: {first_line(error)}") from error
+
+
+def _copy_table(reading: sa.Connection, writing: sa.Connection, table: sa.Table) -> int:
+    count = 0
+    keys = [table.c.id] if "id" in table.c else list(table.primary_key)
+    rows = reading.execution_options(yield_per=ROWS).execute(sa.select(table).order_by(*keys))
+    for part in rows.partitions(ROWS):
+        if table is database.blobs:
+            for row in part:
+                inflated(row.sha256, row.deflated)
+        writing.execute(sa.insert(table), [dict(row._mapping) for row in part])
+        count += len(part)
+    if writing.dialect.name == "postgresql" and "id" in table.c and count:
+        sequence = sa.func.pg_get_serial_sequence(table.name, "id")
+        writing.execute(sa.select(sa.func.setval(sequence, sa.select(sa.func.max(table.c.id)).scalar_subquery())))
+    return count

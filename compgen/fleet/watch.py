@@ -1,0 +1,158 @@
+"""The long-running form: each machine by its schedule, until it is told to stop; edits of the job file are picked up."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from apscheduler.executors.pool import ThreadPoolExecutor
+from apscheduler.jobstores.base import JobLookupError
+from apscheduler.schedulers.background import BackgroundScheduler
+from apscheduler.triggers.combining import OrTrigger
+from apscheduler.triggers.cron import CronTrigger
+from apscheduler.triggers.interval import IntervalTrigger
+
+from compgen.data.files import read_bytes
+from compgen.errors import CompgenError
+from compgen.fleet import logs
+from compgen.fleet.job import DAYS, Cron, Every, Job, MachineJob, Schedule, job_of_text
+from compgen.fleet.runner import MachineOutcome, run_machine
+
+#: How often the job file is looked at, s.
+POLL_S = 2.0
+#: A machine without a schedule is looked at this often.
+UNSCHEDULED = Every(5)
+#: After a trouble that may pass by itself a machine is looked at again after so long, then twice as long, at most, s.
+AGAIN_S, AGAIN_AT_MOST_S = 10.0, 900.0
+
+Work = Callable[[MachineJob, str, Callable[[], bool]], MachineOutcome]
+
+
+def trigger_of(schedule: Schedule) -> Any:
+    """Return the trigger that means the schedule, in local time."""
+    if isinstance(schedule, Every):
+        return IntervalTrigger(minutes=schedule.minutes)
+    days = {"day": _listed(schedule.days)}
+    weekdays = {"day_of_week": ",".join(DAYS[day] for day in schedule.weekdays)}
+    clock = {"minute": _listed(schedule.minutes), "hour": _listed(schedule.hours), "month": _listed(schedule.months)}
+    if isinstance(schedule, Cron) and not (schedule.any_day or schedule.any_weekday):
+        return OrTrigger([CronTrigger(**clock, **days), CronTrigger(**clock, **weekdays)])
+    return CronTrigger(**clock, **days, **weekdays)
+
+
+def _listed(numbers: tuple[int, ...]) -> str:
+    return ",".join(map(str, numbers))
+
+
+class Watch:
+    """Keeps a job running; ``on_outcome`` is told of every pass over a machine, ``threads`` passes run at once.
+
+    ``notify`` is a command in place of those of the job file.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        work: Work = run_machine,
+        threads: int = 1,
+        on_outcome: Callable[[MachineOutcome], None] = lambda _: None,
+        poll_s: float = POLL_S,
+        notify: tuple[str, ...] = (),
+    ) -> None:
+        self.path, self.work, self.on_outcome, self.poll_s = path, work, on_outcome, poll_s
+        self.notify = notify
+        self.stopped = threading.Event()
+        self.job: Job | None = None
+        self._content = b""
+        self._troubles: dict[str, int] = {}
+        self._scheduler = BackgroundScheduler(
+            executors={"default": ThreadPoolExecutor(threads)},
+            job_defaults={"coalesce": True, "max_instances": 1, "misfire_grace_time": None},
+        )
+
+    def stop(self, *_: object) -> None:
+        """Ask to stop; the measurement that is being processed is finished first."""
+        self.stopped.set()
+
+    def run(self, *, signals: bool = True) -> None:
+        """Run until :meth:`stop`, SIGTERM or SIGINT; InputError if the job file is wrong at the beginning."""
+        self._load()
+        if signals:
+            for number in (signal.SIGTERM, signal.SIGINT):
+                signal.signal(number, self.stop)
+        self._scheduler.start()
+        logs.info("watching", job=str(self.path), machines=len(self.job.machines) if self.job else 0)
+        try:
+            while not self.stopped.wait(self.poll_s):
+                self._reload()
+        finally:
+            self.stopped.set()
+            self._scheduler.shutdown(wait=True)
+            logs.info("stopped", job=str(self.path))
+
+    def _load(self) -> None:
+        content = read_bytes(self.path)
+        job = job_of_text(content.decode("utf-8-sig", "replace"), self.path).with_notify(self.notify)
+        self._schedule(job)
+        self.job, self._content = job, content
+
+    def _reload(self) -> None:
+        """Take an edited job file; one that is wrong is reported once, and what was known before stays."""
+        try:
+            content = read_bytes(self.path)
+            if content == self._content:
+                return
+            self._content = content
+            self._load()
+            logs.info("job file read anew", job=str(self.path))
+        except CompgenError as error:
+            if self._content != b"":
+                logs.error("job file not taken", job=str(self.path), problem=str(error))
+            if not self.path.is_file():
+                self._content = b""
+
+    def _schedule(self, job: Job) -> None:
+        """Add, replace and remove what changed against the job before; new and changed machines run at once."""
+        before = {} if self.job is None else self.job.machines
+        same_store = self.job is not None and self.job.store == job.store
+        for name in before.keys() - job.machines.keys():
+            self._scheduler.remove_job(name)
+        for name, machine in job.machines.items():
+            if same_store and before.get(name) == machine:
+                continue
+            self._scheduler.add_job(
+                self._pass,
+                trigger_of(machine.schedule or UNSCHEDULED),
+                args=(machine, job.store),
+                id=name,
+                name=name,
+                replace_existing=True,
+                next_run_time=datetime.now().astimezone(),
+            )
+
+    def _pass(self, machine: MachineJob, url: str) -> None:
+        if self.stopped.is_set():
+            return
+        outcome = self.work(machine, url, self.stopped.is_set)
+        if outcome.again:
+            self._look_again(machine.name)
+        else:
+            self._troubles.pop(machine.name, None)
+        self.on_outcome(outcome)
+
+    def _look_again(self, name: str) -> None:
+        """Do not wait for the schedule, which may be a week, where something may pass by itself."""
+        count = self._troubles[name] = self._troubles.get(name, 0) + 1
+        wait_s = min(AGAIN_S * 2.0 ** min(count - 1, 60), AGAIN_AT_MOST_S)
+        when = datetime.now().astimezone() + timedelta(seconds=wait_s)
+        with suppress(JobLookupError):  # the machine was taken out of the job file meanwhile
+            planned = self._scheduler.get_job(name)
+            if planned is not None and planned.next_run_time is not None and when < planned.next_run_time:
+                self._scheduler.modify_job(name, next_run_time=when)
+                logs.info("looked at again soon", machine=name, at=when.isoformat(timespec="seconds"))

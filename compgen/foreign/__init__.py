@@ -1,0 +1,17 @@
+"""Files of instruments and other programs, as objects of the project."""
+
+from compgen.foreign.detect import form_of, import_file, native_format
+from compgen.foreign.findings import Imported, ImportOptions
+from compgen.foreign.opening import describe_native, given_errors, open_errors, open_measurement
+
+__all__ = [
+    "ImportOptions",
+    "Imported",
+    "describe_native",
+    "form_of",
+    "given_errors",
+    "import_file",
+    "open_errors",
+    "open_measurement",
+    "native_format",
+]

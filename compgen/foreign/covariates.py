@@ -1,0 +1,705 @@
+"""The other columns of a foreign table: temperatures, times, tool, feed, load and labels, in the project's units.
+
+:func:`row_data_of` takes one column after the other. A column that cannot be read is left out with the reason, unless the
+user named it; a column of numbers that nobody understands is a doubt, which the user has to settle.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.errors import InputError
+from compgen.foreign.column_names import (
+    CELSIUS,
+    CHANNEL,
+    KG_PER_MASS,
+    MM_MIN_PER_FEED,
+    MM_PER_LENGTH,
+    S_PER_TIME,
+    NamedColumn,
+    Quantity,
+    covariate_unit,
+    is_index,
+    quantity_of,
+    split_name,
+    units_of,
+    way,
+)
+from compgen.foreign.findings import Kind, TableFindings
+from compgen.foreign.source import (
+    Order,
+    Written,
+    header_date,
+    iso,
+    moment,
+    order_of,
+    parse_number,
+    read_date,
+    serial_date,
+    shown,
+)
+
+# Columns beside the readings of a foreign table as numbers in the units of the contract.
+
+
+#: Temperatures of a workshop and its machines, degC; a column without a unit is taken in the one that puts it here.
+USUAL_C = (5.0, 45.0)
+#: Beyond these a unit is wrong, or a sensor was not connected.
+POSSIBLE_C = (-30.0, 120.0)
+_CHANNEL_WORDS = {
+    "ambient": ["ambient", "air", "luft", "room", "raum", "umgebung", "hall", "halle", "environment", "ambiente", "aria",
+                "delair", "dellaria", "delaire", "\u73af\u5883", "\u7a7a\u6c14"],
+    "spindle": ["spindle", "spindel", "spdl", "mandrin", "mandrino", "husillo", "broche"],
+    "material": ["material", "mat", "workpiece", "werkstuck", "part", "teil"],
+}  # fmt: skip
+_FILLERS = re.compile(
+    r"temperatur(?:en|es|e|a)?|temp|sensor|fuhler|scale|massstab|axis|achse|channel|kanal|celsius|\u6e29\u5ea6"
+)
+
+
+def is_temperature(column: NamedColumn) -> bool:
+    """Whether a column holds a temperature, by its unit or its name."""
+    return (column.unit in CELSIUS) or (column.unit is None and quantity_of(column.word) == "temperature")
+
+
+def channel_of(word: str) -> str:
+    """Return the name of a channel by the word of its column.
+
+    >>> channel_of("temperaturxachse"), channel_of("airtemp"), channel_of("mattemp1"), channel_of("t3"), channel_of("temp")
+    ('x', 'ambient', 'material_1', '3', 'measured')
+    """
+    rest = _FILLERS.sub("", word)
+    for part in (rest, rest.removeprefix("t")):
+        stem, number = re.fullmatch(r"(.*?)(\d*)", part).groups()  # type: ignore[union-attr]
+        if stem in ("x", "y", "z") and not number:
+            return str(stem)
+        name = next((name for name, words in _CHANNEL_WORDS.items() if stem in words), None)
+        if name:
+            return f"{name}_{number}" if number else name
+    rest = rest[1:] if re.fullmatch(r"t\d*", rest) else rest
+    return rest[:30] or "measured"
+
+
+def _numbers(findings: TableFindings, column: NamedColumn) -> FloatArray:
+    """Return the numbers of a column; InputError with the line for one that has other cells."""
+    return np.array(findings.table.numbers(column.name))
+
+
+def _given_unit(findings: TableFindings, key: str, quantity: Quantity) -> str | None:
+    given = findings.options.units.get(key)
+    if given is None:
+        return None
+    unit = covariate_unit(given, quantity)
+    if unit is None:
+        raise InputError(
+            f"{given!r} is not a unit of {quantity}; use {', '.join(units_of(quantity))}", field=f"--unit {key}"
+        )
+    return unit
+
+
+def celsius_of(findings: TableFindings, key: str, channel: str, column: NamedColumn) -> FloatArray:
+    """Temperatures in degC: by the user's word, the unit in the name, else by the only unit in which they are usual."""
+    raw = _numbers(findings, column)
+    name = channel.removesuffix("_c")
+    unit = _given_unit(findings, name, "temperature") or _given_unit(findings, key, "temperature")
+    declared = unit or column.unit
+    if declared is not None and declared not in CELSIUS:
+        raise InputError(f"{declared} is not a unit of temperature")
+    if declared is None:
+        fitting = [
+            u
+            for u, (f, o) in CELSIUS.items()
+            if USUAL_C[0] <= (f * raw + o).min() and (f * raw + o).max() <= USUAL_C[1]
+        ]
+        if len(fitting) != 1:
+            raise InputError(f"the file gives no unit; say --map {name}={column.name} --unit {name}=degC (or K, degF)")
+        declared = fitting[0]
+        findings.notes.append(
+            f"{shown(column.name)} is taken as {declared}, in which {raw.min():g} to {raw.max():g} is usual"
+        )
+    factor, offset = CELSIUS[declared]
+    values = factor * raw + offset
+    if unit is None and (values.min() < POSSIBLE_C[0] or values.max() > POSSIBLE_C[1]):
+        low_high = f"{values.min():.4g} to {values.max():.4g} degC"
+        raise InputError(f"in {declared} it would go from {low_high}: another unit (--unit {name}=...), or no sensor")
+    return values
+
+
+def amount_of(findings: TableFindings, key: str, quantity: Quantity, scales: Mapping[str, float]) -> FloatArray:
+    """Feed or load in the unit of the contract; the unit must stand in the file or be given."""
+    column = findings.fields[key]
+    unit = _given_unit(findings, key, quantity) or (column.unit if column.unit in scales else None)
+    if unit is None:
+        raise InputError(f"its unit is not given; --unit {key}= one of {', '.join(scales)}")
+    return _numbers(findings, column) * scales[unit]
+
+
+def uncertainty_of(findings: TableFindings) -> FloatArray:
+    """Standard uncertainties of lengths, um."""
+    column = findings.fields["u_value"]
+    unit = findings.given_unit("u_value") or column.unit
+    if unit not in MM_PER_LENGTH:
+        raise InputError("its unit is not given; --unit u_value=um")
+    values = _numbers(findings, column) * MM_PER_LENGTH[unit] * 1e3
+    if values.min() <= 0:
+        raise InputError(f"{values.min():g} um is not a standard uncertainty")
+    return values
+
+
+def labels_of(findings: TableFindings, column: NamedColumn) -> NDArray[np.int64]:
+    """Whole numbers as they are; words are numbered as they come."""
+    cells = findings.table.column(column.name)
+    numbers = [parse_number(cell) for cell in cells]
+    if all(value is not None and value == int(value) and abs(value) < 2**53 for value in numbers):
+        return np.array([int(value) for value in numbers if value is not None], dtype=np.int64)
+    names = {cell: k for k, cell in enumerate(dict.fromkeys(cells), start=1)}
+    return np.array([names[cell] for cell in cells], dtype=np.int64)
+
+
+def tool_of(findings: TableFindings, key: str) -> FloatArray:
+    """One component of the tool offset, mm; without a unit of its own in that of the positions."""
+    column = findings.fields[key]
+    unit = findings.given_unit(key) or column.unit or str(findings.understood.get("position_unit", "mm"))
+    if unit not in MM_PER_LENGTH:
+        raise InputError(f"{unit} is not a unit of length")
+    return _numbers(findings, column) * MM_PER_LENGTH[unit]
+
+
+def directions_of(findings: TableFindings, column: NamedColumn) -> FloatArray:
+    """Directions of travel, +1, -1, or 0 where the cell is empty or zero."""
+    ways = []
+    for cell, line in zip(findings.table.column(column.name), findings.table.lines, strict=True):
+        one = 0 if cell in ("", "0", "0.0") else way(cell)
+        if one is None:
+            raise findings.table.grid.fail(f"{shown(cell)} is not a direction; expected +1 or -1", line, column.name)
+        ways.append(float(one))
+    return np.array(ways)
+
+
+# The column of times of a foreign table as seconds since its first reading.
+
+
+_DAY_S = 86400.0
+#: Keys of a header under which the day of the measurement stands, the clock, and both.
+_DATE_KEYS = (
+    "measured_at", "measured at", "measurement date", "messdatum", "date/time", "date time", "datum/zeit",
+    "datum/uhrzeit", "date", "datum", "test date", "date of measurement", "start time", "created",
+)  # fmt: skip
+_CLOCK_KEYS = ("time", "zeit", "uhrzeit", "messzeit")
+
+
+def times_of(
+    findings: TableFindings, time: NamedColumn | None, date: NamedColumn | None
+) -> tuple[FloatArray | None, str | None]:
+    """Return seconds since the earliest reading (rows,), None if only a day is known, and that reading's date in ISO form.
+
+    Raises
+    ------
+    InputError
+        for numbers without a unit, text that is no date, times of the day that cross midnight without a date.
+    """
+    column = time or date
+    if column is None:
+        raise InputError("no column of times")
+    cells = findings.table.column(column.name)
+    if time is not None and date is not None:
+        cells = [
+            f"{day.removesuffix('T00:00:00')} {clock}"
+            for day, clock in zip(findings.table.column(date.name), cells, strict=True)
+        ]
+    numbers = [parse_number(cell) for cell in cells]
+    if all(value is not None for value in numbers):
+        return _of_numbers(findings, column, np.array(numbers, dtype=np.float64), dated=time is None)
+    written = [read_date(cell) for cell in cells]
+    wrong = next((k for k, item in enumerate(written) if item is None), None)
+    if wrong is not None:
+        line = findings.table.lines[wrong]
+        raise InputError(f"{shown(cells[wrong])} is not a date or time (line {line})")
+    return _of_dates(findings, [item for item in written if item is not None])
+
+
+def _of_numbers(
+    findings: TableFindings, column: NamedColumn, values: FloatArray, *, dated: bool
+) -> tuple[FloatArray | None, str | None]:
+    """Seconds, minutes, ... by the unit; without one days of a spreadsheet, where all of them are of this century."""
+    given = findings.options.units.get("time")
+    unit = covariate_unit(given, "time") if given else column.unit
+    if given and unit is None:
+        raise InputError(f"{given!r} is not a unit of time; use {', '.join(S_PER_TIME)}", field="--unit time")
+    if unit in S_PER_TIME:
+        return values * S_PER_TIME[unit], None
+    serial = [serial_date(float(value)) for value in values]
+    if all(item is not None for item in serial):
+        findings.notes.append(
+            f"the numbers in {shown(column.name)} are taken as days of a spreadsheet (1 is 1900-01-01)"
+        )
+        return _of_dates(findings, [item for item in serial if item is not None])
+    raise InputError(
+        "it holds numbers without a unit; " + ("it is not a date" if dated else "say --unit time=s (ms, min, h)")
+    )
+
+
+def _of_dates(findings: TableFindings, dates: Sequence[Written]) -> tuple[FloatArray | None, str | None]:
+    with_day = [bool(date.days) for date in dates]
+    if any(with_day) != all(with_day) or len({bool(date.zone) for date in dates}) > 1:
+        raise InputError("some cells have a date or a zone and some have none")
+    if not all(with_day):
+        clock = np.array([date.clock_s for date in dates], dtype=np.float64)
+        if np.any(np.diff(clock) < 0):
+            raise InputError(
+                "the times of the day do not ascend and have no date: the order of the readings is not known"
+            )
+        return clock - clock[0], None
+    order = order_of(dates, findings.options.dates)
+    if order is None:
+        return _in_any_order(findings, dates)
+    at = [_seconds(date, order) for date in dates]
+    first = int(np.argmin(at))
+    clocked = all(date.clock_s is not None for date in dates)
+    return (np.array(at) - at[first] if clocked else None), iso(dates[first], order)
+
+
+def _in_any_order(findings: TableFindings, dates: Sequence[Written]) -> tuple[FloatArray | None, str | None]:
+    """Dates whose order stays open: times within one day do not depend on it, others are asked for."""
+    days = sorted({tuple(sorted(day.date().isoformat() for day in date.days.values())) for date in dates})
+    shown_days = " or ".join(dict.fromkeys(days[0]))
+    if len(days) > 1:
+        findings.doubts.append(f"{shown(dates[0].text)} may be {shown_days}; say --dates dmy, mdy or ymd")
+        return None, None
+    findings.notes.append(
+        f"the date {shown(dates[0].text)} may be {shown_days}: it is left out; say --dates dmy, mdy or ymd to keep it"
+    )
+    if any(date.clock_s is None for date in dates):
+        return None, None
+    clock = np.array([date.clock_s for date in dates], dtype=np.float64)
+    return clock - clock.min(), None
+
+
+def _seconds(date: Written, order: Order) -> float:
+    at = moment(date, order)
+    ahead = 0.0
+    if date.zone and date.zone != "Z":
+        sign = -1.0 if date.zone[0] == "-" else 1.0
+        ahead = sign * (3600.0 * int(date.zone[1:3]) + 60.0 * int(date.zone[-2:]))
+    return (
+        float(at.toordinal()) * _DAY_S
+        + (at - at.replace(hour=0, minute=0, second=0, microsecond=0)).total_seconds()
+        - ahead
+    )
+
+
+def date_in_header(findings: TableFindings) -> str | None:
+    """Return the date of the measurement in ISO form by what stands above the table, None if it is not clear."""
+    metadata = findings.table.metadata
+    text = next((metadata[key] for key in _DATE_KEYS if metadata.get(key)), "")
+    clock = next((metadata[key] for key in _CLOCK_KEYS if metadata.get(key)), "")
+    both = f"{text} {clock}" if text and clock and (found := read_date(text)) and found.clock_s is None else text
+    found_iso, against = header_date(both, findings.options.dates)
+    if against:
+        findings.notes.append(against)
+    return found_iso
+
+
+# What a laser file says about air, material and time: sections ENVIRONMENT and EQUIPMENT, and the date of USER-TEXT.
+#
+# There is no public specification. Programs that read such files take two numbers for each key, at the beginning and at the
+# end of the test, and after some of them a third one whose meaning is not known (of the unit, it seems); older descriptions
+# have one. So everything is shown, and only temperatures that can be nothing but degC, and dates that can be read in one
+# way, are used.
+
+
+#: Channels by key; the air and up to three sensors on the machine or the workpiece.
+_HEADER_CHANNELS = {
+    "air temp": "temp_ambient_c",
+    "mat temp 1": "temp_material_1_c",
+    "mat temp 2": "temp_material_2_c",
+    "mat temp 3": "temp_material_3_c",
+}
+#: Beginning and end may differ so much that their mean still stands for the whole test, K.
+STEADY_K = 1.0
+_QUOTED = re.compile(r"\"([^\"]{4,60})\"")
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Temperatures of the whole test by contract name (degC), its date in ISO form if it is clear, and remarks."""
+
+    temperatures_c: Mapping[str, float]
+    measured_at: str | None
+    notes: tuple[str, ...]
+
+
+def surroundings_of(environment: Mapping[str, str], user_date: str, chosen: Order | None) -> Surroundings:
+    """Return what can be used of the section ENVIRONMENT and of the date in the user text.
+
+    Parameters
+    ----------
+    environment : values by lower-case key.
+    user_date : the date in USER-TEXT, empty if there is none.
+    chosen : order of day, month and year that the user gave.
+    """
+    temperatures: dict[str, float] = {}
+    notes: list[str] = []
+    unused = []
+    for key, channel in _HEADER_CHANNELS.items():
+        text = environment.get(key, "")
+        value = _steady_temperature(text)
+        if value is not None:
+            temperatures[channel] = value
+        elif text:
+            unused.append(f"{key} {shown(text)}")
+    if unused:
+        notes.append(f"not used (no temperature in degC, no sensor, or not steady): {', '.join(unused)}")
+    at, against = _date(environment.get("date time", ""), user_date, chosen)
+    if against:
+        notes.append(against)
+    if environment.get("exp coeff"):
+        notes.append(
+            f"its software has the expansion coefficient {shown(environment['exp coeff'])}: if it compensated the material, "
+            "the readings hold at 20 degC already; nothing is corrected here"
+        )
+    return Surroundings(temperatures, at, tuple(notes))
+
+
+def _steady_temperature(text: str) -> float | None:
+    """Return the mean of beginning and end if both are usual in degC and close together (a third number is a code)."""
+    words = text.split()
+    numbers = [parse_number(word) for word in words]
+    known = [value for value in numbers if value is not None]
+    if not 1 <= len(words) <= 3 or len(known) != len(words):
+        return None
+    if len(known) == 3 and known[2] != 0.0:
+        return None
+    ends = known[:2]
+    usual = all(USUAL_C[0] <= value <= USUAL_C[1] for value in ends)
+    return sum(ends) / len(ends) if usual and max(ends) - min(ends) <= STEADY_K else None
+
+
+def _date(stamps: str, user_date: str, chosen: Order | None) -> tuple[str | None, str | None]:
+    """Return the beginning of the test; the date of the user text counts where it is clear, else the stamp of the software."""
+    at, against = header_date(user_date, chosen)
+    first = next(iter(_QUOTED.findall(stamps)), stamps)
+    stamped, _ = header_date(first, chosen)
+    dated = read_date(user_date)
+    if stamped and (at is None or (dated is not None and dated.clock_s is None and stamped[:10] == at[:10])):
+        return stamped, None
+    if stamped and at and stamped[:10] != at[:10]:
+        return at, f"the user's date is {at}, the software's stamp {stamped}: the user's is taken"
+    return at, against
+
+
+# What stands in a foreign table beside positions and readings: temperatures, times, tool, feed, load, labels.
+#
+# A column that has a place in the contract file is taken along; every other one is named as not used, with the reason.
+
+
+#: Why a column is not used that the user left out.
+LEFT_OUT = "left out by --ignore"
+#: Parts of names of columns that hold no reading, in the languages of FIELDS; such columns may be left out.
+_HARMLESS = (
+    "deadpath", "totstrecke", "totweg", "pressure", "druck", "pression", "presion", "humid", "feuchte", "umidita", "humedad",
+    "wavelength", "wellenlange", "refractive", "brechung", "intensity", "intensitat", "signal", "quality", "strength", "beam",
+    "snr", "power", "leistung", "torque", "expansion", "ausdehnung", "voltage", "spannung",
+    "status", "flag", "uncertainty", "unsicherheit", "remark", "comment", "bemerkung", "kommentar", "note", "nota",
+    "remarque", "osservazioni", "operator", "bediener", "serial", "dwell",
+)  # fmt: skip
+#: Fields of readings: one that is left over may be what was meant.
+_READINGS = ("actual", "deviation", "correction", "value", "length", "x", "y", "z", "dx", "dy", "dz", "xa", "ya", "za")
+#: Units in brackets that are neither a length nor an angle.
+_OTHER_UNIT = re.compile(r"(?i)[\[(]\s*(%|%\s?rh|rh|[hkm]?pa|m?bar|mmhg|ppm|m?v|m?a|k?w|k?n|hz|rpm|1/min|db)\s*[\])]")
+
+#: What stands above a table and is kept, by the words of its key.
+_FACTS = {
+    "operator": ("operator", "bediener", "prufer", "pruefer", "messtechniker", "gemessenvon", "measuredby", "inspector",
+                 "technician", "operateur", "operatore", "operador", "bearbeiter", "\u64cd\u4f5c\u5458", "\u6d4b\u91cf\u5458",
+                 "\u68c0\u6d4b\u5458"),
+    "instrument": ("instrument", "messgerat", "messmittel", "messsystem", "gerat", "device", "laser", "laserinterferometer",
+                   "interferometer", "equipment", "appareil", "strumento", "instrumento", "equipo", "\u4eea\u5668"),
+    "serial_number": ("serialnumber", "serialno", "seriennummer", "seriennr", "laserseriennummer", "serial", "sn",
+                      "laserserialno",
+                      "instrumentserialnumber", "gerateseriennummer",
+                      "numerodeserie", "nodeserie", "matricola",
+                      "numerodiserie", "\u5e8f\u5217\u53f7", "\u4eea\u5668\u7f16\u53f7"),
+}  # fmt: skip
+_EXPANSION = ("expansion", "expansioncoefficient", "expcoeff", "coefficientofthermalexpansion", "cte", "materialexpansion",
+              "ausdehnung", "ausdehnungskoeffizient", "wak", "langenausdehnungskoeffizient", "dilatation",
+              "coefficientdedilatation", "coefficientededilatazione", "dilatazione", "coeficientededilatacion",
+              "\u81a8\u80c0\u7cfb\u6570", "\u7ebf\u81a8\u80c0\u7cfb\u6570")  # fmt: skip
+#: An expansion below this is one per kelvin, not one in a million; um/(m K) of any material of machines.
+_FRACTION, _LARGEST_EXPANSION = 1e-3, 100.0
+_NUMBER = r"[+\-]?\d+(?:[.,]\d+)?(?:[eE][+\-]?\d+)?"
+
+_LABELS = ("run", "repeat", "line", "block", "setup", "pose")
+_MAIN: Mapping[str, tuple[str, ...]] = {
+    "axis": ("position", "direction", "run", "axis"),
+    "lengths": ("x", "y", "z", "length", "station", "point"),
+    "deviations": ("x", "y", "z", "dx", "dy", "dz", "xa", "ya", "za"),
+    "errors": ("error", "position", "value", "u_value"),
+}
+_SPACE = (
+    "time",
+    "date",
+    "feed",
+    "load",
+    "direction",
+    *_LABELS,
+    *(f"{key}_{axis}" for key in ("tool", "approach") for axis in "xyz"),
+)
+_PLACES: Mapping[Kind, tuple[str, ...]] = {
+    "axis": ("time", "date"),
+    "lengths": (*_SPACE, "u_value"),
+    "deviations": _SPACE,
+}
+
+
+@dataclass
+class RowData:
+    """Beside n rows: numbers by contract name, labels, tool and directions of approach (n, 3), and the time of the first."""
+
+    covariates: dict[str, FloatArray] = field(default_factory=dict)
+    labels: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    tool_mm: FloatArray | None = None
+    approach: FloatArray | None = None
+    measured_at: str | None = None
+
+
+def row_data_of(findings: TableFindings, kind: Kind, *, once: bool = True) -> RowData:
+    """Return what a table holds beside its readings, and say in ``findings`` what was taken and what was not.
+
+    Parameters
+    ----------
+    once : each row is one reading; False where the runs have columns of their own, and nothing else has a place.
+    """
+    reader = _Reader(
+        findings, kind, {findings.fields[key].name for key in _MAIN[kind] if key in findings.fields} | findings.used
+    )
+    if once:
+        for take in (reader.times, reader.temperatures, reader.amounts, reader.labels, reader.vectors):
+            take()
+    reader.report(once=once)
+    return reader.found
+
+
+@dataclass
+class _Reader:
+    """Takes one column after the other out of what is left of a table."""
+
+    findings: TableFindings
+    kind: Kind
+    used: set[str]
+    found: RowData = field(default_factory=RowData)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+    def _given(self, key: str) -> bool:
+        return key in self.findings.options.columns
+
+    def _try(self, key: str, column: NamedColumn, take: Callable[[], Any]) -> Any:
+        """Return what ``take`` makes of a column; a column that the user did not name is left out if it cannot be read."""
+        try:
+            taken = take()
+        except InputError as error:
+            if self._given(key):
+                raise
+            self.reasons[column.name] = f"line {error.line} {error.message}" if error.line else error.message
+            return None
+        self.used.add(column.name)
+        return taken
+
+    def _column(self, key: str) -> NamedColumn | None:
+        return self.findings.fields.get(key) if key in _PLACES.get(self.kind, ()) else None
+
+    def times(self) -> None:
+        """Take time stamps: seconds since the first one, and when that was."""
+        time, date = self._column("time"), self._column("date")
+        first = time or date
+        if first is None:
+            return
+        taken = self._try("time" if time else "date", first, lambda: times_of(self.findings, time, date))
+        if taken is None:
+            return
+        seconds, self.found.measured_at = taken
+        self.used |= {column.name for column in (time, date) if column}
+        if seconds is not None:
+            self.found.covariates["time_s"] = seconds
+            self.findings.understood["time_s"] = [float(seconds.min()), float(seconds.max())]
+
+    def temperatures(self) -> None:
+        """Take every channel of temperature, in degC."""
+        given = {
+            key: column
+            for key, column in self.findings.fields.items()
+            if key == "temperature" or CHANNEL.fullmatch(key)
+        }
+        for key, column in given.items():
+            self._temperature(key, "temp_measured_c" if key == "temperature" else f"{key.removesuffix('_c')}_c", column)
+        for name in self.findings.table.header:
+            column = split_name(name)
+            if name not in self.used and name not in self.reasons and is_temperature(column):
+                self._temperature("temperature", f"temp_{channel_of(column.word)}_c", column)
+
+    def _temperature(self, key: str, channel: str, column: NamedColumn) -> None:
+        if self.kind not in _PLACES:
+            return
+        if channel in self.found.covariates:
+            self.reasons[column.name] = f"{channel} is already in another column"
+            return
+        values = self._try(key, column, lambda: celsius_of(self.findings, key, channel, column))
+        if values is not None:
+            self.found.covariates[channel] = values
+            if self.kind != "axis" and channel in ("temp_x_c", "temp_y_c", "temp_z_c"):
+                text = f"{channel} counts as temperature of the scale of {channel[5].upper()}: identify brings the readings to"
+                self.findings.notes.append(f"{text} 20 degC where the machine file has expansion_um_per_m_k")
+            low_high = [float(values.min()), float(values.max())]
+            self.findings.understood.setdefault("temperatures_c", {})[channel] = low_high
+
+    def amounts(self) -> None:
+        """Take feed, load and the standard uncertainty of a length."""
+        amounts: tuple[tuple[str, Quantity, str, Mapping[str, float]], ...] = (
+            ("feed", "feed", "feed_mm_min", MM_MIN_PER_FEED),
+            ("load", "load", "load_kg", KG_PER_MASS),
+        )
+        for key, quantity, name, scales in amounts:
+            column = self._column(key)
+            if column is not None:
+                values = self._try(key, column, partial(amount_of, self.findings, key, quantity, scales))
+                if values is not None:
+                    self.found.covariates[name] = values
+        column = self._column("u_value")
+        if column is not None:
+            values = self._try("u_value", column, lambda: uncertainty_of(self.findings))
+            if values is not None:
+                self.found.covariates["u_length_um"] = values
+
+    def labels(self) -> None:
+        """Take run, repeat, line, block, set-up and pose as whole numbers; words are numbered as they come."""
+        for key in _LABELS:
+            column = self._column(key)
+            if column is not None:
+                labels = self._try(key, column, partial(labels_of, self.findings, column))
+                if labels is not None:
+                    self.found.labels[key] = labels
+
+    def vectors(self) -> None:
+        """Take the tool offset and the directions of approach."""
+        if self.kind == "axis":
+            return
+        tool = [column for axis in "xyz" if (column := self._column(f"tool_{axis}")) is not None]
+        if len(tool) == 3:
+            read = partial(tool_of, self.findings)
+            parts = [self._try(f"tool_{a}", c, partial(read, f"tool_{a}")) for a, c in zip("xyz", tool, strict=True)]
+            if all(part is not None for part in parts):
+                self.found.tool_mm = np.column_stack(parts)
+        else:
+            lacking = "a tool offset has three columns, x, y and z; --map tool_x=... names them"
+            self.reasons |= {column.name: lacking for column in tool}
+        rows = len(self.findings.table.rows)
+        ways = {a: self._ways(f"approach_{a}") for a in "xyz"}
+        if any(part is not None for part in ways.values()):
+            self.found.approach = np.column_stack([np.zeros(rows) if part is None else part for part in ways.values()])
+        last = self._ways("direction")
+        if last is not None:
+            self.found.covariates["approach"] = last
+
+    def _ways(self, key: str) -> FloatArray | None:
+        column = self._column(key)
+        if column is None:
+            return None
+        taken: FloatArray | None = self._try(key, column, lambda: directions_of(self.findings, column))
+        return taken
+
+    def report(self, *, once: bool) -> None:
+        """Name the columns that were not used."""
+        why = "the native format has no column for it" if once else "there is one value for several runs"
+        unused = {}
+        for name in self.findings.table.header:
+            column = split_name(name)
+            if name in self.used or (name.startswith("column ") and not any(self.findings.table.column(name))):
+                continue
+            reason = self.reasons.get(name, why)
+            if name in self.findings.options.ignore:
+                reason = LEFT_OUT
+            elif name not in self.reasons and column.word in ("uncertainty", "unsicherheit", "u"):
+                reason = f"{reason}; a standard uncertainty (k = 1) of lengths is named by --map u_value=..."
+            elif name not in self.reasons and not self._has_known_name(column) and self.findings.is_numeric(name):
+                reason = self._not_understood(column)
+            unused[name] = reason
+        if unused:
+            self.findings.understood["not_used"] = unused
+            self.findings.notes.append(f"not used: {', '.join(unused)}")
+
+    def _has_known_name(self, column: NamedColumn) -> bool:
+        """Whether the name of a column says what it holds, and that it is no reading: so it may be left out."""
+        words = re.sub(r"[^a-z]", "", column.word)
+        known = [field for key, field in self.findings.fields.items() if key not in _READINGS]
+        return (
+            column in known
+            or is_temperature(column)
+            or covariate_unit(column.unit or "") is not None
+            or any(word in words for word in _HARMLESS)
+            or is_index(column.name)
+            or _OTHER_UNIT.search(column.name) is not None
+        )
+
+    def _not_understood(self, column: NamedColumn) -> str:
+        """Ask about a column of numbers: what looks like data is never left out without a word of the user."""
+        run = " --map run1-=... (a run and its direction)," if self.kind == "axis" else ""
+        name = shown(column.name)
+        self.findings.doubts.append(
+            f"column {name} holds numbers and is not understood; say what it is, --map FIELD={column.name},{run} or leave it "
+            f"out: --ignore {name}"
+        )
+        return "it is not understood"
+
+
+def metadata_of(findings: TableFindings, row_data: RowData) -> dict[str, str]:
+    """Return the comments of the contract file: those of the file itself, what stands above its table, source and date.
+
+    Comments ``# key = value`` count for other commands (``u_length_um``, ``reference_point_mm``) and are kept as they are.
+    Temperatures, operator, instrument, its serial number and the expansion coefficient are kept where they are clear; a
+    temperature above a table corrects nothing.
+    """
+    comments = {key: _with_point(value) for key, value in findings.table.comments.items()}
+    above = {name: value for key, text in findings.table.metadata.items() for name, value in _fact(key, text).items()}
+    at = row_data.measured_at or date_in_header(findings)
+    if at:
+        findings.understood["measured_at"] = at
+    dated = {"measured_at": at, "date": at} if at else {}
+    return {**above, **comments, "source": findings.table.grid.path.name, **dated}
+
+
+def _with_point(text: str) -> str:
+    """Return a number with a decimal comma as one with a point; other text stays."""
+    value = parse_number(text) if text.count(",") == 1 and "." not in text else None
+    return text if value is None else repr(value)
+
+
+def _fact(key: str, text: str) -> dict[str, str]:
+    """Return what a line above a table says, by the name and in the unit of the contract; nothing if it is not clear."""
+    column = split_name(key)
+    name = next((name for name, words in _FACTS.items() if column.word in words), None)
+    if name is not None and text:
+        return {name: text}
+    numbers = [value for word in re.findall(_NUMBER, text) if (value := parse_number(word)) is not None]
+    if column.word in _EXPANSION and numbers:
+        value = numbers[0] * (1e6 if abs(numbers[0]) < _FRACTION else 1.0)
+        return {"material_expansion_um_per_m_k": f"{value:g}"} if 0 < value <= _LARGEST_EXPANSION else {}
+    if not is_temperature(column) or not numbers:
+        return {}
+    rest = re.sub(_NUMBER, " ", text).strip()
+    unit = column.unit or covariate_unit(next(iter(rest.split()), ""), "temperature")
+    usual = [scale for name, scale in CELSIUS.items() if unit in (None, name)]
+    found = [[factor * value + offset for value in numbers] for factor, offset in usual]
+    fitting = [values for values in found if all(POSSIBLE_C[0] < value < POSSIBLE_C[1] for value in values)]
+    if unit is None:
+        fitting = [values for values in fitting if all(USUAL_C[0] <= value <= USUAL_C[1] for value in values)]
+    if len(fitting) != 1 or max(fitting[0]) - min(fitting[0]) > STEADY_K:
+        return {}
+    return {f"temp_{channel_of(column.word)}_c": f"{sum(fitting[0]) / len(numbers):.6g}"}

@@ -1,0 +1,478 @@
+"""What a file is, by its first bytes, and the import of each foreign format.
+
+:func:`native_format` and :func:`form_of` look at the head of a file; :func:`import_file` calls the reader of its format and
+turns units, sign and axis into those of the project. What the file leaves open becomes a doubt.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from compgen.controls.etalon_exchange import errors_from_etalon, is_exchange_text
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.csv_files import names_in_header
+from compgen.data.deviations import Deviations
+from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.names import AXES, MM_PER_UM, error_named
+from compgen.data.records import format_of_columns
+from compgen.errors import CompgenError, InputError
+from compgen.foreign.cells import chosen_sheet, grid_of_text, holds_readings, read_sheets
+from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, check_field, known_unit
+from compgen.foreign.covariates import surroundings_of
+from compgen.foreign.findings import (
+    ABSURD_DECADES,
+    USUAL_URAD,
+    Imported,
+    ImportOptions,
+    Kind,
+    decades_off,
+    unit_of_deviations,
+    usual_deviation_mm,
+)
+from compgen.foreign.laser_files import MOST_CAPTURE_BYTES as MOST_CAPTURE
+from compgen.foreign.laser_files import (
+    REFUSED,
+    UNITS,
+    Renishaw,
+    is_capture,
+    is_ecmc,
+    is_renishaw_text,
+    read_capture,
+    read_ecmc,
+    read_renishaw,
+    without_runs,
+)
+from compgen.foreign.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion, remarks
+from compgen.foreign.source import (
+    MOST_BYTES,
+    MOST_OWN_BYTES,
+    check_size,
+    decode_head,
+    header_date,
+    read_head,
+    read_source,
+    shown,
+)
+from compgen.foreign.table_kinds import check_largest, import_table, merged_sheets, runs_of
+
+MOST_EXCHANGE_BYTES = 16_000_000
+#: A slope of readings over targets further from 1 than this is not an error of a machine.
+SLOPE_TOLERANCE = 0.01
+_SIGN_NOTE = "deviations are measured minus target (errors), as the maker's software has them"
+_USER_TEXT = (
+    "machine",
+    "serial no",
+    "date",
+    "by",
+    "axis",
+    "location",
+    "title",
+    "owner",
+    "version no",
+    "filetype",
+    "flags",
+)
+
+
+def import_renishaw(path: Path, options: ImportOptions) -> Imported:
+    """Import .rtl, .rta or .rts: axis runs, or with ``options.error`` that error over the axis."""
+    found = read_renishaw(path)
+    angular = found.letter == "a"
+    doubts: list[str] = []
+    found, zero = _without_zero_runs(found, options, doubts)
+    around = surroundings_of(found.beside.get("ENVIRONMENT", {}), found.keys.get("date", ""), options.dates)
+    notes = [
+        *found.notes,
+        *zero,
+        *around.notes,
+        _SIGN_NOTE,
+    ]
+    axis = options.axis or axis_in(found.keys.get("axis", "")) or _axis_of_name(path, notes)
+    runs, unit = _scaled(found, options, doubts, notes)
+    runs = _with_directions(found, runs, options, doubts)
+    if options.sign == "correction":
+        runs = runs.negated()
+        notes.append("the values were said to be corrections: their sign was turned round")
+    notes += remarks(runs, axis or "", angular=angular)
+    understood = {
+        "axis": axis,
+        **_facts(runs, angular=angular),
+        "unit": f"{unit} (by the type of the file, which does not state it)" if "value" not in options.units else unit,
+        "sign": "measured minus target" if options.sign != "correction" else "target minus measured, turned round",
+        "directions_from": options.directions or "the order of the targets in each run",
+        "instrument": found.keys.get("owner") or "Renishaw laser software",
+        "encoding": found.encoding,
+        **{key: found.keys[key] for key in _USER_TEXT if found.keys.get(key)},
+        **{section.lower(): dict(values) for section, values in found.beside.items()},
+        "measured_at": around.measured_at,
+        "temperatures_c": dict(around.temperatures_c) or None,
+    }
+    metadata = {"source": path.name}
+    if around.measured_at:
+        metadata |= {"measured_at": around.measured_at, "date": around.measured_at}
+    runs = replace(runs, covariates={k: np.full(len(runs.value), c) for k, c in around.temperatures_c.items()})
+    error = None
+    if found.letter != "l" or options.error is not None:
+        error = _error_named(path, axis, options, doubts, angular=angular)
+    elif axis is None:
+        named = f" ('{found.keys['axis']}')" if found.keys.get("axis") else ""
+        doubts.append(f"the file does not say X, Y or Z{named}; give --axis")
+    data, reversal = _of_runs(path, runs, axis, error, metadata)
+    kind: Kind = "axis" if error is None else "errors"
+    return Imported(path, "renishaw", kind, data, understood, tuple(doubts), tuple(notes), reversal)
+
+
+def _of_runs(
+    path: Path, runs: OneAxis, axis: str | None, error: str | None, metadata: dict[str, str]
+) -> tuple[AxisRuns | ErrorTable, ReversalCurves | None]:
+    """Readings along an axis as runs, or as the error that they are, with its reversal."""
+    if error is None:
+        return runs_of({axis or "": runs}, str(path), metadata), None
+    return errors_of(runs, error, metadata)
+
+
+def _without_zero_runs(found: Renishaw, options: ImportOptions, doubts: list[str]) -> tuple[Renishaw, list[str]]:
+    """Leave out runs of zeros that stand for runs never made; some programs fill a test in one direction up with them."""
+    if not found.zero_runs or options.zero_runs == "keep":
+        return found, []
+    named = f"run{'s' if len(found.zero_runs) > 1 else ''} {', '.join(map(str, found.zero_runs[:8]))}"
+    if found.one_way_test or options.zero_runs == "drop":
+        return without_runs(found, found.zero_runs), [f"{named}: zero at every target, left out as not made"]
+    doubts.append(f"{named}: zero at every target; say --zero-runs drop if not made, keep if measured")
+    return found, []
+
+
+def _axis_of_name(path: Path, notes: list[str]) -> str | None:
+    """Return the axis that the name of a file says, with a note."""
+    axis = axis_in(re.sub(r"[_\-.]", " ", path.stem))
+    if axis:
+        notes.append(f"axis {axis} by the name of the file")
+    return axis
+
+
+def _error_named(path: Path, axis: str | None, options: ImportOptions, doubts: list[str], *, angular: bool) -> str:
+    """Return the error that the user named; without one a stand-in, with the doubt that keeps it from being used."""
+    if options.error is None:
+        about = "EA?, EB? or EC? with the axis in place of ?" if angular else "the straightness error, for example EYX"
+        doubts.append(f"the file does not say which error it is; give --error ({about})")
+        letter = axis or "X"
+        return f"E{'B' if angular else AXES[(AXES.index(letter) + 1) % 3]}{letter}"
+    try:
+        return check_error(options.error, axis, angular=angular)
+    except InputError as error:
+        raise InputError(error.message, file=path, field="--error") from error
+
+
+def _scaled(found: Renishaw, options: ImportOptions, doubts: list[str], notes: list[str]) -> tuple[OneAxis, str]:
+    """Readings in mm or rad; the unit of the type is compared with the size of the numbers."""
+    angular = found.letter == "a"
+    units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
+    usual = 1e-5 if angular else usual_deviation_mm(float(np.ptp(found.runs.position_mm)))
+    given = options.units.get("value") or options.units.get("deviation")
+    unit = known_unit(given) if given else UNITS[found.letter]
+    if unit not in units:
+        raise InputError(
+            f"{given!r} is not a unit of {'angle' if angular else 'length'}; use {', '.join(units)}", field="--unit"
+        )
+    weighed = {name: units[name] for name in (("urad", "mrad", "arcsec") if angular else ("um", "mm"))}
+    judged = unit_of_deviations(found.runs.value, weighed, usual)
+    if not given and abs(decades_off(found.runs.value, units[unit], usual)) > ABSURD_DECADES:
+        doubts.append(
+            f"such files are in {unit}, but the numbers look like {judged.best}: say --unit value={judged.best} or {unit}"
+        )
+    elif not given:
+        notes.append(f"by the size of the numbers {judged.text()}")
+    return replace(found.runs, value=found.runs.value * units[unit]), unit
+
+
+def _with_directions(found: Renishaw, runs: OneAxis, options: ImportOptions, doubts: list[str]) -> OneAxis:
+    if options.directions == "alternate":
+        _, order = np.unique(found.one_way, return_inverse=True)
+        direction = np.where(order % 2 == 0, 1, -1).astype(np.int64)
+        return replace(runs, direction=direction, run=cycles(direction, found.one_way), in_time=False)
+    if found.sorted_rows and options.directions is None:
+        doubts.append(
+            "its flags say runs in both directions, but every run lists the targets in the same order; give --directions "
+            "alternate (odd runs up, even runs down) or motion"
+        )
+    if not runs.direction.all():
+        doubts.append("a run has a single target: its direction is not known")
+    return runs
+
+
+def _facts(runs: OneAxis, *, angular: bool) -> dict[str, object]:
+    facts = runs.summary()
+    unit, scale = ("urad", 1e-6) if angular else ("um", MM_PER_UM)
+    sizes = {f"{key}_{unit}": float(str(facts.pop(key))) / scale for key in ("rms", "largest")}
+    return {**facts, **sizes}
+
+
+def import_ecmc(path: Path, options: ImportOptions) -> Imported:
+    """Import an ISO 230-2 input file of the ecmc tools; it does not say which axis it is."""
+    found = read_ecmc(path)
+    doubts, notes = [], ["deviations are reading minus target; nothing is taken out of them here"]
+    if found.fitted:
+        notes.append("a gear ratio was fitted to these readings before: the scale error of the axis is not in them")
+    axis = options.axis or _axis_of_name(path, notes)
+    if axis is None and options.error is None:
+        doubts.append("the file does not say X, Y or Z; give --axis")
+    if abs(found.slope - 1.0) > SLOPE_TOLERANCE:
+        doubts.append(
+            f"the readings follow the targets with the slope {found.slope:.5g}, which no machine error explains: a gear ratio or "
+            "a sign is missing; correct the readings first, and say so where the result is used"
+        )
+    runs = found.runs
+    if options.directions == "motion":
+        runs = replace(runs, direction=motion(runs.position_mm, 2 * runs.run + (runs.direction < 0)))
+    if options.sign == "correction":
+        runs = runs.negated()
+    notes += remarks(runs, axis or "", angular=False)
+    understood = {
+        "axis": axis,
+        **_facts(runs, angular=False),
+        "unit": found.keys.get("UNIT", "mm (none stated)"),
+        "sign": "reading minus target",
+        "directions_from": "the order of the targets: FWD goes through them as they are numbered",
+        "slope_of_readings": found.slope,
+        "offset_mm": found.offset_mm,
+        "instrument": found.keys.get("REF_PV"),
+    }
+    metadata = {"source": path.name}
+    error = None if options.error is None else _error_named(path, axis, options, doubts, angular=False)
+    data, reversal = _of_runs(path, runs, axis, error, metadata)
+    kind: Kind = "axis" if error is None else "errors"
+    return Imported(path, "ecmc-iso230", kind, data, understood, tuple(doubts), tuple(notes), reversal)
+
+
+def import_exchange(path: Path, options: ImportOptions) -> Imported:
+    """Import an Etalon exchange file, variant Vendor: errors in mm and rad, as they stand."""
+    source = read_source(path, most=MOST_EXCHANGE_BYTES)
+    table, units = _in_units(errors_from_etalon(source.text, path), options)
+    notes = [
+        f"lengths are {units['linear']} and angles {units['angle']}; squareness in the convention of ISO 230-1 (reference X)"
+    ]
+    if options.sign == "correction":
+        curves = {name: replace(curve, value=-curve.value) for name, curve in table.curves.items()}
+        table = table.replace(curves=curves, squareness={k: (-v, u) for k, (v, u) in table.squareness.items()})
+        notes.append("the values were said to be corrections: their sign was turned round")
+    understood = {
+        "errors": list(table.names),
+        "ranges_mm": {name: [float(c.position_mm[0]), float(c.position_mm[-1])] for name, c in table.curves.items()},
+        "points": {name: len(curve.position_mm) for name, curve in table.curves.items()},
+        "largest_um_urad": {
+            **{n: float(np.max(np.abs(c.value))) * (1e3 if n[1] in "XYZ" else 1e6) for n, c in table.curves.items()},
+            **{name: abs(value) * 1e6 for name, (value, _) in table.squareness.items()},
+        },
+        "unit": f"{units['linear']}, {units['angle']}",
+        "sign": "errors" if options.sign != "correction" else "corrections, turned round",
+        "instrument": "laser tracer software (Etalon exchange)",
+    }
+    kind: Kind = "errors"
+    return Imported(path, "etalon-exchange", kind, table, understood, tuple(_absurd(table, options)), tuple(notes))
+
+
+def _in_units(table: ErrorTable, options: ImportOptions) -> tuple[ErrorTable, dict[str, str]]:
+    """Return the errors in the units that the user says, and those units; the format has mm and rad."""
+    units = {"linear": "mm", "angle": "rad"}
+    scales = {}
+    for kind, known in (("linear", MM_PER_LENGTH), ("angle", RAD_PER_ANGLE)):
+        given = options.units.get(kind)
+        unit = known_unit(given) if given else units[kind]
+        if unit not in known:
+            raise InputError(f"{given!r} is not a unit of it; use {', '.join(known)}", field=f"--unit {kind}")
+        units[kind], scales[kind] = str(unit), known[str(unit)]
+    curves = {
+        name: replace(curve, value=curve.value * scales["linear" if error_named(name).kind == "linear" else "angle"])
+        for name, curve in table.curves.items()
+    }
+    squareness = {name: (value * scales["angle"], u) for name, (value, u) in table.squareness.items()}
+    return table.replace(curves=curves, squareness=squareness), units
+
+
+def _absurd(table: ErrorTable, options: ImportOptions) -> list[str]:
+    """Errors that are hundreds of times larger than usual are in another unit, unless the user has said it."""
+    found = []
+    for name, curve in table.curves.items():
+        linear = error_named(name).kind == "linear"
+        usual = usual_deviation_mm(float(np.ptp(curve.position_mm))) if linear else USUAL_URAD * 1e-6
+        kind = "linear" if linear else "angle"
+        if kind not in options.units and decades_off(curve.value, 1.0, usual) > ABSURD_DECADES:
+            reach = f"{float(np.max(np.abs(curve.value))) * (1e3 if linear else 1e6):.4g} {'um' if linear else 'urad'}"
+            found.append(
+                f"{name} reaches {reach}: are the numbers mm and rad? say --unit {kind}={'mm' if linear else 'rad'} or another"
+            )
+    for name, (value, _) in table.squareness.items():
+        if "angle" not in options.units and abs(value) > USUAL_URAD * 1e-6 * 10**ABSURD_DECADES:
+            found.append(
+                f"{name} reaches {1e6 * abs(value):.4g} urad: are the numbers mm and rad? say --unit angle=rad or another"
+            )
+    return found
+
+
+def import_capture(path: Path, options: ImportOptions) -> Imported:
+    """Import a dynamic capture: displacement over time."""
+    found = read_capture(path)
+    understood = {**found.summary(), "axis": axis_in(found.keys.get("axis", "")), "instrument": found.keys.get("owner")}
+    understood |= {key: found.keys[key] for key in ("machine", "serial no", "date", "velocity") if found.keys.get(key)}
+    at, against = header_date(found.keys.get("date", ""), options.dates)
+    understood["measured_at"] = at
+    keys = {key: value for key, value in found.keys.items() if key != "date"} | (
+        {"measured_at": at, "date": at} if at else {}
+    )
+    notes = ("a capture over time has no targets: no other command computes from it", *([against] if against else []))
+    return Imported(path, "renishaw-capture", "capture", replace(found, keys=keys), understood, (), notes)
+
+
+# What a file is, by its first bytes.
+
+
+_FLAGS = {
+    "columns": "--map",
+    "units": "--unit",
+    "axis": "--axis",
+    "error": "--error",
+    "sign": "--sign",
+    "directions": "--directions",
+    "sheet": "--sheet",
+    "dates": "--dates",
+    "decimal": "--decimal",
+    "zero_runs": "--zero-runs",
+    "ignore": "--ignore",
+}
+_ONE_AXIS = ("axis", "error", "sign", "directions", "dates")
+#: What each format leaves to the user.
+_TAKES: dict[str, tuple[str, ...]] = {
+    "renishaw": ("units", *_ONE_AXIS, "zero_runs"),
+    "renishaw-capture": ("dates",),
+    "ecmc-iso230": _ONE_AXIS[:-1],
+    "etalon-exchange": ("sign", "units"),
+    "table": tuple(name for name in _FLAGS if name not in ("sheet", "zero_runs")),
+    "xlsx": tuple(name for name in _FLAGS if name != "zero_runs"),
+}
+
+
+def native_format(path: Path) -> str | None:
+    """Return the kind of a native file, None for a foreign one; InputError for what is not data."""
+    check_size(path, MOST_CAPTURE)
+    head = read_head(path)
+    if head.startswith((b"PK\x03\x04", b"HEADER::", b"\xff\xfe", b"\xfe\xff")):
+        return None
+    kind = format_of_columns(names_in_header(decode_head(head).lstrip("\ufeff")), complete=True)
+    if kind not in (None, "sixdof", "part"):
+        check_size(path, MOST_OWN_BYTES)
+    return kind
+
+
+def form_of(path: Path) -> str:
+    """Return the name of a foreign file's format."""
+    check_size(path, MOST_CAPTURE)
+    head = read_head(path)
+    if head.startswith(b"PK\x03\x04"):
+        return "xlsx"
+    if is_capture(head) or path.suffix.lower() == ".rtx":
+        return "renishaw-capture"
+    text = decode_head(head)
+    if is_renishaw_text(text) or path.suffix.lower() in REFUSED:
+        return "renishaw"
+    if is_ecmc(text):
+        return "ecmc-iso230"
+    if is_exchange_text(text.lstrip("\ufeff")):
+        return "etalon-exchange"
+    check_size(path, MOST_BYTES)
+    return "table"
+
+
+def import_file(path: str | Path, options: ImportOptions | None = None) -> Imported:
+    """Import any foreign file that is known.
+
+    Raises
+    ------
+    InputError
+        with file, line and column for one that is damaged, cut, too large or not known.
+    """
+    source, chosen = Path(path), options or ImportOptions()
+    form = form_of(source)
+    _check_options(source, form, chosen)
+    item = READERS[form](source, chosen)
+    if not item.doubts and isinstance(item.data, AxisRuns | Deviations):
+        check_largest(item.data.deviation_mm, item.data.origin)
+    # refuse a name after --ignore that is neither a column nor a sheet: it would hide what the user meant
+    text = f"{item.understood} {item.notes}"
+    for name in chosen.ignore:
+        if name not in text:
+            raise InputError(f"there is no column or sheet {name!r}", file=source, field="--ignore")
+    if chosen.kind is not None and item.kind != chosen.kind:
+        raise InputError(f"holds {item.kind}, not {chosen.kind}", file=source, field="--kind")
+    return item
+
+
+def _check_options(path: Path, form: str, options: ImportOptions) -> None:
+    """Refuse what a format cannot take, and names that are none: an option that is silently ignored misleads."""
+    for name, flag in _FLAGS.items():
+        if getattr(options, name) and name not in _TAKES[form]:
+            taken = ", ".join(_FLAGS[key] for key in _TAKES[form]) or "none"
+            raise InputError(f"does not apply to a file of the format {form}; {taken} do", file=path, field=flag)
+    for key in options.units:
+        if form == "renishaw" and key not in ("value", "deviation"):
+            raise InputError("of this format only the unit of the values is open", file=path, field=f"--unit {key}")
+        if form == "etalon-exchange" and key not in ("linear", "angle"):
+            raise InputError("say linear= or angle= for this format", file=path, field=f"--unit {key}")
+        if key not in ("value", "linear", "angle"):
+            check_field(key, "--unit")
+
+
+def _import_text(path: Path, options: ImportOptions) -> Imported:
+    return import_table(grid_of_text(read_source(path)), options)
+
+
+def _import_workbook(path: Path, options: ImportOptions) -> Imported:
+    sheets, hidden = read_sheets(path, options.sheet)
+    aside = tuple(f"sheet {shown(name)} is hidden and was left out; --sheet takes it" for name in hidden)
+    left_out = [name for name, _ in sheets if name in options.ignore]
+    aside += tuple(f"sheet {shown(name)} was left out by --ignore" for name in left_out)
+    sheets = [sheet for sheet in sheets if sheet[0] not in left_out]
+    if not sheets:
+        raise InputError("no sheet is left to read", file=path, field="--ignore")
+    one = chosen_sheet(path, sheets, options.sheet)
+    if one is not None:
+        item = _of_sheet(import_table(one[1], options, "xlsx"), one[0])
+        return replace(item, notes=(*item.notes, *aside))
+    read, reasons, open_sheets = [], [], []
+    for name, grid in sheets:
+        try:
+            read.append((name, _of_sheet(import_table(grid, options, "xlsx"), name)))
+        except CompgenError as error:
+            reason = f"sheet left out: {shown(name)}: {error}"
+            if holds_readings(grid):
+                reason = (
+                    f"sheet {shown(name)} holds numbers that are not understood ({error}); take one sheet with --sheet, or "
+                    f"leave it out: --ignore {shown(name)}"
+                )
+                open_sheets.append(reason)
+            else:
+                reasons.append(reason)
+    if not read:
+        raise InputError(
+            f"no sheet holds a table that can be read: {'; '.join([*reasons, *open_sheets])}"[:1000], file=path
+        )
+    item = merged_sheets(read)
+    return replace(item, doubts=(*item.doubts, *open_sheets), notes=(*item.notes, *aside, *reasons))
+
+
+def _of_sheet(item: Imported, name: str) -> Imported:
+    return replace(item, understood={"sheet": name, **item.understood})
+
+
+READERS: dict[str, Callable[[Path, ImportOptions], Imported]] = {
+    "renishaw": import_renishaw,
+    "renishaw-capture": import_capture,
+    "ecmc-iso230": import_ecmc,
+    "etalon-exchange": import_exchange,
+    "xlsx": _import_workbook,
+    "table": _import_text,
+}

@@ -1,0 +1,445 @@
+"""What is found out about a foreign file: options, result, and the units that its numbers speak for.
+
+:class:`ImportOptions` is what the user says, :class:`Imported` what comes out, :class:`TableFindings` the state of a table
+while it is read. Units that a file does not state are weighed by the data (:func:`judge_lengths`, :func:`slope_of`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from compgen.data.axis_runs import AxisRuns, format_axis_runs
+from compgen.data.csv_files import FloatArray
+from compgen.data.declared import option
+from compgen.data.deviations import Deviations, format_deviations
+from compgen.data.error_table import ErrorTable, ReversalCurves, format_errors, format_reversal
+from compgen.data.lengths import Lengths, format_lengths
+from compgen.data.names import AXES
+from compgen.errors import InputError
+from compgen.foreign.cells import Table
+from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, NamedColumn, is_deviation, known_unit
+from compgen.foreign.laser_files import Capture, format_capture
+from compgen.foreign.source import Order, parse_number, shown
+
+# What an import hands on: the object of the project, what was understood, and what is in doubt.
+
+
+Kind = Literal["axis", "lengths", "deviations", "errors", "capture"]
+KINDS: tuple[Kind, ...] = ("axis", "lengths", "deviations", "errors", "capture")
+SUFFIXES = {
+    "axis": ".axis.csv",
+    "lengths": ".lengths.csv",
+    "deviations": ".deviations.csv",
+    "errors": ".errors.csv",
+    "capture": ".capture.csv",
+}
+Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What the user says about a file; None or empty: take it from the file.
+
+    Parameters
+    ----------
+    kind : what the file holds.
+    columns : column of the file by field (position, deviation, direction, ...).
+    units : unit by field; the field "value" stands for deviations, lengths and errors.
+    axis : X, Y or Z, for files that measure along one axis and do not say which.
+    error : name of the error (EYX, ECX, ...) that the values of a file are, for straightness and angles.
+    sign : "error" (measured minus commanded) or "correction" (what is to be added; turned round on import).
+    directions : "labels", "motion" (from the order of the rows) or "alternate" (odd runs up, even runs down).
+    sheet : name of the sheet of a workbook.
+    decimal : decimal mark of a table, where its numbers do not show it.
+    zero_runs : what becomes of laser runs that are zero at every target.
+    dates : order of day, month and year where the file writes them as numbers.
+    ignore : columns, or sheets of a workbook, that are left out though they hold numbers.
+    """
+
+    kind: Kind | None = option(None, "What the file holds; default: told by its columns.")
+    columns: Mapping[str, str] = option(
+        factory=dict,
+        text="FIELD=COLUMN: position, actual, deviation, correction, direction, run, axis; x, y, z, length, station, "
+        "point; dx, dy, dz, xa, ya, za; error, value; temperature, temp_NAME, time, date, feed, load, tool_x, "
+        "approach_x, repeat, line, block, setup, pose, u_value; run1+, run1-, run2 (a column of one run). May be given "
+        "several times.",
+        name="--map",
+        metavar="FIELD=COLUMN",
+    )
+    units: Mapping[str, str] = option(
+        factory=dict,
+        text="FIELD=UNIT, e.g. deviation=um, position=mm, or UNIT alone for the values; linear=, angle= of errors. um, "
+        "mm, nm, m, in; urad, mrad, arcsec, rad, deg; temp_NAME=degC, K, degF; time=s, ms, min, h; feed=mm/min; load=kg.",
+        name="--unit",
+        metavar="[FIELD=]UNIT",
+    )
+    axis: str | None = option(None, "The axis that moved.", choices=AXES)
+    error: str | None = option(
+        None, "The error that the values are (EYX, ECX, ...), for straightness and angles.", metavar="NAME"
+    )
+    sign: Literal["error", "correction"] | None = option(
+        None,
+        "error: measured minus commanded (default where the format says so); correction: to be turned round.",
+    )
+    directions: Literal["labels", "motion", "alternate"] | None = option(
+        None,
+        "labels: as the file names them; motion: from the order of the rows; alternate: odd runs up, even down.",
+    )
+    sheet: str | None = option(None, "Sheet of a workbook.", metavar="NAME")
+    dates: Order | None = option(None, "Order of dates such as 03/04/2025 (never guessed): day, month, year.")
+    decimal: Literal["comma", "point"] | None = option(
+        None, "Decimal mark of a table; the other one parts thousands (asked for where 1,000 may be either)."
+    )
+    zero_runs: Literal["drop", "keep"] | None = option(
+        None, "Laser runs that are zero at every target: not made (drop) or measured (keep)."
+    )
+    ignore: Sequence[str] = option(
+        (),
+        "Column, or sheet of a workbook, that is left out though it holds numbers (may be given several times).",
+        metavar="NAME",
+    )
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A foreign file as an object of the project.
+
+    Parameters
+    ----------
+    path, format : the file, and the name of its format.
+    kind : which contract file it becomes.
+    data : the object, mm and rad.
+    understood : what was read from the file or inferred, in words and numbers.
+    doubts : what the file does not settle; until the user has said it, no other command takes the file as it is.
+    notes : remarks that need no decision.
+    reversal : difference of both directions, where ``data`` holds only their mean.
+    beside : errors on other sheets of a workbook of axis runs (squareness, straightness).
+    """
+
+    path: Path
+    format: str
+    kind: Kind
+    data: Data
+    understood: Mapping[str, Any]
+    doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    reversal: ReversalCurves | None = None
+    beside: ErrorTable | None = None
+
+    @property
+    def file_name(self) -> str:
+        """Name of the contract file that it becomes."""
+        return f"{self.path.stem}{SUFFIXES[self.kind]}"
+
+    def check_settled(self) -> None:
+        """Raise InputError if something is in doubt, or the file holds two measurements."""
+        if self.doubts:
+            raise InputError(
+                f"leaves open: {'; '.join(self.doubts)}. 'volcomp import' shows what was understood and takes what is "
+                "missing; give its result to this command",
+                file=self.path,
+            )
+
+        if self.beside is not None:
+            names = ", ".join(self.beside.names)
+            raise InputError(
+                f"holds runs of axes and errors as well ({names}): 'volcomp import --out DIR' writes a file of each; or take one "
+                "of them, with --ignore SHEET for the other",
+                file=self.path,
+            )
+
+    def files(self) -> dict[str, str]:
+        """Return the texts of the contract files by name."""
+        found = {self.file_name: _text_of(self.data)}
+        if self.reversal is not None:
+            found[f"{self.path.stem}.reversal.csv"] = format_reversal(self.reversal)
+        if self.beside is not None:
+            found[f"{self.path.stem}{SUFFIXES['errors']}"] = format_errors(self.beside)
+        return found
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of ``--json``."""
+        return {
+            "file": str(self.path),
+            "format": self.format,
+            "kind": self.kind,
+            "understood": dict(self.understood),
+            "doubts": list(self.doubts),
+            "notes": list(self.notes),
+        }
+
+
+def _text_of(data: Data) -> str:
+    if isinstance(data, AxisRuns):
+        return format_axis_runs(data)
+    if isinstance(data, Lengths):
+        return format_lengths(data)
+    if isinstance(data, Deviations):
+        return format_deviations(data)
+    if isinstance(data, Capture):
+        return format_capture(data)
+    return format_errors(data)
+
+
+# Unit and sign as hypotheses that the data speak for or against.
+#
+# Three ways to judge, the strongest first. Where a file holds target AND reading, the slope of the one over the other is
+# the ratio of their units and its sign the sign. Tracer lengths and commanded points obey |P - S|^2 = (k L + c)^2, linear in
+# k^2, S and the rest, so least squares tells the unit k and, by the sign of k L + c, the sign. Bare deviations have their
+# size only: it is compared with what machine tools have.
+
+
+#: Usual size of a deviation: so much, and so much for each metre of travel; one standard deviation is a factor of 5.
+USUAL_UM, USUAL_UM_PER_M, SPREAD_DECADES = 2.0, 10.0, 0.7
+USUAL_URAD = 10.0
+#: Usual travel, and its spread.
+USUAL_TRAVEL_MM, TRAVEL_DECADES = 800.0, 0.5
+#: A hypothesis with less than this share of all is not taken without being asked.
+SURE = 0.95
+#: A declared unit that makes the data so much larger or smaller than usual is doubted (decades).
+ABSURD_DECADES = 2.2
+#: Deviation of a slope from a ratio of units that still is that ratio.
+SLOPE_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class UnitVerdict:
+    """The best hypothesis, its share among all (0..1), and the shares of the others."""
+
+    best: str
+    share: float
+    shares: Mapping[str, float]
+
+    @property
+    def sure(self) -> bool:
+        """Whether it may be taken without asking."""
+        return self.share >= SURE
+
+    def text(self) -> str:
+        """Say the best two in words."""
+        ranked = sorted(self.shares.items(), key=lambda item: -item[1])[:2]
+        return ", ".join(f"{name} {100 * share:.1f} %" for name, share in ranked)
+
+
+def verdict_of(scores: Mapping[str, float]) -> UnitVerdict:
+    """Return the shares of hypotheses with the given log-likelihoods."""
+    top = max(scores.values())
+    weights = {name: float(np.exp(score - top)) for name, score in scores.items()}
+    total = sum(weights.values())
+    shares = {name: weight / total for name, weight in weights.items()}
+    best = max(shares, key=lambda name: shares[name])
+    return UnitVerdict(best, shares[best], shares)
+
+
+def decades_off(values: FloatArray, si_per_unit: float, usual_si: float) -> float:
+    """Return by how many powers of ten the RMS of ``values`` about their mean (a single one: itself) exceeds the usual."""
+    centre = values.mean() if len(values) > 1 else 0.0
+    rms = float(np.sqrt(np.mean((values - centre) ** 2))) * si_per_unit
+    return float(np.log10(max(rms, 1e-15) / usual_si))
+
+
+def usual_deviation_mm(span_mm: float) -> float:
+    """Return the usual size of deviations over a travel, mm."""
+    return 1e-3 * (USUAL_UM + USUAL_UM_PER_M * span_mm / 1000.0)
+
+
+def unit_of_deviations(values: FloatArray, units: Mapping[str, float], usual_si: float) -> UnitVerdict:
+    """Judge units of bare deviations by their size; ``units`` holds mm or rad for each unit."""
+    scores = {
+        name: -0.5 * (decades_off(values, scale, usual_si) / SPREAD_DECADES) ** 2 for name, scale in units.items()
+    }
+    return verdict_of(scores)
+
+
+def unit_of_positions(span: float) -> UnitVerdict:
+    """Judge mm, m and inch for positions that span so much; mm is ten times as likely before one looks."""
+    scores = {
+        name: prior - 0.5 * (float(np.log10(max(span * scale, 1e-12) / USUAL_TRAVEL_MM)) / TRAVEL_DECADES) ** 2
+        for name, scale, prior in (("mm", 1.0, 0.0), ("m", 1e3, -np.log(10.0)), ("in", 25.4, -np.log(50.0)))
+    }
+    return verdict_of(scores)
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Reading = slope * target + offset, in units of the reading; ``unit_ratio`` and ``sign`` if the slope is a ratio."""
+
+    slope: float
+    offset: float
+    unit_ratio: float | None
+    sign: int
+
+
+def slope_of(target: FloatArray, reading: FloatArray) -> Slope:
+    """Compare readings with targets, both (n,): the size of the slope is a ratio of units, its sign a sign."""
+    if np.ptp(target) == 0.0:  # a single target shows no slope
+        return Slope(0.0, float(np.mean(reading)), None, 1)
+    slope, offset = np.polyfit(target, reading, 1).tolist()
+    for ratio in (1.0, 1e3, 1e-3, 25.4, 1.0 / 25.4, 1e4):
+        if abs(abs(slope) / ratio - 1.0) < SLOPE_TOLERANCE:
+            return Slope(slope, offset, ratio, 1 if slope > 0 else -1)
+    return Slope(slope, offset, None, 1 if slope > 0 else -1)
+
+
+@dataclass(frozen=True)
+class LengthGeometry:
+    """What lengths and points say together: mm per unit of length, and the sign with which lengths grow."""
+
+    mm_per_unit: float
+    sign: int
+    rms_mm: float
+
+
+def judge_lengths(position_mm: FloatArray, length: FloatArray) -> LengthGeometry | None:
+    """Judge the unit and the sign of the lengths of ONE station and set-up.
+
+    |P|^2 = k^2 L^2 + 2 k c L + 2 S P + (c^2 - |S|^2) with points P (n, 3) in mm and lengths L (n,) in their unit. Two
+    solutions c differ in sign only with k; of both the one counts with k L + c > 0 everywhere.
+
+    Returns
+    -------
+    what they say, or None if the points are too few or do not tell (k^2 not above zero, sign mixed).
+    """
+    if len(length) < 8:
+        return None
+    centre = position_mm.mean(axis=0)
+    points, own = position_mm - centre, length - length.mean()
+    size, scale = float(np.abs(points).max()), float(np.abs(own).max())
+    if size == 0.0 or scale == 0.0:
+        return None
+    p, read = points / size, own / scale
+    design = np.column_stack([read**2, read, p, np.ones(len(read))])
+    found, _, rank, _ = np.linalg.lstsq(design, np.sum(p**2, axis=1), rcond=1e-10)
+    square, linear = float(found[0]), float(found[1])
+    if square <= 0.0 or rank < 3:
+        return None
+    k = float(np.sqrt(square))
+    distance = k * read + linear / (2.0 * k)
+    if not (np.all(distance > 0) or np.all(distance < 0)):
+        return None
+    rms = float(np.sqrt(np.mean((design @ found - np.sum(p**2, axis=1)) ** 2)))
+    return LengthGeometry(k * size / scale, 1 if distance[0] > 0 else -1, rms * size)
+
+
+# What is found out about one table while it is read: the units that count, what was understood, what is in doubt.
+
+
+#: A unit in brackets, after the word "in" (en, em), or at the end of a line.
+_UNIT_IN_TEXT = re.compile(r"[\[(]([^\])]{1,8})[\])]|\b(?:in|en|em)\s+(\S{1,6})|\s([u\u00b5\u03bc]m|mm)\s*$")
+#: Units that are weighed when a file says none.
+_LENGTHS = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "nm", "in")}
+_ANGLES = {name: RAD_PER_ANGLE[name] for name in ("urad", "mrad", "arcsec", "deg")}
+
+
+@dataclass
+class TableFindings:
+    """One table being read; ``fields`` holds its columns by field, ``used`` the names of columns that gave values.
+
+    ``letter`` is the axis by the names of the columns.
+    ``checked_sign`` says that a second column has shown the sign of the values; ``runs`` are the columns of a run each.
+    """
+
+    table: Table
+    fields: Mapping[str, NamedColumn]
+    options: ImportOptions
+    understood: dict[str, Any] = field(default_factory=dict)
+    doubts: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    used: set[str] = field(default_factory=set)
+    letter: str | None = None
+    checked_sign: bool = False
+    runs: list[str] = field(default_factory=list)
+
+    def numbers(self, key: str) -> FloatArray:
+        """Return the column of a field in its own unit (rows,)."""
+        return np.array(self.table.numbers(self.fields[key].name))
+
+    def is_numeric(self, name: str) -> bool:
+        """Whether at least half of the filled cells of a column are numbers; False for an empty one."""
+        filled = [cell for cell in self.table.column(name) if cell]
+        return bool(filled) and 2 * sum(parse_number(cell) is not None for cell in filled) >= len(filled)
+
+    def given_unit(self, key: str, *, value: bool = False) -> str | None:
+        """Return the unit that the user gave for a field (``value``: also by the word value), or None."""
+        given = self.options.units.get(key) or (self.options.units.get("value") if value else None)
+        if given is None:
+            return None
+        unit = known_unit(given)
+        if unit is None:
+            allowed = ", ".join([*MM_PER_LENGTH, *RAD_PER_ANGLE])
+            raise InputError(f"{given!r} is not a unit; use {allowed}", field="--unit")
+        return unit
+
+    def positions_mm(self, key: str, values: FloatArray) -> FloatArray:
+        """Return positions in mm: by the user's word, the column's name, else by their size."""
+        unit = self.given_unit(key) or self.given_unit("position") or self.fields[key].unit
+        if unit is None:
+            judged = unit_of_positions(float(np.ptp(values)))
+            inches = self._inches()
+            if inches and judged.best != "in":
+                self.doubts.append(
+                    f"{inches} is in inches, and the file gives no unit of {key}; give --unit {key}=in or mm"
+                )
+            unit = judged.best if inches else self._weighed(f"unit of {key}", judged)
+        self._length(unit, key)
+        self.understood.setdefault("position_unit", unit)
+        return values * MM_PER_LENGTH[unit]
+
+    def _inches(self) -> str | None:
+        """Return the first field that is said to be in inches; positions are then probably so too."""
+        said = {key: known_unit(unit) for key, unit in self.options.units.items()}
+        said |= {shown(column.name): column.unit for column in self.fields.values() if column.unit}
+        return next((key for key, unit in said.items() if unit in ("in", "mil")), None)
+
+    def values_si(self, key: str, name: str, values: FloatArray, usual_si: float, *, angular: bool) -> FloatArray:
+        """Return deviations in mm or rad: by the user's word, the column's name, else by their size.
+
+        A declared unit is doubted where it makes the data absurdly large or small and another one does not.
+        """
+        units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
+        column = self.fields.get(key)
+        given = self.given_unit(key, value=True)
+        unit = given or (column.unit if column else None) or self._unit_in(name)
+        judged = unit_of_deviations(values, _ANGLES if angular else _LENGTHS, usual_si)
+        if unit is None:
+            unit = self._weighed(f"unit of {key}", judged)
+        elif unit not in units:
+            raise InputError(
+                f"{name!r} is in {unit}; expected a unit of {'angle' if angular else 'length'}", field="--unit"
+            )
+        elif given is None and abs(decades_off(values, units[unit], usual_si)) > ABSURD_DECADES and judged.best != unit:
+            self.doubts.append(f"{name!r} says {unit}, but the numbers look like {judged.best}; give --unit {key}=...")
+        self.understood["unit"] = unit
+        return values * units[unit]
+
+    def _unit_in(self, name: str) -> str | None:
+        """Return the unit above the table: ``Unit: um``, or the one in a line that speaks of deviations, if it is one."""
+        metadata = self.table.metadata
+        from_metadata = next((v for k, v in metadata.items() if k in ("unit", "units", "einheit")), None)
+        if from_metadata:
+            return known_unit(from_metadata)
+        lines = [f"{key} {text}" for key, text in metadata.items()]
+        found = {
+            known_unit("".join(part)) for line in lines if is_deviation(line) for part in _UNIT_IN_TEXT.findall(line)
+        }
+        return found.pop() if len(found - {None}) == 1 and len(found) == 1 else None
+
+    def _weighed(self, what: str, judged: UnitVerdict) -> str:
+        key = what.rpartition(" ")[2]
+        if judged.sure:
+            self.notes.append(f"the file gives no {what}; by the size of the numbers {judged.text()}")
+        else:
+            self.doubts.append(f"the file gives no {what} ({judged.text()}); give --unit {key}=...")
+        return judged.best
+
+    def _length(self, unit: str, key: str) -> None:
+        if unit not in MM_PER_LENGTH:
+            raise self.table.grid.fail(
+                f"{unit} is not a unit of length; expected positions of a linear axis", None, self.fields[key].name
+            )

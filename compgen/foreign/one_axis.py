@@ -1,0 +1,207 @@
+"""Readings along one axis as every format gives them, and what becomes of them: axis runs, or one error over the axis."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.messages import nearest
+from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.errors import InputError
+from compgen.identify.single_axes import SAME_TARGET_MM, two_way_mean, worth_a_table
+
+IntArray = NDArray[np.int64]
+#: A reading is remarked on if it lies so far from the median, mm or rad, and so many times further than nine in ten others.
+_NOTABLE, _FAR = 0.1, 20.0
+_AXIS = re.compile(r"(?<![A-Z])([XYZ])[0-9]?(?![A-Z])")
+
+
+@dataclass(frozen=True)
+class OneAxis:
+    """n readings along one axis, in the order of the file.
+
+    Parameters
+    ----------
+    position_mm : targets (n,).
+    direction : +1, -1, or 0 where it is not known, (n,).
+    run : number of the run, from 1, (n,); the two ways of a cycle count as one run.
+    value : measured minus target (n,), mm or rad.
+    line : line of the file, (n,).
+    covariates : further numbers by contract name (time_s, temp_..._c), each (n,).
+    in_time : whether the rows are in the order in which they were measured; tables by target or direction are not.
+    """
+
+    position_mm: FloatArray
+    direction: IntArray
+    run: IntArray
+    value: FloatArray
+    line: IntArray
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    in_time: bool = False
+
+    def ordered(self) -> OneAxis:
+        """Return the rows in the order of time: run by run, up then down, unless the file says more.
+
+        Rows that are in the order of time already stay; where it is another one (a cycle that begins downwards), the column
+        ``order`` keeps it, since the order of rows by itself is never taken for time.
+        """
+        usual = np.lexsort((self.position_mm * self.direction, -self.direction, self.run))
+        if "time_s" in self.covariates and np.isfinite(self.covariates["time_s"]).all():
+            return self._rows(np.argsort(self.covariates["time_s"], kind="stable"))
+        if not self.in_time or not self.direction.all():
+            return self._rows(usual) if self.direction.all() else self
+        if np.array_equal(usual, np.arange(len(usual))):
+            return self
+        return replace(self, covariates={**self.covariates, "order": np.arange(1.0, len(usual) + 1)})
+
+    def _rows(self, rows: IntArray) -> OneAxis:
+        return replace(
+            self,
+            position_mm=self.position_mm[rows],
+            direction=self.direction[rows],
+            run=self.run[rows],
+            value=self.value[rows],
+            line=self.line[rows],
+            covariates={name: values[rows] for name, values in self.covariates.items()},
+        )
+
+    def negated(self) -> OneAxis:
+        """Return the readings with corrections turned into errors."""
+        return replace(self, value=-self.value)
+
+    @property
+    def targets_mm(self) -> FloatArray:
+        """Distinct targets, ascending."""
+        rounded = np.round(self.position_mm / SAME_TARGET_MM).astype(np.int64)
+        _, first = np.unique(rounded, return_index=True)
+        return self.position_mm[first]
+
+    def summary(self) -> dict[str, object]:
+        """Say what was measured, in the words of ISO 230-2."""
+        targets = self.targets_mm
+        ways = [int(way) for way in np.unique(self.direction)]
+        return {
+            "targets": len(targets),
+            "from_mm": float(targets[0]),
+            "to_mm": float(targets[-1]),
+            "runs": len(np.unique(self.run)),
+            "directions": {1: "positive only", -1: "negative only", 0: "unknown"}[ways[0]]
+            if len(ways) == 1
+            else "both",
+            "readings": len(self.value),
+            "rms": float(np.sqrt(np.mean(self.value**2))),
+            "largest": float(np.max(np.abs(self.value))),
+        }
+
+
+def axis_in(text: str) -> str | None:
+    """Return the one axis X, Y or Z that a text names; None if it names none or several.
+
+    >>> axis_in("X axis"), axis_in("y1"), axis_in("XY"), axis_in("spindle")
+    ('X', 'Y', None, None)
+    """
+    found = set(_AXIS.findall(text.upper()))
+    return found.pop() if len(found) == 1 else None
+
+
+def motion(position_mm: FloatArray, run: IntArray) -> IntArray:
+    """Direction of travel (n,) from the order of the rows within each run; the first row goes as the second.
+
+    A run of a single target has direction 0, and a repeated target keeps the direction of the row before it.
+    """
+    direction = np.zeros(len(position_mm), dtype=np.int64)
+    for number in np.unique(run):
+        rows = np.flatnonzero(run == number)
+        step = np.sign(np.round(np.diff(position_mm[rows]) / SAME_TARGET_MM)).astype(np.int64)
+        moving = np.flatnonzero(step)
+        if not moving.size:
+            continue
+        last = np.maximum.accumulate(np.where(step != 0, np.arange(len(step)), -1))
+        filled = np.where(last >= 0, step[np.maximum(last, 0)], step[moving[0]])
+        direction[rows] = np.concatenate([filled[:1], filled])
+    return direction
+
+
+def cycles(direction: IntArray, one_way: IntArray) -> IntArray:
+    """Number of the cycle (n,) for numbers of one-way runs: the k-th run up and the k-th run down are cycle k."""
+    result = np.zeros(len(one_way), dtype=np.int64)
+    for way in (1, -1, 0):
+        rows = direction == way
+        _, index = np.unique(one_way[rows], return_inverse=True)
+        result[rows] = index + 1
+    return result
+
+
+def check_error(error: str, axis: str | None, *, angular: bool) -> str:
+    """Return the error that the user named; InputError if it is none of this axis or has another unit."""
+    if error not in CURVE_NAMES:
+        raise InputError(f"{error!r} is not an error over an axis; {nearest(error, CURVE_NAMES)}", field="--error")
+    known = error_named(error)
+    if (known.kind == "angular") != angular:
+        due = "an angle (EAX ... ECZ)" if angular else "a displacement (EXX ... EZZ)"
+        raise InputError(f"{error} does not fit: the file holds {due}", field="--error")
+    if axis is not None and AXES[known.axis] != axis:
+        raise InputError(f"{error} belongs to axis {AXES[known.axis]}, the file to {axis}", field="--error")
+    return error
+
+
+def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[ErrorTable, ReversalCurves | None]:
+    """Return the two-way mean over the targets as one error, and the reversal of the axis.
+
+    See :func:`compgen.identify.single_axes.two_way_mean`. The reversal is None for angles, for one direction, and below
+    0.1 um.
+    """
+    centre, gap, _ = two_way_mean(runs.position_mm, runs.direction, runs.value)
+    table = ErrorTable({error: centre}, {}, dict(metadata))
+    name = error_named(error)
+    if name.kind != "linear" or gap is None or not worth_a_table(gap):
+        return table, None
+    return table, ReversalCurves({(name.axis, name.direction): gap}, dict(metadata))
+
+
+def remarks(runs: OneAxis, axis: str, *, angular: bool) -> list[str]:
+    """Say which readings are missing, and which runs are equal to the last digit; nothing for a regular test."""
+    found, name = [], f"axis {axis}" if axis else "the axis"
+    keys = np.round(runs.position_mm / SAME_TARGET_MM).astype(np.int64)
+    _, target = np.unique(keys, return_inverse=True)
+    _, one_way = np.unique(2 * runs.run + (runs.direction < 0), return_inverse=True)
+    table = np.full((one_way.max() + 1, target.max() + 1), np.nan)
+    table[one_way.ravel(), target.ravel()] = runs.value
+    empty = int(np.isnan(table).sum())
+    if empty and len(runs.value) > table.size // 2:
+        row, column = np.argwhere(np.isnan(table))[0]
+        at = runs.targets_mm[column]
+        what = "reading is" if empty == 1 else "readings are"
+        found.append(f"{name}: {empty} of {table.size} {what} missing, the first in one-way run {row + 1} at {at:g} mm")
+    return found + _outlier(runs, name, angular=angular) + _copies(runs, name, table, one_way.ravel())
+
+
+def _outlier(runs: OneAxis, name: str, *, angular: bool) -> list[str]:
+    """Name the reading that is furthest from the median, if it is far beyond what the others spread over (0.1 mm, mrad)."""
+    away = np.abs(runs.value - np.median(runs.value))
+    worst = int(np.argmax(away))
+    if len(away) < 3 or away[worst] < max(_NOTABLE, _FAR * float(np.quantile(np.delete(away, worst), 0.9))):
+        return []
+    at, value = runs.position_mm[worst], runs.value[worst]
+    size = f"{value / RAD_PER_URAD:.5g} urad" if angular else f"{value / MM_PER_UM:.5g} um"
+    return [f"{name}: {size} at {at:g} mm, line {runs.line[worst]}, is far from all others; a slip?"]
+
+
+def _copies(runs: OneAxis, name: str, table: FloatArray, one_way: IntArray) -> list[str]:
+    """Name runs in the same direction whose values at three targets or more are equal to the last digit, but not all alike."""
+    first: dict[bytes, int] = {}
+    for k, values in enumerate(table):
+        if np.isnan(values).any() or len(values) < 3 or np.ptp(values) == 0:
+            continue
+        row = int(np.flatnonzero(one_way == k)[0])
+        earlier = first.setdefault(values.tobytes() + bytes([int(runs.direction[row]) + 1]), row)
+        if earlier != row:
+            pair = f"{int(runs.run[earlier])} and {int(runs.run[row])}"
+            return [f"{name}: runs {pair} are equal to the last digit at every target; is one a copy of the other?"]
+    return []

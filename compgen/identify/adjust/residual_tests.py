@@ -1,0 +1,611 @@
+"""Are the residuals noise? Their size and its causes, and tests along time, stations, distance and axes."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.deviations import Deviations
+from compgen.data.error_table import ErrorTable
+from compgen.data.lengths import Lengths
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM
+from compgen.errors import CompgenWarning
+from compgen.identify.adjust.levels import levels_of
+from compgen.identify.adjust.robust import time_order
+from compgen.identify.adjust.unknowns import IntArray
+from compgen.kinematics.first_order import c_matrix
+
+# Whether the residuals are larger than their uncertainty allows, and whether a step or a drift explains most of them.
+#
+# ``whiteness`` tests whether residuals look like noise; this asks how large they are, and for the causes that make a
+# measurement worthless although every uncertainty can be computed: something moved between two runs, at one moment, or
+# slowly. Such a cause is looked for with the sum of squares that it takes away, in the residuals as they are and in those
+# with the reversal put back: a step between two runs that came from opposite sides looks like a reversal at first.
+
+
+#: Probability that noise of the stated uncertainty alone gives a larger reduced chi-square than the limit.
+FALSE_ALARM = 0.001
+#: An uncertainty that was assumed, not stated, may be wrong by this factor before the residuals speak against the model.
+ASSUMED_FACTOR = 5.0
+#: A cause is named when it takes away this share of the sum of squares, ...
+EXPLAINS = 0.5
+#: ... with at least so many readings for each of its parameters.
+READINGS_PER_PARAMETER = 10
+#: Degree of the polynomial in time that a drift is looked for with.
+DRIFT_DEGREE = 3
+#: Degree of the polynomial in time that repeated readings are compared with.
+REPEATS_DEGREE = 5
+#: Moments at which a step is tried.
+MOMENTS = 200
+#: Times the uncertainty from which the machine file or the units, and not the measurement, are in doubt.
+LARGEST_CHI_SQUARE = {"stated": 25.0, "assumed": 1000.0}
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Something that explains most of the residuals: ``code`` for programs, ``text`` for people, share of the squares."""
+
+    code: str
+    text: str
+    share: float
+
+
+@dataclass(frozen=True)
+class ResidualSeries:
+    """Residuals in the order in which they were read, n of them, for the search for causes.
+
+    Parameters
+    ----------
+    residual_um : residuals, (n,).
+    bare_um : the same with the reversal put back where one was taken out, (n,); None where none was.
+    sigma_um : standard uncertainty of each, (n,).
+    group : what has an unknown constant of its own, (n,): the dead length of a length, the component of a deviation.
+    labels : what may have moved between readings of different value: run, block, file, each (n,).
+    time_s : moments, (n,); None where the order of the rows is all that is known.
+    """
+
+    residual_um: FloatArray
+    bare_um: FloatArray | None
+    sigma_um: FloatArray
+    group: IntArray
+    labels: Mapping[str, IntArray]
+    time_s: FloatArray | None
+
+    def square_sum(self, value_um: FloatArray) -> float:
+        """Weighted sum of squares of values (n,)."""
+        return float(np.sum((value_um / self.sigma_um) ** 2))
+
+    def without_means(self, value_um: FloatArray, cell: IntArray) -> FloatArray:
+        """Values (n,) minus the weighted mean of their cell."""
+        weight = 1.0 / self.sigma_um**2
+        total = np.bincount(cell, weight)
+        mean = np.bincount(cell, weight * value_um) / np.where(total > 0, total, 1.0)
+        return np.asarray(value_um - mean[cell])
+
+    @property
+    def clock(self) -> FloatArray:
+        """Time of each reading, scaled to -1 ... 1; the order of the rows where no time is known."""
+        return scaled_clock(np.arange(len(self.group)) if self.time_s is None else self.time_s)
+
+
+def residual_series(
+    readings: Lengths | Deviations,
+    rows: NDArray[Any],
+    residual_mm: FloatArray,
+    sigma_mm: FloatArray,
+    group: IntArray,
+    bare_mm: FloatArray | None = None,
+) -> ResidualSeries:
+    """Gather the residuals (k,) of the readings at ``rows`` with what may explain them, see :class:`ResidualSeries`."""
+    station = readings.station if isinstance(readings, Lengths) else None
+    labels = labels_of(readings.labels, readings.origin, readings.position_mm, station)
+    time = readings.covariates.get("time_s")
+    return ResidualSeries(
+        residual_um=residual_mm / MM_PER_UM,
+        bare_um=None if bare_mm is None else bare_mm / MM_PER_UM,
+        sigma_um=sigma_mm / MM_PER_UM,
+        group=group,
+        labels={name: label[rows] for name, label in labels.items()},
+        time_s=None if time is None or not np.isfinite(time[rows]).all() else time[rows],
+    )
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How far the residuals are above what their uncertainty allows.
+
+    Parameters
+    ----------
+    reduced_chi_square, degrees_of_freedom : of the readings that were used.
+    limit : reduced chi-square that noise exceeds with probability ``FALSE_ALARM``; ``ASSUMED_FACTOR`` squared times that
+        where the uncertainty was assumed.
+    scaled_by : by how much all standard uncertainties were widened.
+    source : where the uncertainty of the readings comes from, "stated" or "assumed".
+    causes : steps and drifts that explain most of the residuals, the strongest first.
+    series : the residuals that they were looked for in; None where there are none.
+    """
+
+    reduced_chi_square: float
+    degrees_of_freedom: int
+    limit: float
+    scaled_by: float
+    source: str
+    causes: tuple[Cause, ...] = ()
+    series: ResidualSeries | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def beyond(self) -> bool:
+        """Whether the residuals are larger than their uncertainty and the degrees of freedom allow."""
+        return self.reduced_chi_square > self.limit
+
+    @property
+    def text(self) -> str:
+        """The misfit in one sentence."""
+        return (
+            f"the residuals are {np.sqrt(self.reduced_chi_square):.3g} times their {self.source} uncertainty (reduced "
+            f"chi-square {self.reduced_chi_square:.3g}, the limit is {self.limit:.3g}); all uncertainties were "
+            f"widened by {self.scaled_by:.3g}"
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Return the object ``misfit`` of ``identify.json``."""
+        return {
+            "beyond": self.beyond,
+            "reduced_chi_square": self.reduced_chi_square,
+            "limit": self.limit,
+            "scaled_by": self.scaled_by,
+            "source": self.source,
+            "causes": [asdict(item) for item in self.causes],
+        }
+
+
+def misfit_of(
+    reduced_chi_square: float,
+    degrees_of_freedom: int,
+    scaled_by: float,
+    source: str,
+    series: Callable[[], ResidualSeries],
+) -> Misfit:
+    """Judge the size of the residuals, and look for causes where it is beyond the limit.
+
+    ``series`` makes the readings that were used, where they are looked at.
+    """
+    noise_alone = float(chdtri(degrees_of_freedom, FALSE_ALARM)) / degrees_of_freedom
+    limit = noise_alone * (ASSUMED_FACTOR**2 if source == "assumed" else 1.0)
+    found = Misfit(reduced_chi_square, degrees_of_freedom, limit, scaled_by, source)
+    if not reduced_chi_square > noise_alone:
+        return found
+    readings = series()
+    return replace(found, causes=tuple(_causes(readings)), series=readings)
+
+
+def warn_of_misfit(reduced_chi_square: float, u_source: str) -> None:
+    """Warn of residuals that are too large for the model to be right."""
+    if reduced_chi_square > LARGEST_CHI_SQUARE[u_source]:
+        warnings.warn(
+            f"the model does not describe the readings: the residuals are {np.sqrt(reduced_chi_square):.0f} times their "
+            f"{u_source} uncertainty (reduced chi-square {reduced_chi_square:.3g}); check the chain and the errors of the "
+            "machine file, the order and the signs of the axes, and the uncertainty of a length",
+            CompgenWarning,
+            stacklevel=4,
+        )
+
+
+def _causes(series: ResidualSeries) -> list[Cause]:
+    """Causes that take away most of the sum of squares, the strongest first."""
+    whole, count = series.square_sum(series.residual_um), len(series.group)
+    found: dict[str, Cause] = {}
+    for values_um in (series.residual_um, series.bare_um):
+        if values_um is None:
+            continue
+        centred_um = series.without_means(values_um, series.group)
+        for code, text, parameters, rest_um in _candidates(series, centred_um):
+            if count < READINGS_PER_PARAMETER * parameters:
+                continue
+            share = 1.0 - series.square_sum(rest_um) * count / (count - parameters) / max(whole, 1e-30)
+            if share > EXPLAINS and (code not in found or share > found[code].share):
+                found[code] = Cause(code, text, round(share, 4))
+    causes = sorted(found.values(), key=lambda item: -item.share)
+    # a step between runs is a step at one moment, too, and much of a drift: what leaves twice as much is not named
+    return [item for item in causes if 1.0 - item.share < 2.0 * (1.0 - causes[0].share) + 1e-9]
+
+
+def split_labels(series: ResidualSeries) -> Iterator[tuple[str, str, IntArray]]:
+    """Yield code, text and label (n,) of what may have given the readings another constant: run, block, file, a moment.
+
+    With a constant of its own for each value of the label, a second adjustment tells whether that explains a misfit;
+    residuals alone do not, where a step was taken for a reversal and bent everything else.
+    """
+    for name, label in series.labels.items():
+        if label.min() < label.max():
+            yield f"step_between_{name}s", f"a step between {name}s", label
+    for values_um in (series.bare_um, series.residual_um):
+        if values_um is None:
+            continue
+        late = _best_split(series, series.without_means(values_um, series.group), series.clock)
+        if late is not None:
+            yield "step", f"a step at {_moment(series, late)}", late
+            return
+
+
+def _moment(series: ResidualSeries, late: IntArray) -> str:
+    row = int(np.argmin(np.where(late > 0, series.clock, np.inf)))
+    return f"reading {row + 1}" if series.time_s is None else f"{series.time_s[row]:.0f} s"
+
+
+def _candidates(series: ResidualSeries, value_um: FloatArray) -> Iterator[tuple[str, str, int, FloatArray]]:
+    """Yield code, text and number of parameters of each cause, and what it leaves of values (n,) without group means."""
+    for name, label in series.labels.items():
+        _, place = np.unique(label, return_inverse=True)
+        if place.max() > 0:
+            cell = _pairs(series.group, place.ravel())
+            rest_um = series.without_means(value_um, cell)
+            size_um = 2.0 * float(np.sqrt(np.mean((value_um - rest_um) ** 2)))
+            yield (
+                f"step_between_{name}s",
+                f"a step between {name}s of about {size_um:.3g} um",
+                int(cell.max()) + 1,
+                rest_um,
+            )
+    clock, groups = series.clock, int(series.group.max()) + 1
+    late = _best_split(series, value_um, clock)
+    if late is not None:
+        rest_um = series.without_means(value_um, _pairs(series.group, late))
+        size_um = 2.0 * float(np.sqrt(np.mean((value_um - rest_um) ** 2)))
+        yield "step", f"a step of about {size_um:.3g} um at {_moment(series, late)}", 2 * groups, rest_um
+    drift_um = _drift(series, value_um, clock)
+    text = f"a drift with time over a range of about {float(np.ptp(drift_um)):.3g} um"
+    yield "drift", text, DRIFT_DEGREE * groups, value_um - drift_um
+
+
+def _pairs(first: IntArray, second: IntArray) -> IntArray:
+    """Number the pairs of two labels."""
+    _, number = np.unique(first * (int(second.max()) + 1) + second, return_inverse=True)
+    return np.asarray(number, dtype=np.int64).ravel()
+
+
+def _best_split(series: ResidualSeries, value_um: FloatArray, clock: FloatArray) -> IntArray | None:
+    """Return which readings (1) lie after the moment that splits values without group means best; None if none does."""
+    weight = 1.0 / series.sigma_um**2
+    groups = int(series.group.max()) + 1
+    total = np.bincount(series.group, weight, groups)
+    best, found = 0.0, None
+    for place in np.unique(np.quantile(clock, np.linspace(0.0, 1.0, MOMENTS + 2)[1:-1], method="lower")).tolist():
+        late = clock > place
+        behind = np.bincount(series.group, weight * late, groups)
+        both = (behind > 1e-9 * total) & (behind < (1.0 - 1e-9) * total)
+        moved = np.bincount(series.group, weight * value_um * late, groups)[both]
+        taken = float(np.sum(moved**2 * total[both] / (behind[both] * (total[both] - behind[both]))))
+        if taken > best:
+            best, found = taken, late.astype(np.int64)
+    return found
+
+
+def _drift(series: ResidualSeries, value_um: FloatArray, clock: FloatArray) -> FloatArray:
+    """Polynomial in time of each group that fits the values best, (n,)."""
+    fitted = np.zeros(len(value_um))
+    for group in np.unique(series.group).tolist():
+        own = series.group == group
+        if np.count_nonzero(own) > DRIFT_DEGREE + 1 and np.ptp(clock[own]) > 0:
+            design = np.polynomial.legendre.legvander(clock[own], DRIFT_DEGREE)
+            weight = 1.0 / series.sigma_um[own]
+            fitted[own] = design @ np.linalg.lstsq(weight[:, None] * design, weight * value_um[own], rcond=None)[0]
+    return fitted
+
+
+def drift_of_repeats(lengths: Lengths) -> FloatArray | None:
+    """Return the drift of each station with time that repeated readings show, (n,), mm; None if too few are repeated.
+
+    Two readings of one station at one position differ by what drifted between them, whatever the machine's errors are. The
+    drift is a polynomial in time for each station, zero on average.
+    """
+    setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
+    keys = np.column_stack([np.round(lengths.position_mm, 4), lengths.station, setup])
+    _, first, stop = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    earlier = first[stop.ravel()]
+    time = lengths.covariates.get("time_s")
+    clock = scaled_clock(np.arange(len(lengths)) if time is None or not np.isfinite(time).all() else time)
+    design = np.polynomial.legendre.legvander(clock, REPEATS_DEGREE)[:, 1:]
+    drift = np.zeros(len(lengths))
+    for station in range(len(lengths.stations)):
+        rows = np.flatnonzero((lengths.station == station) & (earlier != np.arange(len(lengths))))
+        if len(rows) < READINGS_PER_PARAMETER * REPEATS_DEGREE:
+            return None
+        moved = lengths.length_mm[rows] - lengths.length_mm[earlier[rows]]
+        found = np.linalg.lstsq(design[rows] - design[earlier[rows]], moved, rcond=None)[0]
+        own = lengths.station == station
+        drift[own] = design[own] @ found - float(np.mean(design[own] @ found))
+    return drift
+
+
+def scaled_clock(time: NDArray[Any]) -> FloatArray:
+    """Moments (n,) scaled to -1 ... 1."""
+    span = float(np.ptp(time))
+    return np.asarray(2.0 * (time - time.min()) / span - 1.0) if span > 0 else np.zeros(len(time))
+
+
+def labels_of(
+    labels: Mapping[str, IntArray],
+    origin: Sequence[tuple[str, int]],
+    position_mm: FloatArray,
+    group: IntArray | None = None,
+) -> dict[str, IntArray]:
+    """Return what may have moved between readings (n,): the labels run and block, and the file of each.
+
+    Where no run is labelled, the readings that come to a position (n, 3) for the k-th time are the k-th run of it; ``group``
+    (n,) says which readings belong to another station.
+    """
+    found = {name: labels[name] for name in ("run", "block") if name in labels}
+    if "run" not in found:
+        keys = np.round(np.asarray(position_mm), 4)
+        keys = keys if group is None else np.column_stack([keys, group])
+        _, stop = np.unique(keys, axis=0, return_inverse=True)
+        found["run"] = _occurrence(stop.ravel())
+    names = {file: k for k, file in enumerate(dict.fromkeys(file for file, _ in origin))}
+    if len(names) > 1:
+        found["file"] = np.array([names[file] for file, _ in origin], dtype=np.int64)
+    return found
+
+
+def _occurrence(value: IntArray) -> IntArray:
+    """Number, from 0, how often each value has been there before (n,)."""
+    order = np.argsort(value, kind="stable")
+    ranked = value[order]
+    first = np.flatnonzero(np.concatenate([[True], ranked[1:] != ranked[:-1]]))
+    counted = np.arange(len(value)) - np.repeat(first, np.diff(np.append(first, len(value))))
+    result = np.empty(len(value), dtype=np.int64)
+    result[order] = counted
+    return result
+
+
+# Whether the residuals are noise: tests along time, between stations, over distance and along the axes.
+#
+# Residuals of a model that describes the readings are independent, with the variance that was stated. Every test is made
+# so that it errs on the quiet side, because fitting takes part of the noise out of the residuals.
+
+
+#: Probability of a false alarm of each of the four kinds of test, over all stations and axes; together below 1 %.
+WHITENESS_FALSE_ALARM = 0.001
+#: Variance ratios between stations, and between near and far readings, that are small enough to be of no interest.
+STATION_RATIO = 2.0
+DISTANCE_RATIO = 1.5
+#: Fewer readings than this say nothing.
+LEAST_READINGS = 30
+#: Residuals smaller than this share of their uncertainty are rounding.
+ROUNDING = 0.02
+#: Levels of an axis are gathered into at most so many bins.
+MOST_BINS = 60
+#: An error is hardly determined when its standard uncertainty in um or urad is so many times that of a reading in um.
+WEAK = 50.0
+#: ... or when it is more than this share of the error, and moves the tool by so many times that of a reading.
+WEAK_SHARE, WEAK_READINGS = 1.0 / 6.0, 3.0
+
+
+@dataclass(frozen=True)
+class StationWhiteness:
+    """One station: autocorrelation of successive residuals, Durbin-Watson statistic, variance against the mean of all.
+
+    ``limit`` is the autocorrelation from which the test fires.
+    """
+
+    lag_1: float
+    limit: float
+    durbin_watson: float
+    variance_ratio: float
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Results of all tests.
+
+    Parameters
+    ----------
+    stations : by name.
+    far_to_near : variance of the far half of the readings over that of the near half.
+    axes : for each axis the variance of the means of the levels, station by station, over what noise would give, and
+        the limit of that.
+    messages : what is not white, in words; empty for white residuals.
+    """
+
+    stations: Mapping[str, StationWhiteness]
+    far_to_near: float
+    axes: Mapping[str, tuple[float, float]]
+    messages: tuple[str, ...]
+
+    @property
+    def white(self) -> bool:
+        """Whether no test fired."""
+        return not self.messages
+
+    def summary(self) -> dict[str, Any]:
+        """Return the object ``whiteness`` of ``identify.json``."""
+        return {
+            "white": self.white,
+            "stations": {name: asdict(item) for name, item in self.stations.items()},
+            "far_to_near_variance": self.far_to_near,
+            "axes": {name: {"ratio": ratio, "limit": limit} for name, (ratio, limit) in self.axes.items()},
+            "messages": list(self.messages),
+        }
+
+
+def check_whiteness(
+    lengths: Lengths, group: IntArray, standardised: FloatArray, distance_mm: FloatArray, unknowns: int
+) -> Whiteness:
+    """Test residuals of readings that were used.
+
+    Parameters
+    ----------
+    lengths, group : the readings and the dead length of each, (n,).
+    standardised : residual over standard uncertainty of each, (n,); nan for a rejected one.
+    distance_mm : distance of each, (n,).
+    unknowns : number of fitted unknowns.
+    """
+    used = np.isfinite(standardised)
+    z = np.where(used, standardised, 0.0)
+    mean_square = float(z @ z) / max(int(used.sum()), 1)
+    if used.sum() - unknowns < LEAST_READINGS or mean_square < ROUNDING**2:
+        return Whiteness({}, 1.0, {}, ())
+    z = z / np.sqrt(mean_square)
+    stations = _stations(lengths, group, z, used, unknowns)
+    far_to_near, distance_message = _distance(z[used], distance_mm[used])
+    axes = {name: _axis(lengths, z, used, axis) for axis, name in enumerate(AXES)}
+    messages = [
+        *_station_messages(stations),
+        *distance_message,
+        *(
+            f"the residuals depend on the position of {name}: the means of its levels scatter {ratio:.1f} times as much "
+            f"as noise would (limit {limit:.1f}); a finer curve or another effect is missing"
+            for name, (ratio, limit) in axes.items()
+            if ratio > limit
+        ),
+    ]
+    return Whiteness(stations, far_to_near, axes, tuple(messages))
+
+
+def _normal_limit(tests: int) -> float:
+    """Value that a standard normal variable exceeds with FALSE_ALARM / tests."""
+    from statistics import NormalDist
+
+    return NormalDist().inv_cdf(1.0 - WHITENESS_FALSE_ALARM / tests)
+
+
+def _stations(
+    lengths: Lengths, group: IntArray, z: FloatArray, used: np.ndarray[Any, Any], unknowns: int
+) -> dict[str, StationWhiteness]:
+    order = time_order(lengths)
+    order = order[used[order]]
+    order = order[np.argsort(group[order], kind="stable")]
+    same = group[order[1:]] == group[order[:-1]]
+    before, after = z[order[:-1]], z[order[1:]]
+    of_pair = lengths.station[order[1:]]
+    count = len(lengths.stations)
+    pairs = np.bincount(of_pair, same, count)
+    products = np.bincount(of_pair, before * after * same, count)
+    changes = np.bincount(of_pair, (after - before) ** 2 * same, count)
+    squares = np.bincount(lengths.station, z**2, count)
+    readings = np.bincount(lengths.station, used, count)
+    limit = _normal_limit(count)
+    found = {}
+    for k, name in enumerate(lengths.stations):
+        if pairs[k] < LEAST_READINGS:
+            continue
+        mean = squares[k] / readings[k]
+        found[name] = StationWhiteness(
+            lag_1=float(products[k] / pairs[k] / mean),
+            limit=float(limit / np.sqrt(pairs[k])),
+            durbin_watson=float(changes[k] / pairs[k] / mean),
+            variance_ratio=float(mean),
+        )
+    return found
+
+
+def _station_messages(stations: Mapping[str, StationWhiteness]) -> list[str]:
+    found = []
+    for name, item in stations.items():
+        if item.lag_1 > item.limit:
+            found.append(
+                f"successive residuals of station {name} are alike: autocorrelation {item.lag_1:.2f} (limit "
+                f"{item.limit:.2f}), Durbin-Watson {item.durbin_watson:.2f} where noise has 2; drift, or another effect"
+            )
+        pairs = (_normal_limit(1) / item.limit) ** 2
+        chance = 2.0 * _normal_limit(2 * len(stations)) * np.sqrt(2.0 / pairs)  # of the ratio, with a margin
+        if item.variance_ratio > STATION_RATIO + chance or item.variance_ratio < 1.0 / (STATION_RATIO + chance):
+            found.append(
+                f"the residuals of station {name} have {item.variance_ratio:.2f} times the variance of all, against the "
+                "stated uncertainty; give it another uncertainty, or look for what disturbs it"
+            )
+    return found
+
+
+def _distance(z: FloatArray, distance_mm: FloatArray) -> tuple[float, list[str]]:
+    """Ratio of the variances of far and near readings, and the message if it is not one."""
+    far = distance_mm > np.median(distance_mm)
+    if min(np.count_nonzero(far), np.count_nonzero(~far)) < LEAST_READINGS:
+        return 1.0, []
+    ratio = float(np.mean(z[far] ** 2) / np.mean(z[~far] ** 2))
+    chance = _normal_limit(2) * np.sqrt(2.0 / np.count_nonzero(far) + 2.0 / np.count_nonzero(~far))
+    if abs(np.log(ratio)) < np.log(DISTANCE_RATIO) + chance:
+        return ratio, []
+    return ratio, [
+        f"the far half of the readings has {ratio:.2f} times the variance of the near half, against the stated "
+        "uncertainty a + b L: a and b do not describe the readings"
+    ]
+
+
+def _axis(lengths: Lengths, z: FloatArray, used: np.ndarray[Any, Any], axis: int) -> tuple[float, float]:
+    """Mean square of the level means of all stations times their numbers (1 for noise, less after a fit), and limit."""
+    levels, level = levels_of(lengths.position_mm[:, axis])
+    if len(levels) > MOST_BINS:
+        level = (level * MOST_BINS) // len(levels)
+    cell = level * len(lengths.stations) + lengths.station
+    numbers = np.bincount(cell, used)
+    sums = np.bincount(cell, z)
+    filled = numbers > 0
+    cells = int(np.count_nonzero(filled))
+    ratio = float(np.sum(sums[filled] ** 2 / numbers[filled]) / cells)
+    # Wilson & Hilferty (1931): the upper tail of chi-square over its degrees of freedom
+    spread = 2.0 / (9.0 * cells)
+    return ratio, float((1.0 - spread + _normal_limit(3) * np.sqrt(spread)) ** 3)
+
+
+def warn_of_weakness(
+    machine: Machine, errors: ErrorTable, worst: Mapping[str, tuple[float, str]], sigma_mm: float
+) -> None:
+    """Warn of errors that the set-up hardly shows.
+
+    That is a standard uncertainty far above that of a reading, or one that is a good part of the error itself and moves the
+    tool, by the lever arms of this machine, by more than the readings scatter.
+
+    Parameters
+    ----------
+    machine : its chain, travel and tool give the lever arms.
+    errors : the identified errors.
+    worst : the largest standard uncertainty by unit with its error.
+    sigma_mm : standard uncertainty of a reading.
+    """
+    advice = "place the stations at different heights, not on a line, and not in a plane with an end of the travel"
+    for unit, (value, name) in worst.items():
+        times = value * MM_PER_UM / sigma_mm
+        if times > WEAK:
+            warnings.warn(
+                f"{name} is hardly determined: its standard uncertainty is {value:.3g} {unit}, {times:.0f} "
+                f"times that of a reading; {advice}",
+                CompgenWarning,
+                stacklevel=4,
+            )
+            return
+    weak = [name for name in errors.names if _weak(machine, errors, name, sigma_mm)]
+    if weak:
+        warnings.warn(
+            f"{', '.join(weak)} {'are' if len(weak) > 1 else 'is'} hardly determined: the standard uncertainty is more than a "
+            f"sixth of the largest value; {advice}",
+            CompgenWarning,
+            stacklevel=4,
+        )
+
+
+def _weak(machine: Machine, errors: ErrorTable, name: str, sigma_mm: float) -> bool:
+    if name in errors.squareness:
+        value, u = (abs(part) for part in errors.squareness[name])
+    else:
+        curve = errors.curves[name]
+        value, u = float(np.abs(curve.value).max()), float(curve.u.max())
+    corners = np.array(list(itertools.product(*zip(machine.lower_mm, machine.upper_mm, strict=True))))
+    lever = float(np.linalg.norm(c_matrix(machine, corners)[:, :, ERROR_INDEX[name]], axis=1).max())
+    return bool(u > WEAK_SHARE * value and u * lever > WEAK_READINGS * sigma_mm)
+
+
+def warn_of_residuals(whiteness: Whiteness, reduced_chi_square: float, u_source: str) -> None:
+    """Warn of residuals that are not white, unless they are too large for the model to be right at all."""
+    if whiteness.messages and reduced_chi_square <= LARGEST_CHI_SQUARE[u_source]:
+        more = f"; and {len(whiteness.messages) - 1} more in identify.json" if len(whiteness.messages) > 1 else ""
+        warnings.warn(f"the residuals are not white: {whiteness.messages[0]}{more}", CompgenWarning, stacklevel=4)

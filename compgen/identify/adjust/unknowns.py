@@ -1,0 +1,276 @@
+"""The unknowns of an adjustment: error curves with their basis and gauge, stations, dead lengths; and the travel they cover."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, ERROR_INDEX, SQUARENESS_NAMES, ErrorName, error_named
+from compgen.errors import InputError
+from compgen.kinematics.curves import free_basis, hat_matrix, spline_matrix
+from compgen.kinematics.first_order import modelled_errors, observable_errors, tool_of
+
+# The unknown curves: their basis, the constraints that fix the gauge, and the place of each in the vector.
+
+
+#: Positions per node interval at which a cubic curve is written, so that linear interpolation loses nothing.
+SUBDIVISION = 8
+
+
+@dataclass(frozen=True)
+class CurveParameters:
+    """One unknown curve: coefficients = ``free`` (n, k) times its k unknowns, at ``columns`` of the vector."""
+
+    error: ErrorName
+    nodes_mm: FloatArray
+    free: FloatArray
+    columns: slice
+
+
+@dataclass(frozen=True)
+class ErrorParameters:
+    """All unknown errors of a machine and their place in the vector of unknowns (curves first, then squareness).
+
+    ``curves`` is the basis between nodes; ``size`` the number of unknowns.
+    """
+
+    machine: Machine
+    curves: tuple[CurveParameters, ...]
+    squareness: tuple[str, ...]
+    size: int
+
+    def basis(self, axis: int, position_mm: FloatArray) -> FloatArray:
+        """Basis matrix of the curves of ``axis`` at positions (m,): shape (m, coefficients)."""
+        nodes = self.machine.axes[axis].nodes_mm
+        build = spline_matrix if self.machine.curves == "cubic" else hat_matrix
+        return build(nodes, position_mm)
+
+    def values(self, unknowns: FloatArray, bases: Sequence[FloatArray]) -> FloatArray:
+        """All 21 errors at points whose basis matrices are ``bases`` (one per axis): shape (m, 21), mm and rad."""
+        values = np.zeros((len(bases[0]), len(ERROR_INDEX)))
+        for curve in self.curves:
+            coefficients = curve.free @ unknowns[curve.columns]
+            values[:, ERROR_INDEX[curve.error.name]] = bases[curve.error.axis] @ coefficients
+        for k, name in enumerate(self.squareness):
+            values[:, ERROR_INDEX[name]] = unknowns[self.size - len(self.squareness) + k]
+        return values
+
+    def design(self, columns: FloatArray, bases: Sequence[FloatArray]) -> FloatArray:
+        """Derivative of the tip by the unknowns, shape (m, 3, size); ``columns`` (m, 3, 21) is dTip/dP."""
+        design = np.empty((len(columns), 3, self.size))
+        for curve in self.curves:
+            reduced = bases[curve.error.axis] @ curve.free
+            column = columns[:, :, ERROR_INDEX[curve.error.name]]
+            design[:, :, curve.columns] = column[:, :, None] * reduced[:, None, :]
+        for k, name in enumerate(self.squareness):
+            design[:, :, self.size - len(self.squareness) + k] = columns[:, :, ERROR_INDEX[name]]
+        return design
+
+    def output_positions_mm(self, axis: int) -> FloatArray:
+        """Positions at which the curves of an axis are written: the nodes, for cubic curves with more in between."""
+        nodes = self.machine.axes[axis].nodes_mm
+        if self.machine.curves == "linear":
+            return nodes
+        steps = np.arange(SUBDIVISION) / SUBDIVISION
+        between = nodes[:-1, None] + np.diff(nodes)[:, None] * steps
+        return np.append(between.ravel(), nodes[-1])
+
+
+def error_parameters(machine: Machine, names: Sequence[str], *, several_tools: bool = False) -> ErrorParameters:
+    """Lay out the unknowns for the errors ``names`` and fix the gauge by elimination.
+
+    Constraints (Zha & Zhang 2024, eq. 25, taken together; 20 for 17 errors): positioning and angular curves are zero
+    at the reference point, straightness curves at both ends of the travel. If several tools were used, the angular
+    curves of the axis without any other axis in its lever arm stay free: with them comes the constant orientation
+    between tool and workpiece, which the tools show.
+    """
+    single_tool = observable_errors(machine) if several_tools else ()
+    bare = next(axis for axis in range(3) if not [lever for lever in machine.chain.lever_axes(axis) if lever != axis])
+    curves: list[CurveParameters] = []
+    known: dict[tuple[int, bool, bool], FloatArray] = {}
+    size = 0
+    for name in names:
+        if name in SQUARENESS_NAMES:
+            continue
+        error = error_named(name)
+        released = several_tools and error.kind == "angular" and error.axis == bare and name not in single_tool
+        key = (error.axis, error.is_straightness, released)
+        if key not in known:
+            known[key] = _free_coefficients(machine, error, released=released)
+        free = known[key]
+        curves.append(
+            CurveParameters(error, machine.axes[error.axis].nodes_mm, free, slice(size, size + free.shape[1]))
+        )
+        size += free.shape[1]
+    squareness = tuple(name for name in names if name in SQUARENESS_NAMES)
+    return ErrorParameters(machine, tuple(curves), squareness, size + len(squareness))
+
+
+def common_tool(machine: Machine, tool_mm: FloatArray | None) -> FloatArray:
+    """Return the tool offset of all rows (3,), or of each (n, 3) if several tools were used; None is the machine's."""
+    offset_mm = tool_of(machine, tool_mm)
+    one = offset_mm.ndim == 2 and not np.any(np.ptp(offset_mm, axis=0) > 1e-9)
+    return offset_mm[0] if one else offset_mm
+
+
+def parameters_for_tools(machine: Machine, tool_mm: FloatArray) -> ErrorParameters:
+    """Lay out the errors that the machine's model contains for the tools that were used, (3,) or (n, 3)."""
+    several = tool_mm.ndim == 2
+    names = modelled_errors(machine, np.unique(tool_mm, axis=0) if several else None)
+    return error_parameters(machine, names, several_tools=several)
+
+
+def _free_coefficients(machine: Machine, error: ErrorName, *, released: bool) -> FloatArray:
+    axis = machine.axes[error.axis]
+    count = len(axis.nodes_mm)
+    if released:
+        return np.eye(count)
+    zeros = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
+    held = (axis.nodes_mm[:, None] == np.array(zeros)).any(axis=1)
+    if machine.curves == "linear" and np.count_nonzero(held) == len(zeros):
+        return np.eye(count)[:, ~held]
+    build = spline_matrix if machine.curves == "cubic" else hat_matrix
+    rows = build(axis.nodes_mm, np.array(zeros))
+    return free_basis(np.where(np.abs(rows) < 1e-14, 0.0, rows), count)
+
+
+# The values of all unknowns of an identification.
+
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class State:
+    """Current values of the unknowns: errors (size,), stations (S, 3), dead lengths (groups,); mm and rad."""
+
+    errors: FloatArray
+    stations_mm: FloatArray
+    dead_length_mm: FloatArray
+
+    def moved(self, step: FloatArray) -> State:
+        """Return the state after a step (unknowns in the order errors, stations, dead lengths)."""
+        first, second = len(self.errors), len(self.errors) + self.stations_mm.size
+        return State(
+            self.errors + step[:first],
+            self.stations_mm + step[first:second].reshape(-1, 3),
+            self.dead_length_mm + step[second:],
+        )
+
+
+@dataclass(frozen=True)
+class KnownPositions:
+    """Stations whose coordinates were observed: indices (k,), positions (k, 3) in mm, weight (k,) of each coordinate.
+
+    A weight counts on the scale of the weights of the readings.
+    """
+
+    station: IntArray
+    position_mm: FloatArray
+    weight: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of observed coordinates."""
+        return 3 * len(self.station)
+
+    def columns(self, errors: int) -> IntArray:
+        """Places (k, 3) of the coordinates among the unknowns, ``errors`` of which come first."""
+        return errors + 3 * self.station[:, None] + np.arange(3)
+
+    def square_sum(self, state: State) -> float:
+        """Weighted sum of squares of the coordinates."""
+        return float(np.sum(self.weight[:, None] * (state.stations_mm[self.station] - self.position_mm) ** 2))
+
+    def add_gradient(self, state: State, gradient: FloatArray) -> float:
+        """Add the gradient to that of all unknowns (size,), and return half the weighted sum of squares."""
+        away = state.stations_mm[self.station] - self.position_mm
+        gradient[self.columns(len(state.errors))] += self.weight[:, None] * away
+        return 0.5 * self.square_sum(state)
+
+    def add_weight(self, state: State, matrix: FloatArray) -> None:
+        """Add to the normal matrix (size, size)."""
+        columns = self.columns(len(state.errors))
+        matrix[columns, columns] += self.weight[:, None]
+
+
+class LeastSquaresProblem(Protocol):
+    """What the solver needs of a least-squares problem; the unknowns are in the order of :meth:`State.moved`."""
+
+    @property
+    def parameters(self) -> ErrorParameters:
+        """The unknown errors."""
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+
+    def evaluate(self, state: State) -> tuple[float, FloatArray]:
+        """Half the weighted sum of squares, and its gradient (size,)."""
+
+    def normal_matrix(self, state: State) -> FloatArray:
+        """J^T W J (size, size), exact or close to it."""
+
+    def residuals(self, state: State) -> FloatArray:
+        """Model minus reading of every reading, mm."""
+
+    def weighted(self, weight: FloatArray) -> LeastSquaresProblem:
+        """Return the same problem with other weights of the readings, 1/mm^2."""
+
+
+# Measured positions must lie within the travel of the machine.
+
+
+_ROUNDING_MM = 1e-3
+
+
+def check_travel(machine: Machine, position_mm: FloatArray, origin: Sequence[tuple[str, int]] = ()) -> None:
+    """Raise InputError, with file, line and column, for the first position (n, 3) outside the travel.
+
+    ``origin`` is file and line of each row; without it the message counts the points.
+    """
+    for axis in range(3):
+        along = np.ascontiguousarray(position_mm[:, axis])
+        row = outside_travel(machine, axis, along)
+        if row is None:
+            continue
+        low, high = machine.axes[axis].range_mm
+        file, line = origin[row] if len(origin) else (None, None)
+        raise InputError(
+            f"{along[row]:g} mm{'' if len(origin) else f' (point {row + 1})'} lies outside the travel {low:g} ... {high:g} mm "
+            f"of {AXES[axis]} of machine {machine.name!r}: wrong machine file, wrong axis order or wrong unit?",
+            file=file,
+            line=line,
+            field=f"column {AXES[axis].lower()}_mm",
+        )
+
+
+def check_axis_travel(
+    machine: Machine,
+    axis: IntArray,
+    position_mm: FloatArray,
+    origin: Sequence[tuple[str, int]],
+    field: str | None = None,
+) -> None:
+    """The same for readings along single axes: axis 0 ... 2 and position of each, both (n,)."""
+    for k, letter in enumerate(AXES):
+        rows = np.flatnonzero(axis == k)
+        found = outside_travel(machine, k, position_mm[rows])
+        if found is not None:
+            row, (low, high) = int(rows[found]), machine.axes[k].range_mm
+            file, line = origin[row] if len(origin) else (None, None)
+            message = f"{position_mm[row]:g} mm is outside the travel of {letter}, {low:g} to {high:g} mm"
+            raise InputError(message, file=file, line=line, field=field)
+
+
+def outside_travel(machine: Machine, axis: int, position_mm: FloatArray) -> int | None:
+    """First row of positions (n,) along an axis that lies outside its travel; None if all are within."""
+    low, high = machine.axes[axis].range_mm
+    if not len(position_mm) or (position_mm.min() >= low - _ROUNDING_MM and position_mm.max() <= high + _ROUNDING_MM):
+        return None
+    return int(np.flatnonzero((position_mm < low - _ROUNDING_MM) | (position_mm > high + _ROUNDING_MM))[0])

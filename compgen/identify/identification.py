@@ -1,0 +1,308 @@
+"""The result of an identification: error curves, stations, uncertainties, and the contents of ``identify.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.deviations import Deviations
+from compgen.data.display import Drawable, Overview, Panel, PlottedLine
+from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
+from compgen.data.machine import Machine
+from compgen.data.names import ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES
+from compgen.identify.adjust.propagation import Adjustment, Systematic
+from compgen.identify.adjust.residual_tests import Misfit, Whiteness, warn_of_residuals
+from compgen.identify.adjust.robust import Rejected, Segment
+from compgen.identify.adjust.unknowns import ErrorParameters
+from compgen.identify.reversal_errors import Reversal
+from compgen.kinematics.first_order import observable_errors
+
+# What an identification returns, and the contents of ``identify.json``.
+
+
+@dataclass(frozen=True)
+class StationResult:
+    """One station and set-up: position and dead length with standard uncertainties, mm, and residual RMS in um.
+
+    ``segment`` counts the dead lengths that beam breaks added to it, 0 being the main one.
+    """
+
+    station: str
+    setup: int
+    position_mm: tuple[float, float, float]
+    u_position_mm: tuple[float, float, float]
+    dead_length_mm: float
+    u_dead_length_mm: float
+    readings: int
+    rms_um: float
+    segment: int = 0
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class Identification(Drawable):
+    """Result of :func:`identify`.
+
+    Parameters
+    ----------
+    errors : the identified errors with standard uncertainties.
+    stations : one entry for every station and set-up.
+    residual_mm : model minus reading of every reading (n,), also of the rejected ones.
+    accepted : which readings were used, (n,).
+    rms_um, degrees_of_freedom, reduced_chi_square : of the used readings; chi-square with the stated uncertainty.
+    u_source : "stated" or "assumed"; with "assumed", and whenever the residuals are larger than stated, the
+        uncertainties are scaled by the root of the reduced chi-square (``u_scale``).
+    unobservable : combinations that the model leaves out because nothing can show them, in words.
+    rejected : readings that were not used, with the reason.
+    segments : beam breaks: runs of readings with a dead length of their own, or rejected together.
+    reversal : mean difference between the directions of approach; None if no stop was approached from both sides.
+    residual_tests : makes the tests behind ``whiteness``.
+    corrections : what was taken out of the readings (temperature of the scales, wavelength, effects of the machine file).
+    rank, unknowns, condition, iterations : of the least-squares problem.
+    worst_u : largest standard uncertainty by unit ("um", "urad") with its error.
+    layout : the unknown errors and their bases.
+    adjustment : the optimum with its factor, for the joint covariance and for systematic inputs; None if there is none.
+    systematic : what systematic inputs contribute, and is part of the standard uncertainties then; None if none is.
+    method : "joint", "two-step", "sixdof" for readings of the six-DOF instrument (the residuals are translations about
+        the mean of their position), "merged" for those and others, "axis-runs" for
+        runs along single axes, "given" for errors of another program (no residuals), or "deviations" where
+        measured positions were given
+        in place of lengths; then the residuals are those of the components dx, dy, dz, and ``u_length_um`` is their
+        standard uncertainty.
+    steps : figures of the single steps of the two-step method.
+    positions : the positions that it measured in the machine frame, against the commanded ones.
+    values_factor : where there is no adjustment: F (k, r) with F F^T the covariance of the error values in the order of
+        the errors file, mm and rad; None if there is none.
+    reversal_curves : reversals over the position of each axis, where the instrument shows them so.
+    details : figures of the method beyond those that all methods have in common.
+    objections : why nothing that is made of these errors may be accepted; empty if there is no such reason.
+    misfit : whether the residuals are larger than their uncertainty allows, and what explains them; None where no
+        uncertainty of the readings is part of the method.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> lengths = compgen.read_lengths("examples/zha-gantry.lengths.csv")
+    >>> found: compgen.Identification = compgen.identify(machine, lengths)
+    >>> found
+    <Identification: 17 errors from 10648 of 10648 readings (joint), residual 0.279 um rms, reduced chi-square 0.999>
+    >>> found.rank, found.unknowns, [item.station for item in found.stations]
+    (153, 153, ['LT1', 'LT2', 'LT3', 'LT4'])
+    """
+
+    errors: ErrorTable
+    stations: tuple[StationResult, ...] = ()
+    residual_mm: FloatArray
+    accepted: NDArray[np.bool_]
+    rms_um: float
+    degrees_of_freedom: int
+    reduced_chi_square: float
+    u_source: str
+    u_length_um: float
+    u_length_um_per_m: float = 0.0
+    u_scale: float = 1.0
+    unobservable: tuple[str, ...]
+    rejected: tuple[Rejected, ...] = ()
+    rank: int
+    unknowns: int
+    condition: float = 1.0
+    iterations: int = 1
+    worst_u: dict[str, tuple[float, str]]
+    layout: ErrorParameters
+    adjustment: Adjustment | None = None
+    segments: tuple[Segment, ...] = ()
+    reversal: Reversal | None = None
+    residual_tests: Callable[[], Whiteness] | None = field(default=None, repr=False)
+    corrections: Mapping[str, Any] = field(default_factory=dict)
+    systematic: Systematic | None = None
+    method: str = "joint"
+    steps: Mapping[str, Any] = field(default_factory=dict)
+    positions: Deviations | None = None
+    values_factor: FloatArray | None = None
+    reversal_curves: ReversalCurves | None = None
+    details: Mapping[str, Any] = field(default_factory=dict)
+    objections: tuple[str, ...] = ()
+    misfit: Misfit | None = None
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether the joint covariance of the errors is known."""
+        return self.adjustment is not None or self.values_factor is not None
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of the unknown errors in the order of the layout (size, size), mm and rad; made at the first look.
+
+        Systematic inputs are part of it where they were given.
+        """
+        if self.adjustment is None:
+            raise ValueError("this identification keeps no covariance")
+        factor = self.adjustment.covariance_factor()[: self.layout.size]
+        if self.systematic is None:
+            return factor @ factor.T
+        response = self.systematic.response[: self.layout.size]
+        return factor @ factor.T + response @ response.T
+
+    @cached_property
+    def whiteness(self) -> Whiteness | None:
+        """Tests of the residuals, made at the first look, with a CompgenWarning if one fires; None if there are none."""
+        if self.residual_tests is None:
+            return None
+        found = self.residual_tests()
+        warn_of_residuals(found, self.reduced_chi_square, self.u_source)
+        return found
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of ``identify.json``."""
+        return {
+            "method": self.method,
+            "residual_rms_um": self.rms_um,
+            "residual_max_um": float(np.max(np.abs(self.residual_mm[self.accepted]))) / MM_PER_UM,
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "reduced_chi_square": None if np.isnan(self.reduced_chi_square) else self.reduced_chi_square,
+            **self._u_of_the_readings(),
+            "readings": len(self.accepted),
+            "readings_used": int(np.count_nonzero(self.accepted)),
+            "rank": self.rank,
+            "unknowns": self.unknowns,
+            "condition": self.condition,
+            "iterations": self.iterations,
+            "identified": list(self.errors.names),
+            "unobservable": list(self.unobservable),
+            "rejected": [asdict(item) for item in self.rejected],
+            "segments": [item.summary() for item in self.segments],
+            "misfit": None if self.misfit is None else self.misfit.summary(),
+            "reversal": None if self.reversal is None else self.reversal.summary(),
+            "whiteness": None if self.whiteness is None else self.whiteness.summary(),
+            "corrections": {key: value for key, value in self.corrections.items() if key != "effects"},
+            "effects": dict(self.corrections.get("effects", {})),
+            "worst_standard_uncertainty": {
+                unit: {"value": value, "error": name} for unit, (value, name) in self.worst_u.items()
+            },
+            "squareness_urad": {
+                name: {"value": value * 1e6, "u": u * 1e6} for name, (value, u) in self.errors.squareness.items()
+            },
+            "stations": [asdict(station) for station in self.stations],
+            "systematic": None if self.systematic is None else self.systematic.summary(),
+            **({"steps": dict(self.steps)} if self.steps else {}),
+            **({self.method: dict(self.details)} if self.details else {}),
+            **({"objections": list(self.objections)} if self.objections else {}),
+        }
+
+    def _u_of_the_readings(self) -> dict[str, Any]:
+        known = {"source": self.u_source, "constant_um": self.u_length_um}
+        if self.method in ("deviations", "sixdof", "axis-runs", "given"):
+            return {"u_deviation": {**known, "scaled_by": self.u_scale}}
+        proportional = {"proportional_um_per_m": self.u_length_um_per_m, "scaled_by": self.u_scale}
+        return {"u_length": {**known, **proportional}}
+
+    def overview(self) -> Overview:
+        """How well the model fits the readings, and the largest value of each error."""
+        table = self.errors.overview()
+        used = f"{np.count_nonzero(self.accepted)} of {len(self.accepted)} readings"
+        quality = f"residual {self.rms_um:.3f} um rms, reduced chi-square {self.reduced_chi_square:.3f}"
+        title = f"{len(self.errors.names)} errors from {used} ({self.method}), {quality}"
+        notes = (f"rank {self.rank} of {self.unknowns} unknowns", *self.objections)
+        return Overview(title, table.header, table.rows, notes)
+
+    def panels(self) -> Sequence[Panel]:
+        """The errors, and the residuals of the readings that were used."""
+        residual_um = -self.residual_mm[self.accepted] / MM_PER_UM  # kept as model minus reading, shown as in the files
+        if not len(residual_um):
+            return self.errors.panels()
+        number = np.flatnonzero(self.accepted).astype(np.float64)
+        drawn = Panel(
+            "reading minus model", "residual (um)", (PlottedLine("", number, residual_um),), x_label="reading"
+        )
+        return [*self.errors.panels(), drawn]
+
+
+def uncertainty_scale(reduced_chi_square: float, u_source: str) -> float:
+    """Factor of all standard uncertainties: an assumed one follows the residuals, a stated one only where they exceed it."""
+    root = float(np.sqrt(reduced_chi_square))
+    return root if u_source == "assumed" else max(1.0, root)
+
+
+def worst_uncertainty(errors: ErrorTable) -> dict[str, tuple[float, str]]:
+    """Return the largest standard uncertainty by unit ("um", "urad") with its error."""
+    worst: dict[str, tuple[float, str]] = {"um": (0.0, ""), "urad": (0.0, "")}
+    for name, curve in errors.curves.items():
+        unit = "um" if name[1] in "XYZ" else "urad"
+        value = float(np.max(curve.u)) * (1e3 if unit == "um" else 1e6)
+        if value > worst[unit][0]:
+            worst[unit] = (value, name)
+    for name, (_, u) in errors.squareness.items():
+        if u * 1e6 > worst["urad"][0]:
+            worst["urad"] = (u * 1e6, name)
+    return worst
+
+
+# What every method of identification returns: error curves with uncertainties, and notes about them.
+
+
+def error_table(layout: ErrorParameters, unknowns: FloatArray, factor: FloatArray) -> ErrorTable:
+    """Return curves and squareness for the unknown errors (size,), mm and rad.
+
+    ``factor`` (size, r) times its transpose is their covariance.
+    """
+    positions = [layout.output_positions_mm(axis) for axis in range(3)]
+    plain = layout.machine.curves == "linear"  # written at the nodes, where coefficients are values
+    bases = [np.zeros((0, 0)) if plain else layout.basis(axis, positions[axis]) for axis in range(3)]
+    variance = np.einsum("ij,ij->i", factor, factor)
+    curves = {}
+    for curve in layout.curves:
+        axis, free = curve.error.axis, curve.free
+        kept = free.argmax(axis=0)
+        if plain and np.count_nonzero(free) == free.shape[1] == free[kept, np.arange(free.shape[1])].sum():
+            value, square = np.zeros(len(free)), np.zeros(len(free))
+            value[kept], square[kept] = unknowns[curve.columns], variance[curve.columns]
+        else:
+            reduced = free if plain else bases[axis] @ free
+            value = reduced @ unknowns[curve.columns]
+            spread = reduced @ factor[curve.columns]
+            square = np.einsum("ij,ij->i", spread, spread)
+        curves[curve.error.name] = Curve(positions[axis], value, np.sqrt(square))
+    first = layout.size - len(layout.squareness)
+    squareness = {
+        name: (float(unknowns[first + k]), float(np.sqrt(variance[first + k])))
+        for k, name in enumerate(layout.squareness)
+    }
+    return ErrorTable(curves, squareness)
+
+
+def table_of_values(values: Iterable[tuple[str, FloatArray, FloatArray, FloatArray]]) -> ErrorTable:
+    """Make curves and squareness of names with positions, values and standard uncertainties, each (m,), mm and rad."""
+    curves, squareness = {}, {}
+    for name, position_mm, value, u in values:
+        if name in SQUARENESS_NAMES:
+            squareness[name] = (float(value[0]), float(u[0]))
+        else:
+            curves[name] = Curve(position_mm, value, u)
+    return ErrorTable(curves, squareness)
+
+
+def metadata_of(machine: Machine, metadata: Mapping[str, str]) -> dict[str, str]:
+    """Return the comments of the errors file; ``metadata`` is that of the measurement."""
+    reference = " ".join(f"{value:g}" for value in machine.reference_point_mm)
+    kept = {key: metadata[key] for key in ("date",) if key in metadata}
+    return {"machine": machine.name, **kept, "source": "compgen identify", "reference_point_mm": reference}
+
+
+def unobservable(layout: ErrorParameters) -> tuple[str, ...]:
+    """Say in words which of the 21 errors the model leaves out, and why."""
+    machine = layout.machine
+    identified = {curve.error.name for curve in layout.curves} | set(layout.squareness)
+    shown = observable_errors(machine)
+    return tuple(
+        f"{name}: left out of the machine file's errors, although it is observable on chain {machine.chain.name}"
+        if name in shown
+        else f"{name}: no lever arm but its own axis' travel or one tool offset on chain {machine.chain.name}"
+        for name in ERROR_NAMES
+        if name not in identified
+    )

@@ -1,0 +1,322 @@
+"""Options of an identification: uncertainty of the readings, and stations that are known beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from compgen.data.csv_files import FloatArray, read_csv
+from compgen.data.declared import option
+from compgen.data.deviations import Deviations
+from compgen.data.lengths import POSITION_COLUMNS, Lengths
+from compgen.data.machine import Machine
+from compgen.data.messages import nearest
+from compgen.data.names import MM_PER_UM
+from compgen.errors import InputError
+from compgen.identify.adjust.grid_problem import GridProblem
+from compgen.identify.adjust.problem import LengthProblem
+from compgen.identify.adjust.propagation import SystematicInputs
+from compgen.identify.adjust.starts import station_start
+from compgen.identify.adjust.unknowns import IntArray, KnownPositions, State
+from compgen.kinematics.first_order import tool_of
+
+# Stations whose machine coordinates are known beforehand: from a file, or located with the machine taken as perfect.
+#
+# A known coordinate is one more observation, s = s0 with standard uncertainty u. It is not more than that: which errors
+# one or two stations determine is for the rank to say (``docs/method.md``, "One or two stations").
+
+
+#: A station without a stated uncertainty is fixed to this: a nanometre is nothing for a tracer.
+FIXED_MM = 1e-6
+
+#: Columns of ``stations.csv`` of an identification.
+U_OF_IDENTIFY = ("u_x_um", "u_y_um", "u_z_um")
+OF_IDENTIFY = (*U_OF_IDENTIFY, "setup", "segment", "dead_length_mm", "u_dead_length_um", "readings", "residual_rms_um")
+
+
+@dataclass(frozen=True)
+class KnownStations:
+    """Names (k), positions in the machine frame (k, 3) and standard uncertainty of each coordinate (k,), mm."""
+
+    names: tuple[str, ...]
+    position_mm: FloatArray
+    u_mm: FloatArray
+
+    def indices(self, stations: Sequence[str]) -> IntArray:
+        """Return the indices of the known ones among ``stations``; InputError for a name that is not there."""
+        for name in self.names:
+            if name not in stations:
+                message = f"the stations file contains {name!r}, but the measurement has no such station"
+                raise InputError(f"{message}; {nearest(name, stations)}")
+        return np.array([list(stations).index(name) for name in self.names], dtype=np.int64)
+
+
+def read_stations(path: str | Path) -> KnownStations:
+    """Read known stations: CSV with ``station, x_mm, y_mm, z_mm`` and, if they are not exact, ``u_mm``.
+
+    ``stations.csv`` of an identification will do, with its uncertainties; more rows of a station are accepted.
+    """
+    optional = ("u_mm", *OF_IDENTIFY)
+    table = read_csv(path, required=("station", *POSITION_COLUMNS), optional=optional)
+    names = table.names("station")
+    position_mm = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
+    kept: list[int] = []
+    for row, name in enumerate(names):
+        first = names.index(name)
+        if first == row:
+            kept.append(row)
+        elif "dead_length_mm" not in table.columns or np.max(np.abs(position_mm[row] - position_mm[first])) > 1e-6:
+            raise table.fail(row, "station", f"{name!r} is already in line {table.lines[first]}")
+    u_mm = np.zeros(len(table))
+    if "u_mm" in table.columns:
+        u_mm = table.numbers("u_mm")
+    elif all(name in table.columns for name in U_OF_IDENTIFY):
+        u_mm = np.max([table.numbers(name) for name in U_OF_IDENTIFY], axis=0) * MM_PER_UM
+    for row in np.flatnonzero(u_mm < 0)[:1]:
+        raise table.fail(int(row), "u_mm", f"{u_mm[row]:g} is negative; a standard uncertainty cannot be")
+    return KnownStations(tuple(names[row] for row in kept), position_mm[kept], np.maximum(u_mm[kept], FIXED_MM))
+
+
+def locate_stations(machine: Machine, lengths: Lengths) -> KnownStations:
+    """Locate every station with the machine taken as perfect (single-station method of Zha & Zhang 2024, section 1).
+
+    The machine's own errors go into the positions. They are smooth over the volume, so that more readings do not average
+    them out: the uncertainty is what errors of the size of the residual RMS do if all of them act in the worst way,
+    the root of n times that of independent ones.
+    """
+    target = lengths.position_mm + tool_of(machine, lengths.tool_mm)
+    setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
+    positions, u = [], []
+    for k, name in enumerate(lengths.stations):
+        rows = lengths.station == k
+        _, group = np.unique(setup[rows], return_inverse=True)
+        position, uncertainty = _locate(name, target[rows], lengths.length_mm[rows], group.ravel().astype(np.int64))
+        positions.append(position)
+        u.append(uncertainty)
+    return KnownStations(lengths.stations, np.array(positions), np.array(u))
+
+
+def _locate(name: str, target_mm: FloatArray, length_mm: FloatArray, group: IntArray) -> tuple[FloatArray, float]:
+    groups = int(group.max()) + 1
+    freedom = len(length_mm) - 3 - groups
+    if freedom < 1:
+        raise InputError(f"station {name!r} has only {len(length_mm)} reading(s); it cannot be located")
+    start = station_start(target_mm, length_mm, group, groups)
+    unknowns = np.concatenate([start.position_mm, start.dead_length_mm])
+    for _ in range(20):
+        sight = target_mm - unknowns[:3]
+        distance = np.linalg.norm(sight, axis=1)
+        residual = distance - unknowns[3 + group] - length_mm
+        jacobian = np.column_stack([-sight / distance[:, None], -(group[:, None] == np.arange(groups)).astype(float)])
+        step = np.linalg.lstsq(jacobian, -residual, rcond=1e-12)[0]
+        unknowns = unknowns + step
+        if np.abs(step).max() < 1e-9:
+            break
+    rms = float(np.sqrt(np.sum(residual**2) / freedom))
+    cofactor = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14)
+    worst = float(np.sqrt(len(length_mm) * np.linalg.eigvalsh(cofactor[:3, :3]).max()))
+    return unknowns[:3], max(rms * worst, FIXED_MM)
+
+
+def with_known_start(
+    start: State, known: KnownStations, lengths: Lengths, target_mm: FloatArray, group: IntArray
+) -> State:
+    """Return the start with the known positions, and the dead lengths that go with them."""
+    stations, dead = start.stations_mm.copy(), start.dead_length_mm.copy()
+    for k, position in zip(known.indices(lengths.stations).tolist(), known.position_mm, strict=True):
+        stations[k] = position
+        rows = np.flatnonzero(lengths.station == k)
+        rest = np.linalg.norm(target_mm[rows] - position, axis=1) - lengths.length_mm[rows]
+        for own in np.unique(group[rows]).tolist():
+            dead[own] = float(np.median(rest[group[rows] == own]))
+    return State(start.errors, stations, dead)
+
+
+def with_known_positions(
+    problem: GridProblem | LengthProblem, known: KnownStations, stations: Sequence[str], sigma_mm: float
+) -> GridProblem | LengthProblem:
+    """Add known stations to a problem in which a reading of standard uncertainty ``sigma_mm`` has weight 1."""
+    observed = KnownPositions(known.indices(stations), known.position_mm, (sigma_mm / known.u_mm) ** 2)
+    return replace(problem, known=observed)
+
+
+# The uncertainty of the readings: stated by the user, by the file, or assumed.
+
+
+Method = Literal["joint", "two-step"]
+METHODS: tuple[Method, ...] = ("joint", "two-step")
+
+#: Standard uncertainty of a laser tracer's length when neither the file nor the user states one: half of the usual
+#: statement 0.2 um + 0.3 um/m at k = 2.
+ASSUMED_U_UM = 0.1
+ASSUMED_U_UM_PER_M = 0.15
+#: Standard uncertainty of a measured deviation when nobody states one.
+ASSUMED_U_DEVIATION_UM = 1.0
+
+
+@dataclass(frozen=True)
+class IdentifyOptions:
+    """What the user may say beyond the machine and the readings.
+
+    ``u_length_um`` and ``u_length_um_per_m`` are the standard uncertainty a + b L of a reading; without them the
+    comments of that name in the file count, else the usual statement of a laser tracer. ``reject`` False keeps all
+    readings. ``systematic`` are the uncertainties of inputs that all readings share.
+
+    ``method`` is "joint" or "two-step" (:mod:`compgen.identify.two_step`). ``stations`` are known beforehand, or located
+    with the machine taken as perfect ("nominal"). ``u_deviation_um`` is the standard uncertainty of a measured deviation;
+    it belongs to deviations files only. ``temperature`` False leaves the scales at the temperature that they had.
+
+    ``part_scale`` "free" takes one scale out of each set-up of a part (its temperature is not known), and ``travel``
+    "from-data" lets the curves end where the readings do; both belong to positions in frames of unknown pose
+    (:mod:`compgen.identify.positions`).
+    ``small_deviations`` takes deviations that are all zero, or smaller than any machine's, as they are.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> lengths = compgen.read_lengths("examples/zha-gantry.lengths.csv")
+    >>> options = compgen.IdentifyOptions(u_length_um=0.2, u_length_um_per_m=0.3)  # half as good as the file says
+    >>> round(compgen.identify(machine, lengths, options).reduced_chi_square, 2)
+    0.25
+    """
+
+    u_length_um: float | None = option(None, "Constant part of the standard uncertainty of a length, um.")
+    u_length_um_per_m: float | None = option(None, "Part of the standard uncertainty that grows with the length, um/m.")
+    reject: bool = option(True, "Reject no reading, however far it is from the model.", name="--keep-all")
+    systematic: SystematicInputs = SystematicInputs()
+    method: Method = option(
+        "joint",
+        "joint: errors and stations in one adjustment; two-step: the tracers first locate themselves and all points, "
+        "which needs four stations at common points.",
+    )
+    stations: KnownStations | Literal["nominal"] | None = option(
+        None,
+        "CSV with known stations (station, x_mm, y_mm, z_mm; optional u_mm, exact without), or the word nominal: "
+        "located with the machine taken as perfect.",
+        metavar="FILE",
+    )
+    u_deviation_um: float | None = option(
+        None,
+        "Standard uncertainty of a measured deviation (*.deviations.csv), um; default: the file's, else 1 um scaled by "
+        "the residuals.",
+    )
+    temperature: bool = option(
+        True,
+        "Leave the scales at the temperature that they had; by default they are corrected to 20 degC where the file has "
+        "temp_x_c, temp_y_c, temp_z_c and the machine file expansion_um_per_m_k.",
+        name="--no-temperature",
+    )
+    part_scale: Literal["known", "free"] = option(
+        "known",
+        "Scale of a measured part (*.part.csv): known (1, or by the temperatures in the file), or free: one unknown "
+        "scale for each set-up, which takes the mean of the scale errors of the axes with it.",
+    )
+    travel: Literal["machine", "from-data"] = option(
+        "machine",
+        "machine: curves over the whole travel, nodes that no reading reaches tied by smoothness; from-data: over the "
+        "range that the readings cover. For parts, and deviations at one height or without a component.",
+        name="--range",
+    )
+    small_deviations: bool = option(
+        False,
+        "Take deviations that are all zero, or all below 0.1 um, as they are; without it they are refused, because "
+        "nothing was measured then, or the values are in mm.",
+    )
+
+
+@dataclass(frozen=True)
+class ReadingNoise:
+    """Standard uncertainty a + b L of a reading; ``source`` is "stated" or "assumed".
+
+    ``column_um`` (n,) takes its place for readings that state their own; nan for the others.
+    """
+
+    source: str
+    constant_um: float
+    proportional_um_per_m: float
+    column_um: FloatArray | None = None
+
+    @property
+    def uniform_mm(self) -> float | None:
+        """Standard uncertainty in mm where it is the same for all readings, else None."""
+        if self.proportional_um_per_m or self.column_um is not None:
+            return None
+        return self.constant_um * MM_PER_UM
+
+    def sigma_mm(self, distance_mm: FloatArray) -> FloatArray:
+        """Standard uncertainty in mm of readings over the given distances."""
+        common = (self.constant_um + self.proportional_um_per_m * distance_mm / 1000.0) * MM_PER_UM
+        if self.column_um is None:
+            return common
+        return np.where(np.isfinite(self.column_um), self.column_um * MM_PER_UM, common)
+
+
+def reading_noise(lengths: Lengths, options: IdentifyOptions) -> ReadingNoise:
+    """Return the uncertainty of the readings.
+
+    Options count first, then the column ``u_length_um``, then the file's comments, then the usual statement.
+    """
+    column = _column(lengths) if options.u_length_um is None and options.u_length_um_per_m is None else None
+    if column is not None and np.isfinite(column).all():
+        return ReadingNoise("stated", float(np.median(column)), 0.0, column)
+    noise = _common_noise(lengths, options)
+    return noise if column is None else replace(noise, column_um=column)
+
+
+def _column(lengths: Lengths) -> FloatArray | None:
+    column = lengths.covariates.get("u_length_um")
+    if column is None:
+        return None
+    wrong = np.flatnonzero(np.isfinite(column) & ~(column > 0))
+    if wrong.size:
+        file, line = lengths.origin[int(wrong[0])] if lengths.origin else (None, None)
+        message = f"{column[wrong[0]]:g} is not a standard uncertainty; give a number above zero"
+        raise InputError(message, file=file, line=line, field="column u_length_um")
+    return column
+
+
+def _common_noise(lengths: Lengths, options: IdentifyOptions) -> ReadingNoise:
+    """Uncertainty a + b L of all readings."""
+    constant, proportional = options.u_length_um, options.u_length_um_per_m
+    constant = number_in_comment(lengths, "u_length_um") if constant is None else constant
+    proportional = number_in_comment(lengths, "u_length_um_per_m") if proportional is None else proportional
+    if constant is None and proportional is None:
+        return ReadingNoise("assumed", ASSUMED_U_UM, ASSUMED_U_UM_PER_M)
+    noise = ReadingNoise("stated", constant or 0.0, proportional or 0.0)
+    values = (noise.constant_um, noise.proportional_um_per_m)
+    if min(values) < 0 or not sum(values) > 0 or not np.isfinite(sum(values)):
+        raise InputError(f"the uncertainty of a length is {values[0]:g} um + {values[1]:g} um/m; it must be above zero")
+    return noise
+
+
+def number_in_comment(readings: Lengths | Deviations, key: str) -> float | None:
+    """Number of the comment ``# key = ...`` of the readings; None without one, InputError for something else."""
+    text = readings.metadata.get(key)
+    if text is None:
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        file = readings.origin[0][0] if readings.origin else None
+        raise InputError(f"the comment {key} = {text!r} is not a number", file=file) from None
+
+
+def deviation_sigma(deviations: Deviations, options: IdentifyOptions) -> tuple[FloatArray, str]:
+    """Standard uncertainty of each component (n, 3) in mm, and "stated" or "assumed".
+
+    The option counts first, then the columns of the file, then its comment, then the usual uncertainty.
+    """
+    stated = options.u_deviation_um
+    if stated is None:
+        if deviations.u_mm is not None:
+            return deviations.u_mm, "stated"
+        stated = number_in_comment(deviations, "u_deviation_um")
+    if stated is not None and not 0 < stated < np.inf:
+        raise InputError(f"the uncertainty of a deviation is {stated:g} um; it must be above zero")
+    u_um = ASSUMED_U_DEVIATION_UM if stated is None else stated
+    return np.full(deviations.deviation_mm.shape, u_um * MM_PER_UM), "assumed" if stated is None else "stated"

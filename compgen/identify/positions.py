@@ -1,0 +1,700 @@
+"""Errors from measured positions (``*.deviations.csv``, ``*.part.csv``), in an aligned frame or in frames of unknown pose."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.deviations import PART, Deviations, aligned, setups_of
+from compgen.data.error_table import ErrorTable
+from compgen.data.machine import Axis, Machine
+from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.identify.adjust.problem import SeparationProblem
+from compgen.identify.adjust.propagation import Adjustment
+from compgen.identify.adjust.rank import determined_factor
+from compgen.identify.adjust.residual_tests import misfit_of, residual_series
+from compgen.identify.adjust.robust import fit_accepted, rejected_components
+from compgen.identify.adjust.solver import LeastSquaresSolution, factorise, solve
+from compgen.identify.adjust.unknowns import (
+    ErrorParameters,
+    State,
+    check_travel,
+    common_tool,
+    error_parameters,
+    parameters_for_tools,
+)
+from compgen.identify.covariance import error_values
+from compgen.identify.identification import (
+    Identification,
+    error_table,
+    metadata_of,
+    table_of_values,
+    uncertainty_scale,
+    unobservable,
+    worst_uncertainty,
+)
+from compgen.identify.options import IdentifyOptions, deviation_sigma
+from compgen.identify.reference_conditions import without_effects
+from compgen.kinematics.curves import hat_matrix
+from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
+from compgen.kinematics.kernel_switch import one_thread
+
+# Errors from positions measured in frames of unknown pose, in any of their components: what they determine, no more.
+#
+# The positions are features of parts (``*.part.csv``) or measured deviations that lack a component, lie at one height, or
+# come from several set-ups. Component i of position j, measured in set-up s, is to first order
+#
+#     d_ij = e_i . (shift_s + turn_s x p_j + scale_s p_j + C(p_j) P)
+#
+# P are the errors of the machine's model, C as in E = C P. The pose (shift, turn) of every set-up is unknown, its scale
+# unknown or given by temperatures. Such data rarely determine the whole model: at one height nothing over Z is seen, without
+# dz no straightness in Z. So directions of the unknowns that no reading shows are found (singular values) and stay zero;
+# errors of which nothing is seen are left out and named. Where only nodes at the ends of a curve see no reading, they are
+# tied to the others by smoothness, and their uncertainty grows as that of an extrapolation.
+
+
+IntArray = NDArray[np.int64]
+#: Directions whose singular value is below this share of the largest are not determined; columns have unit length.
+SHOWS, RCOND = 1e-6, 1e-9
+#: Angles are counted in mm at this lever, so that they compare with translations.
+LEVER_MM = 1000.0
+#: Nodes with less than this share of the readings of the median node are tied to their neighbours.
+WEAK = 0.25
+#: An error counts as identified if readings determine this share of its unknowns, or one direction at least.
+SEEN = 1e-6
+#: Curvature of a curve between neighbouring nodes where too few of them are seen to measure it, um and urad.
+USUAL_BEND = 2.0
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """Where the frame of one set-up lies: measured = offset + rotation(scale x (nominal + error)).
+
+    ``offset_mm`` (3,) is that of the nominal origin, ``turn_rad`` (3,) the rotation vector; nan in components that the
+    readings do not show. ``scale`` is 1 where it was not free.
+    """
+
+    setup: int
+    offset_mm: FloatArray
+    turn_rad: FloatArray
+    scale: float
+    u_scale: float
+    readings: int
+
+    def summary(self) -> dict[str, Any]:
+        """Return the pose for ``identify.json``."""
+        return {
+            "setup": self.setup,
+            "offset_mm": [None if np.isnan(value) else float(value) for value in self.offset_mm],
+            "rotation_deg": [None if np.isnan(value) else float(np.degrees(value)) for value in self.turn_rad],
+            "scale": self.scale,
+            "u_scale": self.u_scale,
+            "readings": self.readings,
+        }
+
+
+@dataclass(frozen=True)
+class _Readings:
+    """The k measured components: position (k, 3), component 0..2, deviation in mm, its sigma, set-up number (k,).
+
+    ``arm_mm`` (k, 3) is the position from the centre of the set-up.
+    """
+
+    row: IntArray
+    component: IntArray
+    position_mm: FloatArray
+    arm_mm: FloatArray
+    tool_mm: FloatArray
+    deviation_mm: FloatArray
+    sigma_mm: FloatArray
+    setup: IntArray
+
+    def kept(self, mask: NDArray[np.bool_]) -> _Readings:
+        return _Readings(*(getattr(self, name)[mask] for name in self.__dataclass_fields__))
+
+
+def needs_free_pose(deviations: Deviations) -> bool:
+    """Whether readings are features of parts, lack a component or an axis, or come from several set-ups."""
+    measured = np.isfinite(deviations.deviation_mm).any(axis=0)
+    flat = bool((np.ptp(deviations.position_mm, axis=0) < 1e-6).any()) if len(deviations) else False
+    several = "setup" in deviations.labels and len(np.unique(deviations.labels["setup"])) > 1
+    return deviations.metadata.get("measured") == PART or not measured.all() or flat or several
+
+
+def identify_with_free_pose(machine: Machine, deviations: Deviations, options: IdentifyOptions) -> Identification:
+    """Identify what positions in frames of unknown pose determine.
+
+    Parameters
+    ----------
+    machine : chain, nodes, reference point and the errors that its model contains.
+    deviations : measured minus nominal coordinates, any components; the label ``setup`` tells the frames apart.
+    options : ``u_deviation_um``, ``reject``, ``part_scale`` ("free", or "known": 1, or what the temperatures say) and
+        ``travel`` ("machine", or "from-data": curves over the range that the readings cover).
+
+    Raises
+    ------
+    InputError
+        for temperatures without the coefficient of expansion of the part.
+    UndeterminedError
+        where no error at all is determined.
+    """
+    deviations = _at_20_degrees(deviations if deviations.poses else aligned(deviations))
+    if options.travel == "from-data":
+        machine = _within(machine, deviations.position_mm)
+    sigma, source = deviation_sigma(deviations, options)
+    readings = _readings(machine, deviations, sigma)
+    free_scale = options.part_scale == "free"
+    solution, accepted = fit_accepted(
+        lambda accepted, _: _solve(machine, readings, accepted, free_scale=free_scale),
+        lambda solution: solution.residual_mm / readings.sigma_mm,
+        len(readings.row),
+        "coordinates do not fit the model; check the axis order, signs and units, and which feature is which,",
+        reject=options.reject,
+    )
+    result = _free_pose_result(machine, deviations, readings, solution, accepted, source)
+    _say_what_is_not_reached(solution)
+    return result
+
+
+def _at_20_degrees(deviations: Deviations) -> Deviations:
+    """Measured coordinates brought to the size that the part has at 20 degC, and to that it had when it was machined.
+
+    ``temp_part_c`` is the temperature of the part while it was measured, ``temp_machined_c`` while it was machined.
+    """
+    names = ("temp_part_c", "temp_machined_c")
+    if not any(name in deviations.covariates for name in names):
+        return deviations
+    text = deviations.metadata.get("expansion_um_per_m_k", "")
+    try:
+        expansion = float(text) * 1e-6
+    except ValueError:
+        raise InputError(
+            f"has {' and '.join(n for n in names if n in deviations.covariates)}, but the comment expansion_um_per_m_k is "
+            f"{text!r}; give the part's coefficient of expansion, e.g. # expansion_um_per_m_k = 11.5",
+            file=deviations.origin[0][0] if deviations.origin else None,
+        ) from None
+    measured, machined = (np.nan_to_num(deviations.covariates.get(n, 20.0) - np.array(20.0)) for n in names)
+    # the part grew by the difference of the two temperatures between the machine and the measurement
+    growth = (expansion * (measured - machined))[..., None]
+    actual = deviations.position_mm + deviations.deviation_mm
+    return replace(deviations, deviation_mm=deviations.deviation_mm - growth * actual)
+
+
+def _within(machine: Machine, position_mm: FloatArray) -> Machine:
+    """The machine with the travel that the positions cover; nodes as far apart as before, the reference point inside."""
+    axes = []
+    for k, axis in enumerate(machine.axes):
+        low, high = float(position_mm[:, k].min()), float(position_mm[:, k].max())
+        if high - low < 1e-6:
+            axes.append(axis)
+            continue
+        share = (high - low) / (axis.range_mm[1] - axis.range_mm[0])
+        count = max(2, int(np.ceil(share * (len(axis.nodes_mm) - 1) - 1e-9)) + 1)
+        axes.append(Axis((low, high), np.linspace(low, high, count), axis.expansion_um_per_m_k, axis.screw_pitch_mm))
+    low_mm, high_mm = np.array([axis.range_mm for axis in axes]).T
+    x, y, z = np.clip(machine.reference_point_mm, low_mm, high_mm).tolist()
+    return replace(machine, axes=(axes[0], axes[1], axes[2]), reference_point_mm=(x, y, z))
+
+
+def _readings(machine: Machine, deviations: Deviations, sigma_mm: FloatArray) -> _Readings:
+    row, component = np.nonzero(np.isfinite(deviations.deviation_mm))
+    tools = np.broadcast_to(tool_of(machine, deviations.tool_mm), deviations.position_mm.shape)
+    setups = setups_of(deviations)
+    centre = np.array([deviations.poses[setup].nominal_mm for setup in setups.tolist()])
+    # a coordinate that was not measured has no centre of its own
+    centre = np.where(np.isfinite(deviations.deviation_mm).any(axis=0), centre, deviations.position_mm.mean(axis=0))
+    return _Readings(
+        row.astype(np.int64),
+        component.astype(np.int64),
+        deviations.position_mm[row],
+        (deviations.position_mm - centre)[row],
+        tools[row],
+        deviations.deviation_mm[row, component],
+        sigma_mm[row, component],
+        setups[row],
+    )
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Optimum: unknown errors with a factor F of their covariance (F F^T), poses (set-ups, 7), residuals (all readings, k).
+
+    ``unreached`` are nodes that no reading reaches, by error; ``left_out`` the errors of which nothing is seen; ``partly`` those
+    of which a part is not determined.
+    """
+
+    layout: ErrorParameters
+    unknowns: FloatArray
+    factor: FloatArray
+    poses: FloatArray
+    u_scale: FloatArray
+    residual_mm: FloatArray
+    rank: int
+    condition: float
+    unreached: Mapping[str, FloatArray]
+    left_out: tuple[str, ...]
+    partly: tuple[str, ...]
+
+
+def _solve(
+    machine: Machine,
+    readings: _Readings,
+    accepted: NDArray[np.bool_],
+    *,
+    free_scale: bool,
+    bend: Mapping[str, float] | None = None,
+) -> _Solution:
+    """Least squares in the directions that the readings show; angles only for what translations cannot explain.
+
+    At one height an angle about a horizontal axis is the same as a straightness. The translations and the squareness are
+    therefore taken first, and of the angles what is left of their columns. ``bend`` says how much each curve bends between
+    nodes; without it that is found out first.
+    """
+    names = modelled_errors(machine)
+    layout = error_parameters(machine, names)
+    pose = _pose_columns(readings, free_scale=free_scale)
+    errors = _error_columns(machine, layout, readings)
+    used = accepted / readings.sigma_mm
+    angular, _ = _kinds(layout)
+    shown, _ = _seen_directions(errors * used[:, None], pose * used[:, None], angular)
+    seen = np.einsum("ij,ij->i", shown, shown)  # how much of each unknown is determined, 0 to 1
+    kept = [name for name, columns in _columns_of(layout) if seen[columns].max(initial=0.0) > SEEN]
+    if not kept:
+        raise UndeterminedError("the readings determine none of the machine's errors", [])
+    layout = error_parameters(machine, kept)
+    errors = _error_columns(machine, layout, readings)
+    angular, unit = _kinds(layout)
+    bends, tied = _ties(layout, readings, used, bend)
+    design = np.vstack([errors * used[:, None], bends])
+    frames = np.vstack([pose * used[:, None], np.zeros((len(bends), pose.shape[1]))])
+    shown, rank = _seen_directions(design, frames, angular)
+    whole = np.hstack([design @ shown, frames])
+    target = np.concatenate([readings.deviation_mm * used, np.zeros(len(bends))])
+    scale = np.linalg.norm(whole, axis=0)
+    scale = np.where(scale > 1e-9 * scale.max(), scale, scale.max())  # a column of rounding stays one
+    values = np.linalg.svd(whole / scale, compute_uv=False)
+    inverse = np.linalg.pinv(whole / scale, rcond=RCOND) / scale[:, None]
+    found = inverse @ target
+    unknowns = unit * (shown @ found[: shown.shape[1]])
+    poses = found[shown.shape[1] :]
+    residual = readings.deviation_mm - errors @ (unknowns / unit) - pose @ poses
+    spread = unit[:, None] * shown @ inverse[: shown.shape[1]]
+    size, direction = np.linalg.eigh(spread @ spread.T)
+    factor = direction * np.sqrt(np.maximum(size, 0.0))  # as wide as the unknowns, not as the readings
+    if bend is None and tied:
+        bend = _bends(layout, unknowns, tied)
+        return _solve(machine, readings, accepted, free_scale=free_scale, bend=bend)
+    share = np.einsum("ij,ij->i", shown, shown)
+    partly = tuple(name for name, columns in _columns_of(layout) if share[columns].min(initial=1.0) < 1.0 - 1e-4)
+    width = pose.shape[1] // len(np.unique(readings.setup))
+    u_poses = np.linalg.norm(inverse[shown.shape[1] :], axis=1).reshape(-1, width)
+    return _Solution(
+        layout,
+        unknowns,
+        factor,
+        poses.reshape(-1, width),
+        u_poses[:, 6] if free_scale else np.zeros(len(u_poses)),
+        residual,
+        rank,
+        float(values[0] / values[values > RCOND * values[0]][-1]),
+        _unreached(layout, readings.position_mm[accepted]),
+        left_out=tuple(name for name in names if name not in kept),
+        partly=partly,
+    )
+
+
+def _columns_of(layout: ErrorParameters) -> list[tuple[str, slice]]:
+    first = layout.size - len(layout.squareness)
+    squareness = [(name, slice(first + k, first + k + 1)) for k, name in enumerate(layout.squareness)]
+    return [*((curve.error.name, curve.columns) for curve in layout.curves), *squareness]
+
+
+def _kinds(layout: ErrorParameters) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Which unknowns belong to angular curves, and the unit of each: mm, and for all angles mm at ``LEVER_MM``."""
+    angular, unit = np.zeros(layout.size, dtype=bool), np.ones(layout.size)
+    for name, columns in _columns_of(layout):
+        angular[columns] = error_named(name).kind == "angular"
+        unit[columns] = 1.0 if error_named(name).kind == "linear" else 1.0 / LEVER_MM
+    return angular, unit
+
+
+def _pose_columns(readings: _Readings, *, free_scale: bool) -> FloatArray:
+    """Derivative of the readings by shift, turn and scale of each set-up about its centre, (k, 6 or 7 times set-ups)."""
+    unit = np.eye(3)[readings.component]
+    arm = readings.arm_mm
+    turn = np.cross(arm, unit)  # e . (w x p) = w . (p x e)
+    own = [unit, turn, np.einsum("ij,ij->i", unit, arm)[:, None]][: 3 if free_scale else 2]
+    block = np.hstack(own)
+    setups = np.unique(readings.setup)
+    return np.hstack([block * (readings.setup == setup)[:, None] for setup in setups])
+
+
+def _error_columns(machine: Machine, layout: ErrorParameters, readings: _Readings) -> FloatArray:
+    """Derivative of the readings by the unknown errors in the units of :func:`_kinds`, (k, size): rows of C times bases."""
+    columns = c_matrix(machine, readings.position_mm, readings.tool_mm)
+    bases = [layout.basis(axis, readings.position_mm[:, axis]) for axis in range(3)]
+    design = layout.design(columns, bases)
+    return np.asarray(design[np.arange(len(design)), readings.component] * _kinds(layout)[1])
+
+
+def _seen_directions(errors: FloatArray, frames: FloatArray, angular: NDArray[np.bool_]) -> tuple[FloatArray, int]:
+    """Orthonormal directions (size, r) of the unknown errors that the readings tell apart from the poses, and r.
+
+    The angles get what neither poses nor translations explain. Directions without effect stay out: an unknown in them is
+    zero, the smallest value that agrees with the readings.
+    """
+    explained = _range(frames)
+    parts = []
+    for group in (~angular, angular):
+        own = errors[:, group]
+        size = float(np.linalg.norm(own, axis=0).max(initial=0.0))
+        if not size:
+            continue
+        lever = np.maximum(np.linalg.norm(own, axis=0), 1e-9 * size)
+        rest = own / lever
+        rest = rest - explained @ (explained.T @ rest)
+        left, values, right = np.linalg.svd(rest, full_matrices=False)
+        shows = values > SHOWS * max(1.0, float(values[0]))
+        good = right[shows]
+        raw = np.zeros((len(angular), len(good)))
+        raw[np.flatnonzero(group)] = good.T / lever[:, None]
+        parts.append(np.linalg.qr(raw)[0] if len(good) else raw)
+        explained = np.hstack([explained, left[:, shows]])
+    shown = np.hstack(parts) if parts else np.zeros((len(angular), 0))
+    return shown, shown.shape[1]
+
+
+def _range(matrix: FloatArray) -> FloatArray:
+    """Orthonormal basis of the columns, (rows, rank); columns of very different size count alike."""
+    size = np.linalg.norm(matrix, axis=0)
+    matrix = matrix[:, size > 0] / size[size > 0]
+    left, values, _ = np.linalg.svd(matrix, full_matrices=False)
+    return np.asarray(left[:, values > 1e-9 * max(1.0, float(values.max(initial=0.0)))])
+
+
+def _unreached(layout: ErrorParameters, position_mm: FloatArray) -> dict[str, FloatArray]:
+    """Nodes without a reading in the intervals beside them, by error; ``position_mm`` (k, 3)."""
+    found = {}
+    for curve in layout.curves:
+        near = (hat_matrix(curve.nodes_mm, position_mm[:, curve.error.axis]) > 1e-6).any(axis=0)
+        if not near.all():
+            found[curve.error.name] = curve.nodes_mm[~near]
+    return found
+
+
+def _bends(layout: ErrorParameters, unknowns: FloatArray, tied: Mapping[str, FloatArray]) -> dict[str, float]:
+    """Second difference of the tied curves between nodes that readings show, rms, mm and rad; at least what is usual."""
+    found = {}
+    for curve in layout.curves:
+        if curve.error.name in tied:
+            unit = MM_PER_UM if curve.error.kind == "linear" else RAD_PER_URAD
+            bends = np.diff(curve.free @ unknowns[curve.columns], 2)
+            alone = set(tied[curve.error.name].tolist())
+            size = [
+                abs(bend)
+                for k, bend in enumerate(bends.tolist())
+                if not alone & set(curve.nodes_mm[k : k + 3].tolist())
+            ]
+            found[curve.error.name] = max(USUAL_BEND * unit, float(np.sqrt(np.mean(np.square(size)))) if size else 0.0)
+    return found
+
+
+def _ties(
+    layout: ErrorParameters, readings: _Readings, used: FloatArray, bend: Mapping[str, float] | None
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Rows that tie nodes with few readings or none to their neighbours by small second differences; those nodes by error.
+
+    A round plate hardly reaches the ends of the travel: without a tie the noise of a few holes there would turn the whole
+    curve, since a straightness is zero at both ends.
+    """
+    rows, tied = [], {}
+    for curve in layout.curves:
+        along = readings.position_mm[used > 0, curve.error.axis]
+        weight = (layout.basis(curve.error.axis, along) ** 2).sum(axis=0)
+        shown: NDArray[np.bool_] = weight > WEAK * np.median(weight)
+        if shown.all():
+            continue
+        near = (hat_matrix(curve.nodes_mm, along) ** 2).sum(axis=0)
+        tied[curve.error.name] = curve.nodes_mm[near <= WEAK * np.median(near)]
+        unit = MM_PER_UM if curve.error.kind == "linear" else RAD_PER_URAD
+        for k in range(1, len(shown) - 1):
+            if not shown[k - 1 : k + 2].all():
+                second = np.zeros(len(shown))
+                second[k - 1 : k + 2] = [1.0, -2.0, 1.0]
+                row = np.zeros(layout.size)
+                allowed = (bend or {}).get(curve.error.name, USUAL_BEND * unit)
+                row[curve.columns] = second @ curve.free / allowed * _kinds(layout)[1][curve.columns]
+                rows.append(row)
+    return (np.array(rows) if rows else np.zeros((0, layout.size))), tied
+
+
+def _say_what_is_not_reached(solution: _Solution) -> None:
+    texts = [f"{name} at {', '.join(f'{value:g}' for value in nodes)} mm" for name, nodes in solution.unreached.items()]
+    if not texts:
+        return
+    warnings.warn(
+        f"no reading reaches {'; '.join(texts[:6])}{' ...' if len(texts) > 6 else ''}: these nodes follow their "
+        "neighbours by smoothness, with the uncertainty of an extrapolation; --range from-data keeps to what was measured",
+        CompgenWarning,
+        stacklevel=4,
+    )
+
+
+def _free_pose_result(
+    machine: Machine,
+    deviations: Deviations,
+    readings: _Readings,
+    solution: _Solution,
+    accepted: NDArray[np.bool_],
+    source: str,
+) -> Identification:
+    layout = solution.layout
+    columns = _pose_columns(readings, free_scale=solution.poses.shape[1] == 7)
+    freedom = int(np.count_nonzero(accepted)) - solution.rank - _range(columns).shape[1]
+    used = readings.kept(accepted)
+    if freedom < 1:
+        raise UndeterminedError(
+            f"{np.count_nonzero(accepted)} coordinates for {solution.rank} unknowns and the poses", []
+        )
+    standard = (solution.residual_mm / readings.sigma_mm)[accepted]
+    chi_square = float(standard @ standard) / freedom
+    u_scale = uncertainty_scale(chi_square, source)
+    errors, values_factor = _error_table(layout, solution.unknowns, solution.factor * u_scale)
+    errors = errors.replace(metadata=metadata_of(machine, deviations.metadata))
+    poses = _poses(deviations, readings, solution, u_scale)
+    return Identification(
+        errors=errors,
+        residual_mm=-solution.residual_mm,
+        accepted=accepted,
+        rms_um=float(np.sqrt(np.mean(solution.residual_mm[accepted] ** 2))) / MM_PER_UM,
+        degrees_of_freedom=freedom,
+        reduced_chi_square=chi_square,
+        u_source=source,
+        u_length_um=float(np.median(readings.sigma_mm)) / MM_PER_UM,
+        u_scale=u_scale,
+        unobservable=tuple(
+            [f"{name}: no reading shows it" for name in ERROR_NAMES if name not in errors.names]
+            + [
+                f"{name}: a part of it is not told apart from the pose, the scale or other errors"
+                for name in solution.partly
+            ]
+        ),
+        rejected=rejected_components(
+            deviations, readings.row, readings.component, -solution.residual_mm, readings.sigma_mm, accepted
+        ),
+        rank=solution.rank,
+        unknowns=solution.rank,
+        condition=solution.condition,
+        worst_u=worst_uncertainty(errors),
+        layout=layout,
+        method="deviations",
+        values_factor=values_factor,
+        details={
+            "poses": [pose.summary() for pose in poses],
+            "range_mm": {
+                letter: [float(column.min()), float(column.max())]
+                for letter, column in zip(AXES, deviations.position_mm.T, strict=True)
+            },
+            "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
+        },
+        misfit=misfit_of(
+            chi_square,
+            freedom,
+            u_scale,
+            source,
+            lambda: residual_series(
+                deviations, used.row, solution.residual_mm[accepted], used.sigma_mm, used.component
+            ),
+        ),
+    )
+
+
+def _error_table(layout: ErrorParameters, unknowns: FloatArray, factor: FloatArray) -> tuple[ErrorTable, FloatArray]:
+    """Curves and squareness, and the factor of the covariance of their values in the order of the errors file."""
+    values, rows = [], {}
+    for name, position_mm, columns, matrix in error_values(layout):
+        rows[name] = matrix @ factor[columns]
+        values.append((name, position_mm, matrix @ unknowns[columns], np.linalg.norm(rows[name], axis=1)))
+    table = table_of_values(values)
+    return table, np.vstack([rows[name] for name in table.names])
+
+
+def _poses(
+    deviations: Deviations,
+    readings: _Readings,
+    solution: _Solution,
+    u_scale: float,
+) -> list[FramePose]:
+    """The pose of each set-up: the rotation that was taken out first, and the small one that was adjusted."""
+    from scipy.spatial.transform import Rotation  # imported here: slow to load, and few measurements need it
+
+    setups, found = setups_of(deviations), []
+    for k, setup in enumerate(np.unique(setups).tolist()):
+        own = setups == setup
+        components = np.isfinite(deviations.deviation_mm[own]).any(axis=0)
+        shift, small = solution.poses[k][:3], solution.poses[k][3:6]
+        scale = 1.0 + (solution.poses[k][6] if solution.poses.shape[1] == 7 else 0.0)
+        rough = deviations.poses[setup]
+        turn = Rotation.from_matrix(rough.rotation) * Rotation.from_rotvec(small)
+        offset = rough.measured_mm + rough.rotation @ shift - scale * turn.apply(rough.nominal_mm)
+        turning = np.array([components[[1, 2]].any(), components[[0, 2]].any(), components[[0, 1]].any()])
+        found.append(
+            FramePose(
+                setup,
+                np.where(components, offset, np.nan),
+                np.where(turning, turn.as_rotvec(), np.nan),
+                float(scale),
+                float(solution.u_scale[k] * u_scale),
+                int(np.count_nonzero(readings.setup == setup)),
+            )
+        )
+    return found
+
+
+# Errors from positions measured against commanded ones (``*.deviations.csv``): the separation step on its own.
+#
+# The rigid placement of the measured frame is unknown (six unknowns more), so that a file in the frame of any instrument
+# will do as long as its axes are those of the machine to a few degrees.
+
+
+def identify_deviations(
+    machine: Machine, deviations: Deviations, options: IdentifyOptions | None = None
+) -> Identification:
+    """Identify the errors of a machine from measured positions.
+
+    Parameters
+    ----------
+    machine : chain, nodes, reference point and which errors its model contains.
+    deviations : measured minus commanded position; any of the three components.
+    options : ``u_deviation_um`` and ``reject`` count.
+
+    Raises
+    ------
+    InputError
+        for positions outside the travel, or an uncertainty that is not above zero.
+    UndeterminedError
+        if the positions do not determine the errors; it names the combinations.
+    ConvergenceError
+        if no optimum is reached.
+    """
+    chosen = options or IdentifyOptions()
+    check_travel(machine, deviations.position_mm, deviations.origin)
+    with one_thread():
+        deviations, effects = without_effects(machine, deviations)
+        identified = identify_with_free_pose if needs_free_pose(deviations) else _identify
+        found = identified(machine, deviations, chosen)
+        return replace(found, corrections={**found.corrections, "effects": effects}) if effects else found
+
+
+def _identify(machine: Machine, deviations: Deviations, options: IdentifyOptions) -> Identification:
+    tool_mm = common_tool(machine, deviations.tool_mm)
+    layout = parameters_for_tools(machine, tool_mm)
+    index = np.flatnonzero(np.isfinite(deviations.deviation_mm.ravel())).astype(np.int64)
+    sigma_mm, source = deviation_sigma(deviations, options)
+    sigma_mm = sigma_mm.ravel()[index]
+    problem = _problem(layout, deviations, tool_mm, index, sigma_mm)
+    factor, _ = determined_factor(problem.normal_matrix(problem.start), problem.unknown_names, "the measured positions")
+
+    def fit(accepted: NDArray[np.bool_], before: LeastSquaresSolution | None) -> LeastSquaresSolution:
+        if before is None:
+            return solve(problem, problem.start, factor)
+        weight = np.zeros(3 * len(problem.position_mm))
+        weight[index] = accepted
+        return solve(problem.weighted(weight), before.state)
+
+    solution, accepted = fit_accepted(
+        fit,
+        lambda found: problem.residuals(found.state)[index] / sigma_mm,
+        len(index),
+        "deviations do not fit the model; check the machine file's chain, the axis order, signs and units",
+        reject=options.reject,
+    )
+    return _separation_result(problem, deviations, index, sigma_mm, source, solution, accepted)
+
+
+def _problem(
+    layout: ErrorParameters, deviations: Deviations, tool_mm: FloatArray, index: IntArray, sigma_mm: FloatArray
+) -> SeparationProblem:
+    count = len(deviations)
+    tools = np.broadcast_to(tool_mm, deviations.position_mm.shape)
+    weight = np.zeros(3 * count)
+    weight[index] = 1.0 / sigma_mm**2
+    bases = tuple(layout.basis(axis, deviations.position_mm[:, axis]) for axis in range(3))
+    return SeparationProblem(
+        parameters=layout,
+        bases=bases,  # type: ignore[arg-type]
+        position_mm=deviations.position_mm,
+        tool_mm=tools,
+        measured_mm=deviations.position_mm + tools + np.nan_to_num(deviations.deviation_mm),
+        information=weight.reshape(count, 3, 1) * np.eye(3),
+        lever=np.zeros((count, 3, 0)),
+        station_information=np.zeros((0, 0)),
+    )
+
+
+def _separation_result(
+    problem: SeparationProblem,
+    deviations: Deviations,
+    index: IntArray,
+    sigma_mm: FloatArray,
+    source: str,
+    solution: LeastSquaresSolution,
+    accepted: NDArray[np.bool_],
+) -> Identification:
+    layout = problem.parameters
+    residual = problem.residuals(solution.state)[index]
+    freedom = int(np.count_nonzero(accepted)) - problem.size
+    if freedom < 1:
+        raise UndeterminedError(f"{np.count_nonzero(accepted)} deviations for {problem.size} unknowns", [])
+    chi_square = float(np.sum((residual / sigma_mm)[accepted] ** 2)) / freedom
+    u_scale = uncertainty_scale(chi_square, source)
+    # normal matrix of the errors, the placement of the frame eliminated
+    whole, size = solution.factor.matrix, layout.size
+    reduced = whole[:size, :size] - whole[size:, :size].T @ np.linalg.solve(whole[size:, size:], whole[size:, :size])
+    row, component = np.divmod(index, 3)
+    adjustment = Adjustment(
+        state=State(solution.state.errors, np.zeros((0, 3)), np.zeros(0)),
+        factor=factorise(0.5 * (reduced + reduced.T)),
+        weight=accepted / sigma_mm**2,
+        group=np.zeros(0, dtype=np.int64),
+        sigma_mm=u_scale,
+    )
+    errors = error_table(layout, solution.state.errors, adjustment.covariance_factor())
+    errors = errors.replace(metadata=metadata_of(layout.machine, deviations.metadata))
+    return Identification(
+        errors=errors,
+        residual_mm=residual,
+        accepted=accepted,
+        rms_um=float(np.sqrt(np.mean(residual[accepted] ** 2))) / MM_PER_UM,
+        degrees_of_freedom=freedom,
+        reduced_chi_square=chi_square,
+        u_source=source,
+        u_length_um=float(np.median(sigma_mm)) / MM_PER_UM,
+        u_scale=u_scale,
+        unobservable=unobservable(layout),
+        rejected=rejected_components(deviations, row, component, residual, sigma_mm, accepted),
+        rank=problem.size,
+        unknowns=problem.size,
+        condition=1.0 / solution.factor.rcond,
+        iterations=solution.iterations,
+        worst_u=worst_uncertainty(errors),
+        layout=layout,
+        adjustment=adjustment,
+        method="deviations",
+        misfit=misfit_of(
+            chi_square,
+            freedom,
+            u_scale,
+            source,
+            lambda: residual_series(
+                deviations, row[accepted], residual[accepted], sigma_mm[accepted], component[accepted]
+            ),
+        ),
+    )

@@ -1,0 +1,546 @@
+"""Errors, stations and dead lengths from tracer lengths (Zha & Zhang 2024, section 5), from readings to result."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.lengths import Lengths
+from compgen.data.machine import Machine
+from compgen.data.names import MM_PER_UM
+from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
+from compgen.identify.adjust.problem import LengthProblem, length_problem
+from compgen.identify.adjust.propagation import Adjustment
+from compgen.identify.adjust.rank import Rank, describe_rank, determined_factor, unknown_names
+from compgen.identify.adjust.residual_tests import EXPLAINS, Cause, drift_of_repeats, labels_of, split_labels
+from compgen.identify.adjust.robust import RobustFit, WeightedReadings, belonging, explain_rejected, fit_robustly
+from compgen.identify.adjust.solver import Factor, solve
+from compgen.identify.adjust.starts import (
+    StationStart,
+    affine_start,
+    robust_state,
+    start_moments,
+    station_start,
+    station_start_from_moments,
+    station_starts_from_moments,
+)
+from compgen.identify.adjust.unknowns import (
+    ErrorParameters,
+    IntArray,
+    State,
+    check_travel,
+    common_tool,
+    parameters_for_tools,
+)
+from compgen.identify.covariance import with_systematic
+from compgen.identify.identification import (
+    Identification,
+    StationResult,
+    error_table,
+    metadata_of,
+    uncertainty_scale,
+    unobservable,
+    worst_uncertainty,
+)
+from compgen.identify.options import (
+    IdentifyOptions,
+    KnownStations,
+    ReadingNoise,
+    locate_stations,
+    reading_noise,
+    with_known_positions,
+    with_known_start,
+)
+from compgen.identify.reference_conditions import identify_at_reference
+from compgen.identify.two_step import TracerReadings, solve_in_two_steps
+from compgen.kinematics.kernel_switch import one_thread
+
+# The readings of an identification with the problem that they pose, and start values in closed form.
+
+
+AnyProblem = GridProblem | LengthProblem
+
+
+@dataclass(frozen=True)
+class Task:
+    """The readings with everything that the steps of the identification share."""
+
+    machine: Machine
+    lengths: Lengths
+    problem: AnyProblem
+    station: IntArray
+    group: IntArray
+
+    @cached_property
+    def target_mm(self) -> FloatArray:
+        """Nominal target of every reading, (n, 3)."""
+        return self.lengths.position_mm + common_tool(self.machine, self.lengths.tool_mm)
+
+    def unknown_names(self) -> list[str]:
+        """Names of all unknowns, for messages."""
+        return unknown_names(self.problem, self.lengths.stations, self.station, self.group)
+
+
+def check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
+    """Raise InputError for fewer than ``least`` stations, and for positions outside the travel."""
+    if len(lengths.stations) < least:
+        raise InputError(
+            f"contains readings of {len(lengths.stations)} station(s) ({', '.join(lengths.stations)}); identification "
+            f"needs at least {least}: with fewer unknown stations a function-valued ambiguity is left. Add the "
+            "missing station, measure with the same tracer from more places, or give known stations",
+            file=lengths.origin[0][0] if lengths.origin else None,
+        )
+    check_travel(machine, lengths.position_mm, lengths.origin)
+
+
+def task_of(machine: Machine, lengths: Lengths) -> Task:
+    """Lay out the unknowns for the readings, all with weight 1."""
+    tool_mm = common_tool(machine, lengths.tool_mm)
+    layout = parameters_for_tools(machine, tool_mm)
+    group = dead_lengths_of(lengths)
+    problem = problem_of(machine, lengths, layout, group)
+    return Task(machine, lengths, problem, lengths.station, group)
+
+
+def problem_of(
+    machine: Machine, lengths: Lengths, layout: ErrorParameters, group: IntArray
+) -> GridProblem | LengthProblem:
+    """Return the least-squares problem of the readings: on a grid of levels where they form one, else point by point."""
+    tool_mm = common_tool(machine, lengths.tool_mm)
+    on_grid = grid_problem(layout, lengths.position_mm, tool_mm, lengths.station, group, lengths.length_mm)
+    return on_grid or length_problem(machine, lengths, layout, group)
+
+
+def dead_lengths_of(lengths: Lengths) -> IntArray:
+    """Index of the dead length of every reading: one for every station and set-up."""
+    setup = lengths.labels.get("setup")
+    if setup is None or not np.any(setup != setup[0]):
+        return lengths.station
+    _, group = np.unique(np.column_stack([lengths.station, setup]), axis=0, return_inverse=True)
+    return group.ravel().astype(np.int64)
+
+
+def start_values(task: Task) -> tuple[State, list[int]]:
+    """Return the start values, and the stations that the closed form could not locate."""
+    stations = np.zeros((len(task.lengths.stations), 3))
+    groups = int(task.group.max()) + 1
+    dead = np.zeros(groups)
+    station_of = np.zeros(groups, dtype=np.int64)
+    station_of[task.group] = task.station
+    moments = start_moments(task.problem) if isinstance(task.problem, GridProblem) else None
+    readings = np.bincount(task.station, minlength=len(stations))
+    searched: list[int] = []
+    at_once: list[StationStart | None] = [None] * len(stations)
+    if moments is not None and groups == len(stations):
+        at_once = station_starts_from_moments(*moments)
+    for k in range(len(stations)):
+        own = np.flatnonzero(station_of == k)
+        if readings[k] < 4 + len(own):
+            origin = task.lengths.origin
+            file = origin[int(np.flatnonzero(task.station == k)[0])][0] if origin else None
+            message = f"station {task.lengths.stations[k]!r} has only {readings[k]} reading(s); it cannot be located"
+            raise InputError(message, file=file)
+        found = at_once[k]
+        if found is None and moments is not None:
+            sums, offset, centre, scale = moments
+            found = station_start_from_moments(sums[own], offset[own], centre, scale)
+        if found is None:
+            rows = task.station == k
+            member = np.searchsorted(own, task.group[rows])
+            found = station_start(task.target_mm[rows], task.lengths.length_mm[rows], member, len(own))
+            searched.append(k)
+        stations[k], dead[own] = found.position_mm, found.dead_length_mm
+    return State(np.zeros(task.problem.parameters.size), stations, dead), searched
+
+
+def with_weights(task: Task, start: State, noise: ReadingNoise) -> tuple[Task, FloatArray, FloatArray]:
+    """Return the task with weighted readings, their standard uncertainty in mm and their weights, each (n,)."""
+    if noise.uniform_mm is not None:  # the problem came with weights 1
+        count = len(task.lengths)
+        return task, np.full(count, noise.uniform_mm), np.ones(count)
+    sigma_mm = noise.sigma_mm(task.problem.distances(start))
+    weights = (sigma_mm.min() / sigma_mm) ** 2
+    return replace(task, problem=task.problem.weighted(weights)), sigma_mm, weights
+
+
+# What the readings leave open at the start, before anything is adjusted.
+
+
+#: Eigenvalue of the scaled normal matrix below which a combination is named when nothing converges.
+HARDLY_DETERMINED = 1e-6
+
+
+def determined(task: Task, start: State) -> tuple[Factor, Rank | None]:
+    """Return the factor of the normal matrix at the start; UndeterminedError if it is singular."""
+    return determined_factor(task.problem.normal_matrix(start), task.unknown_names, "the readings")
+
+
+def unmirrored(task: Task, start: State, searched: Sequence[int]) -> State:
+    """Choose the side for stations whose targets all lie in a plane: its mirror image explains the readings as well.
+
+    Only the machine's errors, seen from the other stations, tell the two apart; so both are tried.
+    """
+    for k in searched:
+        targets = task.target_mm[task.station == k]
+        centre = targets.mean(axis=0)
+        _, spread, directions = np.linalg.svd(np.cov((targets - centre).T))
+        if spread[2] > 1e-6 * spread[0]:
+            continue
+        across = directions[2]
+        mirrored = start.stations_mm.copy()
+        mirrored[k] -= 2.0 * across * float(across @ (mirrored[k] - centre))
+        other = State(start.errors, mirrored, start.dead_length_mm)
+        if _cost_from(task.problem, other) < _cost_from(task.problem, start):
+            start = other
+    return start
+
+
+def _cost_from(problem: AnyProblem, start: State) -> float:
+    try:
+        return solve(problem, start).cost
+    except ConvergenceError:
+        return np.inf
+
+
+def weakness(task: Task, factor: Factor) -> str:
+    """Say which combinations are hardly determined, where that may be why nothing converged."""
+    rank = describe_rank(factor.matrix, task.unknown_names(), HARDLY_DETERMINED)
+    if rank.rank == rank.size:
+        return ""
+    return (
+        f"; hardly determined even at the start: {'; '.join(rank.combinations[:3])}; stations must not lie on a line, "
+        "nor in a plane with an end of the travel"
+    )
+
+
+# From the optimum to what the user gets: curves, stations, uncertainties, and what was rejected.
+
+
+def assemble(
+    task: Task,
+    fit: RobustFit[AnyProblem],
+    sigma_mm: FloatArray,
+    noise: ReadingNoise,
+    rank: Rank | None,
+) -> Identification:
+    """Return what the user gets of a finished adjustment.
+
+    Parameters
+    ----------
+    task : the readings and their problem.
+    fit : the optimum, which readings were used, and the residuals.
+    sigma_mm : standard uncertainty of each reading, (n,).
+    noise : where that comes from.
+    rank : the detailed look at the rank, if it was taken.
+
+    Raises
+    ------
+    UndeterminedError
+        if fewer readings than unknowns are left.
+    """
+    problem, layout = task.problem, task.problem.parameters
+    solution, accepted, residual = fit.solution, fit.accepted, fit.residual_mm
+    known = problem.known
+    freedom = int(np.count_nonzero(accepted)) - problem.size + (len(known) if known else 0)
+    if freedom < 1:
+        raise UndeterminedError(f"{np.count_nonzero(accepted)} readings for {problem.size} unknowns", [])
+    everything = bool(accepted.all())
+    used = residual if everything else residual[accepted]
+    standardised = used / (sigma_mm if everything else sigma_mm[accepted])
+    square_sum = float(standardised @ standardised)
+    square_sum += known.square_sum(solution.state) / float(sigma_mm.min()) ** 2 if known else 0.0
+    chi_square = square_sum / freedom
+    u_scale = uncertainty_scale(chi_square, noise.source)
+    least = float(sigma_mm.min())
+    known_weight = None
+    if known:
+        known_weight = np.zeros(problem.size)
+        known_weight[known.columns(layout.size)] += known.weight[:, None]
+    adjustment = Adjustment(
+        state=solution.state,
+        factor=solution.factor,
+        weight=(least / sigma_mm) ** 2 * accepted,
+        group=task.group,
+        sigma_mm=least * u_scale,
+        known_weight=known_weight,
+    )
+    errors = error_table(layout, solution.state.errors, adjustment.covariance_factor()[: layout.size])
+    errors = errors.replace(metadata=metadata_of(task.machine, task.lengths.metadata))
+    rejected = np.flatnonzero(~accepted)
+    return Identification(
+        errors=errors,
+        stations=_stations(task, adjustment, residual, accepted),
+        residual_mm=residual,
+        accepted=accepted,
+        rms_um=float(np.sqrt(used @ used / len(used))) / MM_PER_UM,
+        degrees_of_freedom=freedom,
+        reduced_chi_square=chi_square,
+        u_source=noise.source,
+        u_length_um=noise.constant_um,
+        u_length_um_per_m=noise.proportional_um_per_m,
+        u_scale=u_scale,
+        unobservable=unobservable(layout),
+        rejected=explain_rejected(
+            task.lengths, layout, solution.state, task.group, rejected, residual, sigma_mm, fit.segments
+        ),
+        segments=fit.segments,
+        rank=problem.size if rank is None else problem.size - (rank.size - rank.rank),
+        unknowns=problem.size,
+        condition=1.0 / solution.factor.rcond,
+        iterations=solution.iterations,
+        worst_u=worst_uncertainty(errors),
+        layout=layout,
+        adjustment=adjustment,
+    )
+
+
+def _stations(
+    task: Task, adjustment: Adjustment, residual: FloatArray, accepted: NDArray[np.bool_]
+) -> tuple[StationResult, ...]:
+    state, factor = adjustment.state, adjustment.covariance_factor()
+    u = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    first = task.problem.parameters.size
+    second = first + state.stations_mm.size
+    groups = len(state.dead_length_mm)
+    everything = bool(accepted.all())
+    used = np.bincount(task.group, None if everything else accepted, groups)
+    squares = np.bincount(task.group, residual**2 if everything else residual**2 * accepted, groups)
+    setups = task.lengths.labels.get("setup", np.zeros(len(task.lengths), dtype=np.int64))
+    row_of = np.zeros(groups, dtype=np.int64)
+    row_of[task.group] = np.arange(len(task.group))
+    results: list[StationResult] = []
+    for group in range(groups):
+        k = int(task.station[row_of[group]])
+        x, y, z = state.stations_mm[k].tolist()
+        u_x, u_y, u_z = u[first + 3 * k : first + 3 * k + 3].tolist()
+        results.append(
+            StationResult(
+                station=task.lengths.stations[k],
+                setup=int(setups[row_of[group]]),
+                position_mm=(x, y, z),
+                u_position_mm=(u_x, u_y, u_z),
+                dead_length_mm=float(state.dead_length_mm[group]),
+                u_dead_length_mm=float(u[second + group]),
+                readings=int(used[group]),
+                rms_um=float(np.sqrt(squares[group] / max(used[group], 1.0))) / MM_PER_UM,
+                segment=sum((r.station, r.setup) == (task.lengths.stations[k], setups[row_of[group]]) for r in results),
+            )
+        )
+    return tuple(results)
+
+
+# Joint identification of error curves, squareness, stations and dead lengths from tracer lengths.
+#
+# Zha & Zhang 2024, section 5 (eq. 22-28), with the exact machine model in place of C P and the constraints of
+# ``docs/conventions.md`` by elimination.
+
+
+MIN_STATIONS = 3
+
+
+def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None = None) -> Identification:
+    """Identify the errors of a machine, the stations and the dead lengths from tracer lengths.
+
+    Parameters
+    ----------
+    machine : chain, nodes, reference point and which errors its model contains.
+    lengths : readings of three or more stations (one tracer at three or more places counts as so many).
+    options : uncertainty of the readings and of inputs that they share, rejection.
+
+    Raises
+    ------
+    InputError
+        for fewer than three stations, or positions outside the travel.
+    UndeterminedError
+        if the readings do not determine the unknowns; it names the combinations.
+    ConvergenceError
+        if no optimum is reached.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> lengths = compgen.read_lengths("examples/zha-gantry.lengths.csv")
+    >>> found = compgen.identify(machine, lengths)
+    >>> value, u = found.errors.squareness["EC0Y"]
+    >>> print(f"{1e6 * value:.1f} +- {1e6 * u:.1f} urad")
+    2903.6 +- 0.2 urad
+    """
+    chosen = options or IdentifyOptions()
+    with one_thread():
+        try:
+            found = _at_reference(machine, lengths, chosen)
+        except ConvergenceError as error:
+            raise ConvergenceError(f"{error}{_explained(machine, lengths, chosen)}") from error
+        return with_systematic(machine, lengths, _with_causes(machine, lengths, chosen, found), chosen.systematic)
+
+
+def _at_reference(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification:
+    def rough(readings: Lengths) -> tuple[ErrorParameters, State, IntArray]:
+        """Unknown errors, start values of everything and the dead length of each reading."""
+        task = task_of(machine, readings)
+        start, _ = robust_state(start_values(task)[0], readings, task.target_mm, task.station, task.group)
+        return task.problem.parameters, start, task.group
+
+    def adjust(readings: Lengths) -> Identification:
+        return _identify(machine, readings, options)
+
+    return identify_at_reference(machine, lengths, adjust, rough, temperature=options.temperature)
+
+
+def _with_causes(machine: Machine, lengths: Lengths, options: IdentifyOptions, found: Identification) -> Identification:
+    """Add to a misfit what explains most of it: the errors are identified again with dead lengths for each run, ..."""
+    misfit = found.misfit
+    if misfit is None or misfit.series is None or misfit.causes:
+        return found
+    for code, text, label in split_labels(misfit.series):
+        every = np.full(len(lengths), int(label.min()), dtype=np.int64)
+        every[found.accepted] = label
+        again = _split_by(machine, lengths, options, every)
+        if again is None:
+            continue
+        share = 1.0 - again.reduced_chi_square / misfit.reduced_chi_square
+        if share > EXPLAINS:
+            return replace(found, misfit=replace(misfit, causes=(Cause(code, text, round(share, 4)),)))
+    drift_mm = drift_of_repeats(lengths)
+    again = (
+        None
+        if drift_mm is None
+        else _quietly(machine, replace(lengths, length_mm=lengths.length_mm - drift_mm), options)
+    )
+    share = 0.0 if again is None else 1.0 - again.reduced_chi_square / misfit.reduced_chi_square
+    if drift_mm is None or share <= EXPLAINS:
+        return found
+    text = f"a drift with time over a range of about {float(np.ptp(drift_mm)) / MM_PER_UM:.3g} um"
+    return replace(found, misfit=replace(misfit, causes=(Cause("drift", text, round(share, 4)),)))
+
+
+def _explained(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> str:
+    """Say what makes readings fit that no optimum was found for; empty if nothing simple does."""
+    for name, label in labels_of(lengths.labels, lengths.origin, lengths.position_mm, lengths.station).items():
+        if label.min() < label.max() and _split_by(machine, lengths, options, label) is not None:
+            found = f"with dead lengths of its own for each {name} the readings fit: there is a step between {name}s"
+            return f"; {found}; `volcomp diagnose` shows it"
+    return "; `volcomp diagnose` looks for what the model lacks"
+
+
+def _split_by(machine: Machine, lengths: Lengths, options: IdentifyOptions, label: IntArray) -> Identification | None:
+    """Identify with a set-up, and so dead lengths, of its own for each value of a label (n,); None where that fails."""
+    setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
+    _, number = np.unique(np.column_stack([setup, label]), axis=0, return_inverse=True)
+    labels = {**lengths.labels, "setup": np.asarray(number, dtype=np.int64).ravel()}
+    return _quietly(machine, replace(lengths, labels=labels), options)
+
+
+def _quietly(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification | None:
+    """Identify without warnings; None where that fails."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        try:
+            return _at_reference(machine, lengths, options)
+        except CompgenError:
+            return None
+
+
+def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification:
+    check_readings(machine, lengths, 1 if options.stations is not None else MIN_STATIONS)
+    task = task_of(machine, lengths)
+    start, searched = start_values(task)
+    if not searched and options.stations is None and options.method == "joint":
+        found = _undisturbed(task, start, options)
+        if found is not None:
+            return found
+    start, disturbed = robust_state(start, lengths, task.target_mm, task.station, task.group)
+    noise = reading_noise(lengths, options)
+    task, sigma_mm, weights = with_weights(task, start, noise)
+    if options.stations is not None:
+        task, start = _with_known_stations(task, start, options.stations, float(sigma_mm.min()))
+    factor, rank = determined(task, start)
+    start = unmirrored(task, start, searched)
+    if options.method == "two-step":
+        return _two_step_result(task, start, sigma_mm, noise, options)
+    readings = WeightedReadings(lengths, task.target_mm, task.group, weights, sigma_mm)
+    try:
+        fit = _fit(task, start, readings, factor, options, disturbed=disturbed)
+    except ConvergenceError as error:
+        raise ConvergenceError(f"{error}{weakness(task, factor)}") from error
+    task = replace(task, problem=fit.problem, group=fit.group)
+    return assemble(task, fit, sigma_mm, noise, rank)
+
+
+def _undisturbed(task: Task, start: State, options: IdentifyOptions) -> Identification | None:
+    """Identify by plain least squares; None where a reading does not belong, or where it does not converge.
+
+    Undisturbed readings are the rule, and need none of the search for gross errors.
+    """
+    if isinstance(task.problem, GridProblem):
+        start = affine_start(task.problem, start)
+    noise = reading_noise(task.lengths, options)
+    task, sigma_mm, _ = with_weights(task, start, noise)
+    try:
+        factor, rank = determined(task, start)
+        solution = solve(task.problem, start, factor)
+    except (ConvergenceError, UndeterminedError):
+        return None
+    residual = task.problem.residuals(solution.state)
+    if options.reject and not belonging(residual / sigma_mm):
+        return None
+    accepted = np.ones(len(residual), dtype=bool)
+    return assemble(task, RobustFit(task.problem, task.group, solution, accepted, residual), sigma_mm, noise, rank)
+
+
+def _with_known_stations(
+    task: Task, start: State, stations: KnownStations | Literal["nominal"], sigma_mm: float
+) -> tuple[Task, State]:
+    """Add the known stations to the problem and start from them."""
+    known = stations if isinstance(stations, KnownStations) else locate_stations(task.machine, task.lengths)
+    if known is not stations:
+        message = "the stations were located with the machine taken as perfect: its errors are part of their positions"
+        warnings.warn(f"{message} (to {known.u_mm.max() * 1e3:.1f} um)", CompgenWarning, stacklevel=5)
+    start = with_known_start(start, known, task.lengths, task.target_mm, task.group)
+    return replace(task, problem=with_known_positions(task.problem, known, task.lengths.stations, sigma_mm)), start
+
+
+def _two_step_result(
+    task: Task, start: State, sigma_mm: FloatArray, noise: ReadingNoise, options: IdentifyOptions
+) -> Identification:
+    """Identify by self-calibration, transformation and separation (Zha & Zhang 2024, sections 4 and 5)."""
+    if options.stations is not None:
+        raise InputError("known stations need the joint method; in the two-step method the tracers locate themselves")
+    readings = TracerReadings(task.lengths, task.problem.parameters, task.group, sigma_mm, start)
+    found = solve_in_two_steps(readings, reject=options.reject)
+    residual = task.problem.residuals(found.solution.state)
+    fit = RobustFit(task.problem, task.group, found.solution, found.accepted, residual)
+    result = assemble(task, fit, sigma_mm, noise, None)
+    reasons = {item.row: item for item in found.rejected}
+    return replace(
+        result,
+        rejected=tuple(reasons.get(item.row, item) for item in result.rejected),
+        method="two-step",
+        steps=found.summary,
+        positions=found.located.deviations,
+    )
+
+
+def _fit(
+    task: Task, start: State, readings: WeightedReadings, factor: Factor, options: IdentifyOptions, *, disturbed: bool
+) -> RobustFit[AnyProblem]:
+    """Adjust with rejection and beam breaks, or with all readings as they are."""
+    if not options.reject:
+        solution = solve(task.problem, start, factor)
+        accepted = np.ones(len(readings.group), dtype=bool)
+        return RobustFit(task.problem, task.group, solution, accepted, task.problem.residuals(solution.state))
+
+    def rebuilt(group: IntArray) -> AnyProblem:
+        problem = problem_of(task.machine, task.lengths, task.problem.parameters, group).weighted(readings.weight)
+        return replace(problem, known=task.problem.known)
+
+    return fit_robustly(task.problem, start, readings, factor, rebuilt, disturbed=disturbed)

@@ -1,0 +1,317 @@
+"""Six-DOF runs to the 21 errors, and comparison with reference instruments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM, error_named
+from compgen.errors import InputError
+from compgen.instruments.interferometer import growth_mm
+from compgen.instruments.sixdof_instrument import ERRORS_OF_AXIS, RAD_PER_ARCSEC, SixDofInstrument
+from compgen.instruments.sixdof_readings import SixDof
+from compgen.instruments.sixdof_reduction import (
+    AxisRun,
+    along,
+    errors_of_run,
+    expected_away,
+    printed_run,
+    reduce_runs,
+    turned_by,
+    zeroed,
+)
+from compgen.kinematics.curves import fitted_line
+
+# Runs of all axes to the 21 errors: mean over runs, lines out of the straightness, squareness from their slopes.
+
+
+#: (S_xy, S_xz, S_yz): for each the two straightnesses, as (component, moving axis), whose slopes add up to it.
+SLOPES = (((1, 0), (0, 1)), ((2, 0), (0, 2)), ((2, 1), (1, 2)))
+SQUARENESS = ("EC0Y", "EB0Z", "EA0Z")
+#: Positions of two runs that differ by less are the same target, mm.
+SAME_MM = 1e-4
+
+
+@dataclass(frozen=True)
+class AxisErrors:
+    """Errors of one axis at its target positions, n of them.
+
+    Parameters
+    ----------
+    position_mm : ascending, (n,).
+    delta_mm, eps_rad : means over all runs, (n, 3), zero at the reference point.
+    spread : half of the range over the runs, (n, 6): three translations in mm, three rotations in rad (half-range
+        repeatability); nan where there is one run only.
+    reversal : mean of the runs in positive direction less those in negative direction, (n, 6), or None.
+    count : runs at each position, (n,).
+    turned_by : how often the rotation of each other axis, where it stood, is still in the translations.
+    """
+
+    axis: int
+    position_mm: FloatArray
+    delta_mm: FloatArray
+    eps_rad: FloatArray
+    spread: FloatArray
+    reversal: FloatArray | None
+    count: FloatArray
+    turned_by: Mapping[int, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The identified errors and what they were made of.
+
+    Parameters
+    ----------
+    errors : in mm and rad, zero at the machine's reference point, uncertainties nan.
+    axes : means of each measured axis.
+    slopes : slope of each straightness by ISO name, rad, carriers' rotation taken out.
+    squareness_rad : S_xy, S_xz, S_yz by the ISO name (EC0Y, EB0Z, EA0Z), as far as both axes were measured: 90 degrees
+        minus the angle between the positive axes.
+    """
+
+    errors: ErrorTable
+    axes: Mapping[int, AxisErrors]
+    slopes: Mapping[str, float] = field(default_factory=dict)
+    squareness_rad: Mapping[str, float] = field(default_factory=dict)
+
+
+def axis_errors(machine: Machine, runs: Sequence[AxisRun]) -> AxisErrors:
+    """Average the runs of one axis at every target position."""
+    axis = runs[0].axis
+    # target positions: readings closer than SAME_MM are one
+    ordered = np.sort(np.concatenate([run.position_mm for run in runs]))
+    keep = np.concatenate([[True], np.diff(ordered) > SAME_MM])
+    positions = np.asarray(ordered[keep])
+    signed: list[tuple[float, FloatArray]] = []
+    for run in runs:
+        values = np.hstack([run.delta_mm, run.eps_rad])
+        for direction in np.unique(run.direction):
+            rows = run.direction == direction
+            signed.append((float(direction), _on(positions, run.position_mm[rows], values[rows])))
+    stacked = np.array([values for _, values in signed])
+    count = np.sum(~np.isnan(stacked[:, :, 0]), axis=0)
+    mean = np.nanmean(stacked, axis=0)
+    several = count[:, None] > 1
+    spread = np.where(several, 0.5 * (np.nanmax(stacked, axis=0) - np.nanmin(stacked, axis=0)), np.nan)
+    turns = (
+        {} if any(run.contradiction for run in runs) else turned_by(machine, axis, unit_at_tool=runs[0].unit_at_tool)
+    )
+    return AxisErrors(axis, positions, mean[:, :3], mean[:, 3:], spread, _reversal(signed), count, turns)
+
+
+def _on(positions: FloatArray, at_mm: FloatArray, values: FloatArray) -> FloatArray:
+    """Means of values (m, 6) at their positions among the targets, (n, 6), nan where there is none."""
+    index = np.clip(np.searchsorted(positions, at_mm + SAME_MM) - 1, 0, len(positions) - 1)
+    total, count = np.zeros((len(positions), values.shape[1])), np.zeros(len(positions))
+    np.add.at(total, index, values)
+    np.add.at(count, index, 1.0)
+    count[count == 0.0] = np.nan
+    return np.asarray(total / count[:, None])
+
+
+def _reversal(signed: Sequence[tuple[float, FloatArray]]) -> FloatArray | None:
+    ways = [[values for direction, values in signed if direction == sign] for sign in (1.0, -1.0)]
+    if not all(ways):
+        return None
+    forward, backward = (np.mean(np.array(way), axis=0) for way in ways)
+    return np.asarray(forward - backward)
+
+
+def evaluate(machine: Machine, instrument: SixDofInstrument, runs: Sequence[AxisRun]) -> Evaluation:
+    """Return the errors of every measured axis, and of squareness where both axes were measured."""
+    measured_axes = sorted({run.axis for run in runs})
+    axes = {axis: axis_errors(machine, [run for run in runs if run.axis == axis]) for axis in measured_axes}
+    return evaluate_axes(machine, instrument, axes)
+
+
+def evaluate_axes(machine: Machine, instrument: SixDofInstrument, axes: Mapping[int, AxisErrors]) -> Evaluation:
+    """Return errors and squareness from the means of each axis."""
+    turns = {axis: zeroed(machine, axis, entry.position_mm, entry.eps_rad) for axis, entry in axes.items()}
+    curves: dict[str, Curve] = {}
+    slopes: dict[str, float] = {}
+    for axis, entry in axes.items():
+        delta = entry.delta_mm - _carried(instrument, entry, axes, turns)
+        for component in range(3):
+            name, value = f"E{AXES[component]}{AXES[axis]}", delta[:, component]
+            if component != axis:
+                constant, slope = fitted_line(entry.position_mm, value, instrument.line)
+                slopes[name], value = slope, value - constant - slope * entry.position_mm
+            curves[name] = _as_curve(entry.position_mm, zeroed(machine, axis, entry.position_mm, value[:, None])[:, 0])
+            angle = f"E{'ABC'[component]}{AXES[axis]}"
+            curves[angle] = _as_curve(entry.position_mm, turns[axis][:, component])
+    measured = _squareness(slopes, axes)
+    signs = dict(zip(SQUARENESS, instrument.squareness_signs, strict=True))
+    squareness = {name: (signs[name] * value, np.nan) for name, value in measured.items()}
+    ordered = {name: curves[name] for name in sorted(curves, key=_order)}
+    return Evaluation(ErrorTable(ordered, squareness), axes, slopes, measured)
+
+
+def _order(name: str) -> tuple[int, int]:
+    return "XYZ".index(name[2]), "XYZABC".index(name[1])
+
+
+def _as_curve(position_mm: FloatArray, value: FloatArray) -> Curve:
+    return Curve(position_mm, np.asarray(value), np.full(len(position_mm), np.nan))
+
+
+def _carried(
+    instrument: SixDofInstrument, entry: AxisErrors, axes: Mapping[int, AxisErrors], turns: Mapping[int, FloatArray]
+) -> FloatArray:
+    """What the rotation of the other axes, where they stood, adds to the measured translations, (n, 3)."""
+    stood = instrument.axes[entry.axis].position_mm or (0.0, 0.0, 0.0)
+    turn = np.zeros(3)
+    for other, times in entry.turned_by.items():
+        if other in axes:
+            at = axes[other].position_mm
+            turn += [times * np.interp(stood[other], at, turns[other][:, k]) for k in range(3)]
+    return np.cross(turn, along(entry.axis, entry.position_mm))
+
+
+def _squareness(slopes: Mapping[str, float], axes: Mapping[int, AxisErrors]) -> dict[str, float]:
+    found = {}
+    for name, pair in zip(SQUARENESS, SLOPES, strict=True):
+        if all(axis in axes for _, axis in pair):
+            found[name] = sum(slopes[f"E{AXES[component]}{AXES[axis]}"] for component, axis in pair)
+    return found
+
+
+# From readings to the 21 errors in one call: reduce every run, turn it into errors of the machine, evaluate.
+
+
+def axis_runs(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> list[AxisRun]:
+    """Errors of the moved axis over every run; a CompgenWarning where chain and readings contradict each other.
+
+    ``as_printed`` of the instrument takes the paper's own equations in place of the traced ones.
+    """
+    reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
+    grown = {axis: growth_mm(machine, readings, axis) for axis in {run.axis for run in reduced}}
+    runs = [
+        printed_run(machine, readings, instrument, run)
+        if instrument.as_printed
+        else errors_of_run(machine, instrument, run)
+        for run in reduced
+    ]
+    return [_cold(run, grown[run.axis][part.rows]) for run, part in zip(runs, reduced, strict=True)]
+
+
+def _cold(run: AxisRun, grown_mm: FloatArray) -> AxisRun:
+    """The run of a machine whose scales are at 20 degC."""
+    if not np.any(grown_mm):
+        return run
+    delta = run.delta_mm.copy()
+    delta[:, run.axis] -= grown_mm
+    return replace(run, delta_mm=delta)
+
+
+def evaluate_readings(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> Evaluation:
+    """Return errors, means of the axes, slopes and squareness of all readings."""
+    return evaluate(machine, instrument, axis_runs(machine, readings, instrument))
+
+
+# Repeatability and comparison with reference instruments in the style of Tables 2 and 3 of Jia et al. 2022.
+
+
+#: Rows of the tables: title, unit, and how much of it 1 mm or 1 rad is; in the order of ROLES.
+ROWS = (
+    ("positioning", "nm", 1e6),
+    ("horizontal straightness", "um", 1.0 / MM_PER_UM),
+    ("vertical straightness", "um", 1.0 / MM_PER_UM),
+    ("yaw", "arcsec", 1.0 / RAD_PER_ARCSEC),
+    ("pitch", "arcsec", 1.0 / RAD_PER_ARCSEC),
+    ("roll", "arcsec", 1.0 / RAD_PER_ARCSEC),
+)
+SQUARENESS_ROWS = (("EC0Y", "S_xy"), ("EB0Z", "S_xz"), ("EA0Z", "S_yz"))
+
+
+def each_run(machine: Machine, instrument: SixDofInstrument, runs: Sequence[AxisRun]) -> list[Evaluation]:
+    """Evaluate the first run of every axis together, then the second ones, and so on, as far as all axes have them."""
+    by_axis = [[run for run in runs if run.axis == axis] for axis in sorted({run.axis for run in runs})]
+    return [evaluate(machine, instrument, list(together)) for together in zip(*by_axis, strict=False)]
+
+
+def half_ranges(evaluations: Sequence[Evaluation]) -> dict[str, float]:
+    """Half of the range over repeated measurements by error, the worst position of a curve, mm and rad.
+
+    Straightness is without its line, everything is zero at the reference point. Empty for a single measurement.
+    """
+    tables = [item.errors for item in evaluations]
+    if len(tables) < 2:
+        return {}
+    result = {}
+    for name in tables[0].names:
+        if name in tables[0].squareness:
+            values = np.array([table.squareness[name][0] for table in tables])[:, None]
+        else:
+            at = tables[0].curves[name].position_mm
+            values = np.array([table.curves[name].at(at) for table in tables])
+        result[name] = float(0.5 * np.ptp(values, axis=0).max())
+    return result
+
+
+def largest_differences(errors: ErrorTable, reference: ErrorTable, line: str = "ls") -> dict[str, float]:
+    """Largest absolute difference to a reference by error, mm and rad; errors that only one of them has are left out.
+
+    The reference is compared at its own positions within the travel of the errors. What the reference instrument has
+    its own zero for is taken out: a line for straightness, the first value for the other curves.
+    """
+    result = {}
+    for name in errors.names:
+        if name in errors.squareness and name in reference.squareness:
+            result[name] = abs(errors.squareness[name][0] - reference.squareness[name][0])
+        elif name in errors.curves and name in reference.curves:
+            own, other = errors.curves[name], reference.curves[name]
+            within = (other.position_mm >= own.position_mm[0] - 1e-6) & (
+                other.position_mm <= own.position_mm[-1] + 1e-6
+            )
+            at = other.position_mm[within]
+            if len(at) < 2:
+                raise InputError(f"the reference has fewer than two positions of {name} within the measured travel")
+            difference = own.at(at) - other.at(at)
+            if error_named(name).is_straightness:
+                constant, slope = fitted_line(at, difference, line)
+                difference = difference - constant - slope * at
+            else:
+                difference = difference - difference[0]
+            result[name] = float(np.abs(difference).max())
+    return result
+
+
+def in_table_units(values: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """Values by error (mm, rad) as the rows of the paper's tables: by row with its unit, then by axis or pair of axes."""
+    table: dict[str, dict[str, float]] = {}
+    for role, (title, unit, factor) in enumerate(ROWS):
+        row = {
+            AXES[axis]: factor * values[names[role]]
+            for axis, names in enumerate(ERRORS_OF_AXIS)
+            if names[role] in values
+        }
+        if row:
+            table[f"{title} ({unit})"] = row
+    pairs = {short: values[name] / RAD_PER_ARCSEC for name, short in SQUARENESS_ROWS if name in values}
+    if pairs:
+        table["squareness (arcsec)"] = pairs
+    return table
+
+
+def format_table(columns: Mapping[str, Mapping[str, float]]) -> str:
+    """Text of a table whose columns are values by error (mm, rad), e.g. ``repeatability``, ``u (k = 1)``.
+
+    One line for every error and axis, in the units of the paper.
+    """
+    cells = {title: in_table_units(values) for title, values in columns.items()}
+    keys = list(
+        dict.fromkeys((row, where) for table in cells.values() for row, part in table.items() for where in part)
+    )
+    width = max((len(f"{row} {where}") for row, where in keys), default=0)
+    lines = [" " * width + "".join(f"  {title:>16}" for title in columns)]
+    for row, where in keys:
+        numbers = [cells[title].get(row, {}).get(where) for title in columns]
+        texts = "".join("  " + ("-" if value is None else f"{value:.3f}").rjust(16) for value in numbers)
+        lines.append(f"{row} {where}".ljust(width) + texts)
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,476 @@
+"""The six-DOF instrument: its optics, the linear model of its signals, and the instrument file.
+
+Signals = S_g errors + S_s systematics + S_d drift; :func:`error_matrix`, :func:`systematic_columns` and
+:func:`drift_matrix` are the three, :func:`solve_errors` inverts the first. :func:`read_instrument` reads the constants.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Vector3
+from compgen.data.messages import nearest
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import setting
+
+# Constants of the six-DOF laser instrument, and which error of which axis each of its channels sees.
+#
+# P. Jia, B. Zhang, F. Zheng, Q. Feng, Meas. Sci. Technol. 33 (2022) 015202, corrected by exact ray tracing.
+
+
+#: Rows of every model matrix: interferometer, spots of beams 1 and 2, angle of the beam reflected by the film, in mm.
+SIGNALS = ("displacement_mm", "y_qd1_mm", "z_qd1_mm", "y_qd2_mm", "z_qd2_mm", "y_psd1_mm", "z_psd1_mm")
+#: Columns of the error matrix: along the beam, along the Y and the Z detector, about their axes, about the beam.
+ROLES = ("along", "horizontal", "vertical", "yaw", "pitch", "roll")
+#: ISO 230-1 names of the errors of X, Y and Z in the order of ROLES (Jia et al. 2022, eq. 5-7).
+ERRORS_OF_AXIS = (
+    ("EXX", "EYX", "EZX", "ECX", "EBX", "EAX"),
+    ("EYY", "EXY", "EZY", "ECY", "EAY", "EBY"),
+    ("EZZ", "EYZ", "EXZ", "EAZ", "EBZ", "ECZ"),
+)
+#: Machine axes of ``along``, ``horizontal``, ``vertical`` (translations) for X, Y and Z.
+DIRECTIONS = ((0, 1, 2), (1, 0, 2), (2, 1, 0))
+#: Machine axes of ``yaw``, ``pitch``, ``roll`` (rotations) for X, Y and Z.
+ROTATIONS = ((2, 1, 0), (2, 0, 1), (0, 1, 2))
+#: (along x horizontal) . vertical: the handedness of the channels at the target.
+HANDEDNESS = (1, -1, -1)
+
+
+def _separation(value: Any) -> float:
+    result = toml_files.number(value)
+    if result == 0.0:
+        raise ValueError("the separation of the beams, not zero, is expected")
+    return result
+
+
+def _glass(value: Any) -> float:
+    result = toml_files.number(value)
+    if not 1.0 < result < 4.0:
+        raise ValueError("a refractive index between 1 and 4 is expected")
+    return result
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Constants of the optics.
+
+    Parameters
+    ----------
+    focal_length_mm : f of the lenses of the angle channels.
+    beam_separation_mm : h, beam 2 runs at y = -h of the unit.
+    glass_index : n of plate, cube corners and first prism.
+    cube_side_mm : a, side of the equilateral entry face of the cube corner; its apex lies sqrt(6) a / 6 behind it.
+    plate_thickness_mm : L_D of the plate that carries the reflecting film in front of the cube corner.
+    prism_leg_mm : b of the right-angle prisms.
+    exit_to_prism_mm : l_0 from the exit (and detector) plane of the unit to the prism.
+    """
+
+    focal_length_mm: float = setting(toml_files.positive, 100.0, required=True)
+    beam_separation_mm: float = setting(_separation, 30.0, required=True)
+    glass_index: float = setting(_glass, 1.5151, required=True)
+    cube_side_mm: float = setting(toml_files.positive, 30.0, required=True)
+    plate_thickness_mm: float = setting(toml_files.not_negative, 3.0, required=True)
+    prism_leg_mm: float = setting(toml_files.positive, 25.4)
+    exit_to_prism_mm: float = setting(toml_files.not_negative, 0.0)
+
+    @property
+    def apex_depth_mm(self) -> float:
+        """Depth of the cube's apex behind the front face of the plate, in glass."""
+        return self.plate_thickness_mm + float(np.sqrt(6.0)) * self.cube_side_mm / 6.0
+
+    @property
+    def reduced_depth_mm(self) -> float:
+        """The reduced depth t = (L_D + sqrt(6) a / 6) / n."""
+        return self.apex_depth_mm / self.glass_index
+
+    def reduced_prism_mm(self, axis: int) -> float:
+        """Path through the prism of an axis, reduced by the index: none for X, b/n in glass for Y, b in air for Z."""
+        return (0.0, self.prism_leg_mm / self.glass_index, self.prism_leg_mm)[axis]
+
+    def lever_mm(self, axis: int) -> float:
+        """l_p: from the reference point of the axis' translations to the exit plane if the unit moves."""
+        return 0.0 if axis == 0 else 0.5 * self.prism_leg_mm
+
+
+# The linear model of the instrument: signals = S_g g + S_s p + S_d alpha, and its closed-form inverse.
+#
+# Jia et al. 2022, eq. 5-7 with the corrections that exact ray tracing asks for (``docs/sixdof.md``). Every matrix is made
+# for a beam along the positive axis and turned by half a turn about the vertical direction for one along the negative
+# axis, whose horizontal channels are read with the opposite sign: a positive reading always means the positive axis.
+
+
+Y1, Z1, Y2, Z2, YP, ZP = range(1, 7)
+#: Signs of the signals and of the errors under half a turn about the vertical direction.
+TURNED_SIGNALS = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
+TURNED_ERRORS = np.array([-1.0, -1.0, 1.0, 1.0, -1.0, -1.0])
+TURNED_DRIFT = np.array([-1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class SetUp:
+    """How one axis is measured.
+
+    Parameters
+    ----------
+    axis : 0, 1, 2 for X, Y, Z.
+    mode : 1: the target moves; 2: the unit and its prism move, the target stands.
+    beam_direction : +1 or -1, the sense along the axis in which the beam meets the target.
+    """
+
+    axis: int
+    mode: int = 1
+    beam_direction: int = 1
+
+    @property
+    def sense(self) -> float:
+        """+1 if the target moves, -1 if the unit does."""
+        return 1.0 if self.mode == 1 else -1.0
+
+
+def _turned(matrix: FloatArray, set_up: SetUp, columns: FloatArray) -> FloatArray:
+    if set_up.beam_direction > 0:
+        return matrix
+    return np.asarray(TURNED_SIGNALS[:, None] * matrix * columns)
+
+
+def _separation_mm(optics: Optics, set_up: SetUp) -> float:
+    return optics.beam_separation_mm * set_up.beam_direction
+
+
+def path_mm(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -> FloatArray:
+    """Full reduced path from the exit plane to the effective apex (capital lambda of the drift terms), (n,)."""
+    ahead = optics.exit_to_prism_mm + optics.reduced_prism_mm(set_up.axis)
+    return np.asarray(ahead + distance_mm + optics.reduced_depth_mm)
+
+
+def cross_talk_arm_mm(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -> FloatArray:
+    """Arm by which an angle of the axis shows as straightness: +t if the target moves, -(L + l_p + t) if the unit does."""
+    if set_up.mode == 1:
+        return np.full(np.shape(distance_mm), optics.reduced_depth_mm)
+    return np.asarray(-(distance_mm + optics.lever_mm(set_up.axis) + optics.reduced_depth_mm))
+
+
+def error_matrix(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -> FloatArray:
+    """S_g, shape (n, 7, 6): signals in mm per mm and rad of the errors of the axis in the order of ROLES."""
+    kappa, s, f = HANDEDNESS[set_up.axis], set_up.sense, optics.focal_length_mm
+    arm = cross_talk_arm_mm(optics, set_up, distance_mm)
+    matrix = np.zeros((len(distance_mm), len(SIGNALS), 6))
+    matrix[:, 0, 0] = s
+    matrix[:, [Y1, Y2], 1] = 2.0 * s
+    matrix[:, [Z1, Z2], 2] = 2.0 * s
+    matrix[:, [Y1, Y2], 3] = 2.0 * kappa * arm[:, None]
+    matrix[:, [Z1, Z2], 4] = -2.0 * kappa * arm[:, None]
+    matrix[:, YP, 3] = -2.0 * f * kappa * s
+    matrix[:, ZP, 4] = 2.0 * f * kappa * s
+    matrix[:, Z2, 5] = -2.0 * kappa * _separation_mm(optics, set_up) * s
+    return _turned(matrix, set_up, TURNED_ERRORS)
+
+
+def drift_matrix(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -> FloatArray:
+    """S_d, shape (n, 7, 2): signals in mm per rad of the tilt of both beams toward unit +y and +z."""
+    path = path_mm(optics, set_up, distance_mm)
+    matrix = np.zeros((len(distance_mm), len(SIGNALS), 2))
+    matrix[:, [Y1, Y2], 0] = -2.0 * path[:, None]
+    matrix[:, [Z1, Z2], 1] = -2.0 * path[:, None]
+    matrix[:, YP, 0] = matrix[:, ZP, 1] = optics.focal_length_mm
+    return _turned(matrix, set_up, TURNED_DRIFT)
+
+
+Columns = dict[str, FloatArray]
+
+
+class _Builder:
+    """Columns (n, 7) by parameter name, for a beam along the positive axis."""
+
+    def __init__(self, optics: Optics, set_up: SetUp, distance_mm: FloatArray) -> None:
+        self.optics, self.set_up, self.distance = optics, set_up, np.asarray(distance_mm, dtype=np.float64)
+        self.kappa, self.f = HANDEDNESS[set_up.axis], optics.focal_length_mm
+        self.h, self.t = _separation_mm(optics, set_up), optics.reduced_depth_mm
+        self.path = path_mm(optics, set_up, self.distance)
+        self.columns: Columns = {}
+
+    def add(self, name: str, terms: Mapping[int | tuple[int, ...], FloatArray | float]) -> None:
+        column = self.columns.setdefault(name, np.zeros((len(self.distance), len(SIGNALS))))
+        for rows, value in terms.items():
+            for row in (rows,) if isinstance(rows, int) else rows:
+                column[:, row] += value
+
+    def target(self) -> None:
+        """Installation of the target about the front centre of its first cube corner."""
+        along, horizontal, vertical = ("xyz"[k] for k in DIRECTIONS[self.set_up.axis])
+        yaw, pitch, roll = ("xyz"[k] for k in ROTATIONS[self.set_up.axis])
+        kappa, t, f = self.kappa, self.t, self.f
+        self.add(f"delta_{along}ic", {0: 1.0})
+        self.add(f"delta_{horizontal}ic", {(Y1, Y2): 2.0})
+        self.add(f"delta_{vertical}ic", {(Z1, Z2): 2.0})
+        self.add(f"eps_{yaw}ic", {(Y1, Y2): 2 * kappa * t, YP: -2 * f * kappa})
+        self.add(f"eps_{pitch}ic", {(Z1, Z2): -2 * kappa * t, ZP: 2 * f * kappa})
+        self.add(f"eps_{roll}ic", {Z2: -2 * kappa * self.h})
+
+    def cubes(self) -> None:
+        """Offset and angle of the beams that the two cube corners return, after leaving the front face."""
+        _, horizontal, vertical = ("xyz"[k] for k in DIRECTIONS[self.set_up.axis])
+        yaw, pitch, _ = ("xyz"[k] for k in ROTATIONS[self.set_up.axis])
+        arm = self.path - self.t
+        first = 2 * self.set_up.axis + 1
+        for number, (y, z) in ((first, (Y1, Z1)), (first + 1, (Y2, Z2))):
+            self.add(f"delta_{horizontal}mc{number}", {y: 1.0})
+            self.add(f"delta_{vertical}mc{number}", {z: 1.0})
+            self.add(f"eps_{yaw}mc{number}", {y: -self.kappa * arm})
+            self.add(f"eps_{pitch}mc{number}", {z: self.kappa * arm})
+
+    def beams(self) -> None:
+        """Beam 2 not parallel to beam 1."""
+        self.add("eps_PEy", {Z2: 2 * self.path, ZP: -self.f})
+        self.add("eps_PEz", {Y2: -2 * self.path, YP: self.f})
+
+    def first_prism(self) -> None:
+        """Right-angle prism in glass, for Y: installation about the centre of its entrance face, angles of its faces."""
+        n, b, t, f, distance = self.optics.glass_index, self.optics.prism_leg_mm, self.t, self.f, self.distance
+        self.add("eps_zir", {(Y1, Y2): 2 * (2 * distance + 2 * t + b / n + b / 2), YP: -4 * f, 0: -b / 2})
+        for name, arm in (("eps_xir", distance + t + b / 2), ("eps_yir", distance + t + b / n - b / 2)):
+            self.add(name, {(Z1, Z2): -2 * arm, Z2: -2 * self.h, ZP: 2 * f})
+        outer, inner = (n - 1) * (distance + t), (n - 1) * (distance + t) + b * (1 - 1 / n)
+        self.add("eps_zmrs1", {(Y1, Y2): -2 * inner, YP: 2 * f * (n - 1)})
+        self.add("eps_zmrs2", {(Y1, Y2): -2 * outer, YP: 2 * f * (n - 1)})
+        self.add("eps_ymrs1", {(Z1, Z2): 2 * inner, ZP: -2 * f * (n - 1)})
+        self.add("eps_xmrs2", {(Z1, Z2): 2 * outer, ZP: -2 * f * (n - 1)})
+        self.add("delta_xir", {(Y1, Y2): -2.0, 0: 1.0})
+        self.add("delta_yir", {(Y1, Y2): 2.0, 0: -1.0})
+
+    def second_prism(self) -> None:
+        """Right-angle prism that reflects on its outside, for Z."""
+        b, t, f, distance = self.optics.prism_leg_mm, self.t, self.f, self.distance
+        for name in ("eps_xir", "eps_zir"):
+            self.add(name, {(Y1, Y2): 2 * (distance + t + b / 2), Z2: -2 * self.h, YP: -2 * f})
+        self.add("eps_yir", {(Z1, Z2): -4 * (distance + 0.75 * b + t), ZP: 4 * f, 0: b / 2})
+        self.add("delta_xir", {(Z1, Z2): -2.0, 0: 1.0})
+        self.add("delta_zir", {(Z1, Z2): 2.0, 0: -1.0})
+
+
+def systematic_columns(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -> Columns:
+    """S_s by parameter: signals in mm per mm or rad, each of shape (n, 7).
+
+    Names as in the paper: ``delta_?ic, eps_?ic`` target installed, ``delta_?ir, eps_?ir`` prism installed,
+    ``delta_?mc<k>, eps_?mc<k>`` cube corner k (1, 2 on X; 3, 4 on Y; 5, 6 on Z), ``eps_?mrs1, eps_?mrs2`` faces of the
+    prism, ``eps_PEy, eps_PEz`` beam 2 against beam 1. Translations and rotations along and about machine axes.
+    """
+    builder = _Builder(optics, set_up, distance_mm)
+    builder.target()
+    builder.cubes()
+    builder.beams()
+    (lambda: None, builder.first_prism, builder.second_prism)[set_up.axis]()
+    if set_up.beam_direction > 0:
+        return builder.columns
+    return {name: TURNED_SIGNALS * column * _turn_of(name, set_up) for name, column in builder.columns.items()}
+
+
+def _turn_of(name: str, set_up: SetUp) -> float:
+    """Sign of a parameter under half a turn about the vertical direction; beams belong to the unit's own frame."""
+    kind, _, rest = name.partition("_")
+    if rest.startswith("PE"):  # tilts in the unit's frame: y is read with the opposite sign, z alike
+        return -1.0 if rest == "PEz" else 1.0
+    vertical = DIRECTIONS[set_up.axis][2]
+    return 1.0 if "xyz".index(rest[0]) == vertical else -1.0
+
+
+def systematic_signals(
+    optics: Optics, set_up: SetUp, distance_mm: FloatArray, values: Mapping[str, float]
+) -> FloatArray:
+    """Signals of the systematic parameters ``values`` (mm, rad; those of other axes are passed over), (n, 7), mm."""
+    columns = systematic_columns(optics, set_up, distance_mm)
+    total = np.zeros((len(distance_mm), len(SIGNALS)))
+    for name, value in values.items():
+        if name in columns:
+            total += value * columns[name]
+    return total
+
+
+def solve_errors(optics: Optics, set_up: SetUp, distance_mm: FloatArray, signals_mm: FloatArray) -> FloatArray:
+    """Errors (n, 6), mm and rad in the order of ROLES, from signals (n, 7) freed of systematics and drift.
+
+    S_g is triangular: angles first, then roll, then the translations with the cross-talk of the angles taken out. The
+    second horizontal spot is not needed.
+    """
+    matrix = error_matrix(optics, set_up, distance_mm)
+    errors = np.zeros((len(distance_mm), 6))
+    errors[:, 3] = signals_mm[:, YP] / matrix[:, YP, 3]
+    errors[:, 4] = signals_mm[:, ZP] / matrix[:, ZP, 4]
+    errors[:, 5] = (signals_mm[:, Z2] - signals_mm[:, Z1]) / matrix[:, Z2, 5]
+    errors[:, 0] = signals_mm[:, 0] / matrix[:, 0, 0]
+    errors[:, 1] = (signals_mm[:, Y1] - matrix[:, Y1, 3] * errors[:, 3]) / matrix[:, Y1, 1]
+    errors[:, 2] = (signals_mm[:, Z1] - matrix[:, Z1, 4] * errors[:, 4]) / matrix[:, Z1, 2]
+    return errors
+
+
+# The instrument file: constants of the optics, the set-up of each axis, calibrated systematic parameters.
+
+
+RAD_PER_ARCSEC = math.pi / 648000.0
+#: Units of systematic parameters by the ending of their key, to mm or rad.
+UNITS = {
+    "eps": {"arcsec": RAD_PER_ARCSEC, "urad": 1e-6, "rad": 1.0},
+    "delta": {"um": 1e-3, "mm": 1.0},
+}
+Line = Literal["ls", "minzone"]
+#: Signs of S_xy, S_xz, S_yz (90 degrees minus the angle between the positive axes) in EC0Y, EB0Z, EA0Z.
+SQUARENESS_SIGNS = (-1.0, 1.0, -1.0)
+
+
+def _signs(value: Any) -> tuple[float, float, float]:
+    """One sign for all three, or a list of three: +1 keeps the program's own convention, -1 turns it."""
+    turns = toml_files.numbers(value) if isinstance(value, list) else (toml_files.number(value),) * 3
+    if len(turns) != 3 or any(turn not in (-1.0, 1.0) for turn in turns):
+        raise ValueError("1, -1, or a list of three of them (for XY, XZ, YZ) is expected")
+    x, y, z = (sign * turn for sign, turn in zip(SQUARENESS_SIGNS, turns, strict=True))
+    return x, y, z
+
+
+def _beam_direction(value: Any) -> int:
+    if value not in (1, -1) or isinstance(value, bool):
+        raise ValueError("1 (beam along the positive axis at the target) or -1 is expected")
+    return int(value)
+
+
+def _offset(value: Any) -> Vector3:
+    """Three numbers, or 0."""
+    if not isinstance(value, bool) and value == 0:
+        return (0.0, 0.0, 0.0)
+    return toml_files.vector3(value)
+
+
+@dataclass(frozen=True)
+class AxisSetUp:
+    """How one axis was measured.
+
+    Parameters
+    ----------
+    set_up : axis, mode and beam direction.
+    distance_first_mm : L at the first target position of a run; None if the readings hold the distance.
+    position_mm : where the other axes stood (its own component does not count); None: machine zero.
+    target_offset_mm : from the reference point of the tool (spindle nose) to the front centre of the first cube corner.
+    systematics : calibrated parameters of this axis, mm and rad.
+    """
+
+    set_up: SetUp
+    distance_first_mm: float | None = setting(toml_files.number, None)
+    position_mm: Vector3 | None = setting(toml_files.vector3, None)
+    target_offset_mm: Vector3 = setting(_offset, (0.0, 0.0, 0.0))
+    systematics: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SixDofInstrument:
+    """A six-DOF laser instrument as its TOML file describes it.
+
+    Parameters
+    ----------
+    optics : constants.
+    axes : set-up of each measured axis by number (0, 1, 2).
+    line : the line that is taken out of straightness: least squares, or minimum zone.
+    as_printed : use equations 5-7 as the paper prints them, for comparison with it only.
+    squareness_signs : signs of S_xy, S_xz, S_yz in EC0Y, EB0Z, EA0Z.
+    u_systematics : standard uncertainties of calibrated parameters, mm and rad.
+    u_constants : standard uncertainties of constants by their key in the file.
+    noise : standard deviations of the signals by name, mm.
+    """
+
+    optics: Optics
+    axes: Mapping[int, AxisSetUp]
+    line: Line = setting(toml_files.choice("ls", "minzone"), "ls")
+    as_printed: bool = setting(toml_files.flag, False)
+    squareness_signs: tuple[float, float, float] = setting(_signs, SQUARENESS_SIGNS, key="squareness_sign")
+    u_systematics: Mapping[str, float] = field(default_factory=dict)
+    u_constants: Mapping[str, float] = field(default_factory=dict)
+    noise: Mapping[str, float] = field(default_factory=dict)
+    source: Path | None = None
+
+
+#: Constants whose standard uncertainty an instrument file may state.
+U_CONSTANTS = (
+    *(item.name for item in fields(Optics)),
+    *("distance_first_mm", "drift_gain_percent", "parallel_drift_um", "displacement_ppm"),
+)
+
+
+def known_systematics(axis: int | None = None) -> tuple[str, ...]:
+    """Names of the systematic parameters of one axis, or of all."""
+    at = np.zeros(1)
+    axes = range(3) if axis is None else (axis,)
+    return tuple(dict.fromkeys(name for k in axes for name in systematic_columns(Optics(), SetUp(k), at)))
+
+
+def read_instrument(path: str | Path) -> SixDofInstrument:
+    """Read an instrument TOML strictly; InputError with file, line and key."""
+    root = toml_files.read_toml(path)
+    root.take("kind", toml_files.choice("sixdof-laser"))
+    optics = toml_files.take_settings(Optics, root)
+    common = read_systematics(root.section("systematics", required=False))
+    u_common = read_systematics(root.section("u_systematics", required=False), check=toml_files.not_negative)
+    noise = _read_numbers(root.section("noise", required=False), ("displacement_um", "qd_um", "psd_um"))
+    return toml_files.read_settings(
+        SixDofInstrument,
+        root,
+        optics=optics,
+        axes=_read_axes(root.section("axes"), common),
+        u_systematics=u_common,
+        u_constants=_read_numbers(root.section("u_constants", required=False), U_CONSTANTS),
+        noise={name.removesuffix("_um"): value * MM_PER_UM for name, value in noise.items()},
+        source=Path(path),
+    )
+
+
+def _read_numbers(section: toml_files.Section, names: tuple[str, ...]) -> dict[str, float]:
+    found = {name: section.take(name, toml_files.not_negative) for name in names if name in section}
+    section.finish()
+    return found
+
+
+def _read_axes(section: toml_files.Section, common: Mapping[str, float]) -> dict[int, AxisSetUp]:
+    found = {}
+    for number, letter in enumerate(AXES):
+        if letter in section:
+            found[number] = _read_axis(section.section(letter), number, common)
+    section.finish()
+    if not found:
+        raise section.fail("X", "no axis is described; give [axes.X], [axes.Y] or [axes.Z]")
+    return found
+
+
+def _read_axis(entry: toml_files.Section, axis: int, common: Mapping[str, float]) -> AxisSetUp:
+    mode = entry.take("mode", toml_files.whole(1, 2))
+    direction = entry.take("beam_direction", _beam_direction, 1)
+    own = read_systematics(entry.section("systematics", required=False), axis)
+    known = known_systematics(axis)
+    return toml_files.read_settings(
+        AxisSetUp,
+        entry,
+        set_up=SetUp(axis, mode, direction),
+        systematics={**{name: value for name, value in common.items() if name in known}, **own},
+    )
+
+
+def read_systematics(
+    section: toml_files.Section, axis: int | None = None, check: Callable[[Any], float] = toml_files.number
+) -> dict[str, float]:
+    """Read parameters with their unit at the end of the key (``eps_zir_arcsec``, ``delta_xic_um``) to mm and rad."""
+    names, found = known_systematics(axis), {}
+    for key in section.data:
+        name, _, unit = key.rpartition("_")
+        units = UNITS.get(name.partition("_")[0], {})
+        if name not in names or unit not in units:
+            allowed = [f"{n}_{'arcsec' if n.startswith('eps') else 'um'}" for n in names]
+            raise section.fail(key, f"is not a systematic parameter; {nearest(key, allowed)}")
+        if name in found:
+            raise section.fail(key, "is given twice, in two units")
+        found[name] = section.take(key, check) * units[unit]
+    section.finish()
+    return found

@@ -1,0 +1,192 @@
+"""First-order volumetric model E = C P, and which of the 21 errors it can show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable
+from compgen.data.machine import Chain, Machine, Reference
+from compgen.data.names import ERROR_INDEX, ERROR_NAMES, ERRORS
+
+# First-order volumetric model E = C P of Zha & Zhang 2024, eq. 9 and 10, for any chain (``docs/conventions.md``).
+#
+# Every entry of C is a sum of monomials of degree at most one in the axis coordinates and the tool offset, so C is
+# kept as a list of :class:`Coefficient` and evaluated from it; tables, fits and emulators use the same list.
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One monomial of one entry of C: ``sign`` times ``factor``, in row ``output`` and column ``error``.
+
+    ``lever`` is None for the factor 1, 0..2 for the coordinate of that axis in mm, 3..5 for the tool offset x, y, z.
+    """
+
+    error: str
+    output: int
+    sign: int
+    lever: int | None
+
+
+def _cross(direction: int, lever: int) -> tuple[int, int]:
+    """Row and sign of e_direction x e_lever (two different axes)."""
+    output = 3 - direction - lever
+    return output, 1 if (direction + 1) % 3 == lever else -1
+
+
+@cache
+def coefficients(chain: Chain, squareness_reference: Reference = "X") -> tuple[Coefficient, ...]:
+    """Return C as a sparse list: E = sum of delta_i + eps_i x lever_i + squareness, for the given chain."""
+    terms: list[Coefficient] = []
+    for error in ERRORS:
+        if error.kind == "linear":
+            terms.append(Coefficient(error.name, error.direction, 1, None))
+        elif error.kind == "angular":
+            travel = chain.lever_axes(error.axis)
+            for component in range(3):
+                if component != error.direction:
+                    output, sign = _cross(error.direction, component)
+                    if component in travel:
+                        terms.append(Coefficient(error.name, output, sign, component))
+                    terms.append(Coefficient(error.name, output, sign, 3 + component))
+        elif error.name == "EC0Y" and squareness_reference == "Y":
+            terms.append(Coefficient(error.name, 1, -1, 0))  # dY = -X EC0Y: Y is the reference direction
+        else:
+            output, sign = _cross(error.direction, error.axis)
+            terms.append(Coefficient(error.name, output, sign, error.axis))
+    return tuple(terms)
+
+
+def factor(lever: int | None, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
+    """Value of a :class:`Coefficient`'s factor at points (n, 3) with tool offsets (n, 3) or (3,): shape (n,)."""
+    if lever is None:
+        return np.ones(len(position_mm))
+    if lever < 3:
+        return position_mm[:, lever]
+    return np.broadcast_to(tool_mm, position_mm.shape)[:, lever - 3]
+
+
+def tool_of(machine: Machine, tool_mm: FloatArray | None) -> FloatArray:
+    """Return the tool offset to use: the given one, else the machine's, shape (3,) or (n, 3)."""
+    return np.asarray(machine.tool_offset_mm if tool_mm is None else tool_mm, dtype=np.float64)
+
+
+def c_matrix(machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | None = None) -> FloatArray:
+    """Matrix C of E = C P at commanded positions.
+
+    Parameters
+    ----------
+    machine : chain, tool offset and squareness reference are taken from it.
+    position_mm : axis coordinates, shape (n, 3).
+    tool_mm : tool offsets, shape (3,) or (n, 3), default the machine's.
+
+    Returns
+    -------
+    array of shape (n, 3, 21), columns in the order of :data:`compgen.data.names.ERROR_NAMES`; mm per mm or mm per rad.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> from compgen.data.names import ERROR_INDEX
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> C = compgen.c_matrix(machine, np.array([[-100.0, -200.0, -50.0]]))
+    >>> C[0, :, ERROR_INDEX["EC0Y"]].tolist()  # dX = -Y EC0Y
+    [200.0, 0.0, 0.0]
+    """
+    position_mm = np.asarray(position_mm, dtype=np.float64)
+    tool = tool_of(machine, tool_mm)
+    matrix = np.zeros((len(position_mm), 3, len(ERRORS)))
+    for term in coefficients(machine.chain, machine.squareness_reference):
+        matrix[:, term.output, ERROR_INDEX[term.error]] += term.sign * factor(term.lever, position_mm, tool)
+    return matrix
+
+
+def volumetric_error(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
+) -> FloatArray:
+    """Error E = C P of the tool tip against the workpiece at commanded positions (n, 3): shape (n, 3), mm.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> leaning = compgen.ErrorTable(squareness={"EC0Y": (2903e-6, 0.0)})
+    >>> position_mm = np.array([[0.0, -1000.0, 0.0]])
+    >>> compgen.volumetric_error(machine, leaning, position_mm).round(4).tolist()
+    [[2.903, 0.0, 0.0]]
+    """
+    from compgen.kinematics.many_points import (
+        volumetric_error_at,  # imported here: it builds on the list of terms above
+    )
+
+    return volumetric_error_at(machine, errors, position_mm, tool_mm)
+
+
+# Which of the 21 errors a machine's own motion can show (``docs/conventions.md``, "Names").
+
+
+_SAME_TOOL_MM = 1e-9
+_PARALLEL = 1e-6  # sine of the angle below which two lever arms count as parallel
+
+
+def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> tuple[str, ...]:
+    """Return the names of the errors that can be told from every other one.
+
+    A linear error and a squareness error always can. An angular error can if the travel of ANOTHER axis is a lever
+    arm of it, or if tools of different offset were used: with its own travel or one tool alone it acts as a function
+    of its own axis only, which is that axis' straightness or positioning. For one tool this leaves 17 on every chain.
+    If all lever arms of an axis are parallel, the rotation about them moves nothing; one error is left out for it
+    and the others, taken together, do what it would do for those tools.
+
+    Parameters
+    ----------
+    machine : its chain counts.
+    tools_mm : the tool offsets that were used, shape (n, 3); default: one tool.
+
+    Examples
+    --------
+    >>> import compgen
+    >>> names = compgen.observable_errors(compgen.load_machine("zha-gantry"))
+    >>> len(names), "ECX" in names  # ECX has no lever arm on this chain
+    (17, False)
+    """
+    tools = np.zeros((1, 3)) if tools_mm is None else np.atleast_2d(tools_mm)
+    idle = [_idle_rotations(machine, axis, tools) for axis in range(3)]
+    return tuple(error.name for error in ERRORS if error.kind != "angular" or error.direction not in idle[error.axis])
+
+
+def _idle_rotations(machine: Machine, axis: int, tools_mm: FloatArray) -> set[int]:
+    """Directions (0, 1, 2) of the angular errors of ``axis`` that its lever arms do not show."""
+    others = [other for other in machine.chain.lever_axes(axis) if other != axis]
+    if len(others) > 1:
+        return set()
+    travel = np.eye(3)[others]
+    spread = tools_mm - tools_mm.mean(axis=0)
+    longest = np.linalg.norm(spread, axis=1).max()
+    if longest <= _SAME_TOOL_MM:
+        return set(others) if others else {0, 1, 2}
+    levers = np.vstack([travel, spread / longest])
+    _, lengths, directions = np.linalg.svd(levers)
+    if len(lengths) > 1 and lengths[1] > _PARALLEL:
+        return set()
+    components = np.abs(directions[0])
+    return {int(np.flatnonzero(components > _PARALLEL)[-1])}
+
+
+def modelled_errors(machine: Machine, tools_mm: FloatArray | None = None) -> tuple[str, ...]:
+    """Return the names of the errors that the machine's model contains, as its ``errors`` entry asks for.
+
+    ``"observable"`` follows the tools that were used, 17 takes those of one tool, 21 all, a list is taken as it is.
+    """
+    if machine.errors == 21:
+        return ERROR_NAMES
+    if machine.errors == 17:
+        return observable_errors(machine)
+    if machine.errors == "observable":
+        return observable_errors(machine, tools_mm)
+    return machine.errors

@@ -1,0 +1,140 @@
+"""Compiled or plain kernels, and one BLAS thread."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from threadpoolctl import ThreadpoolController
+
+from compgen.errors import InputError
+
+# The one switch between compiled kernels (numba, ``pip install compgen[fast]``) and their plain forms (numpy).
+#
+# Both forms of a calculation agree to rounding, not in every bit. Which of them serves a call is therefore said by the
+# environment variable ``COMPGEN_KERNELS`` and the call itself, never by what the process did before:
+#
+# * ``auto`` (default): compiled from so many points or readings on that loading the kernels pays for a single call, plain
+#   below that and where numba is not installed;
+# * ``compiled``: always compiled; an error where numba is not installed;
+# * ``plain``: never compiled.
+#
+# The variable is read at every call. Machine code is kept on disk, so that a computer compiles a kernel only once.
+
+
+VARIABLE = "COMPGEN_KERNELS"
+AUTO, COMPILED, PLAIN = "auto", "compiled", "plain"
+#: Sums may be taken in another order, and a*b + c in one step; infinities and nan keep their meaning.
+FAST = {"contract", "reassoc", "arcp"}
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def kernel_choice() -> str:
+    """Value of ``COMPGEN_KERNELS``: auto, compiled or plain; InputError for anything else."""
+    choice = os.environ.get(VARIABLE, "").strip().lower() or AUTO
+    if choice not in (AUTO, COMPILED, PLAIN):
+        raise InputError(f"{VARIABLE} is {choice!r}; set it to auto, compiled or plain")
+    return choice
+
+
+def use_compiled(size: int, enough: int) -> bool:
+    """Whether the compiled form serves a job of this size, which in ``auto`` it does from ``enough`` on.
+
+    Raises
+    ------
+    InputError
+        if ``COMPGEN_KERNELS`` is ``compiled`` and numba cannot be imported, or has another value than the three.
+    """
+    choice = kernel_choice()
+    if choice == PLAIN or (choice == AUTO and size < enough):
+        return False
+    if has_numba():
+        return True
+    if choice == COMPILED:
+        raise InputError(
+            f"{VARIABLE} is 'compiled', but numba cannot be imported; install compgen[fast] or set it to auto or plain"
+        )
+    return False
+
+
+def has_numba() -> bool:
+    """Whether numba can be imported; it is imported to find out, which takes a third of a second."""
+    try:
+        importlib.import_module("numba")
+    except ImportError:
+        return False
+    return True
+
+
+def load_kernels() -> bool:
+    """Use the compiled kernels for every size from now on, as the environment's ``COMPGEN_KERNELS=compiled`` does.
+
+    This process and those that it starts are switched. False, and nothing is changed, where numba (``compgen[fast]``)
+    is not installed or ``COMPGEN_KERNELS`` is plain.
+    """
+    if kernel_choice() == PLAIN or not has_numba():
+        return False
+    os.environ[VARIABLE] = COMPILED
+    return True
+
+
+def cache_folder() -> Path:
+    """Folder for compiled code, below the user's cache folder; nothing is written next to the program."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "compgen" / "numba"
+
+
+@contextmanager
+def _settings() -> Iterator[None]:
+    """Compile with vectors inside a row, and keep the code in :func:`cache_folder` unless numba was told where."""
+    import numba
+
+    before = numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR
+    numba.config.SLP_VECTORIZE = 1
+    numba.config.CACHE_DIR = before[1] or str(cache_folder())
+    try:
+        yield
+    finally:
+        numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR = before
+
+
+def compile_for(function: Function, *signature: object, **options: object) -> Function:
+    """Compile, for one signature if it is given, and keep the code on disk where a folder can be written."""
+    import numba
+
+    chosen = {"error_model": "numpy", "fastmath": {"contract"}} | options
+    with _settings():
+        try:
+            kernel: Function = numba.njit(*signature, cache=True, **chosen)(function)
+        except (RuntimeError, OSError):
+            kernel = numba.njit(*signature, **chosen)(function)
+    return kernel
+
+
+def loop(**options: object) -> Callable[[Function], Function]:
+    """Decorate a loop that is compiled, or taken from the disk, when it is first called with arguments of some types."""
+    return lambda function: compile_for(function, **options)
+
+
+# One BLAS thread: for matrices of a few hundred columns a second thread only waits, and another number rounds otherwise.
+
+
+@cache
+def _controller(with_scipy: bool) -> ThreadpoolController:
+    """Libraries found so far: scipy brings one of its own, which is not there before ``scipy.linalg`` is imported."""
+    return ThreadpoolController()
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Limit the numerical libraries to one thread for the duration of a ``with`` block."""
+    limiter: AbstractContextManager[object] = _controller("scipy.linalg" in sys.modules).limit(limits=1)
+    return limiter

@@ -1,0 +1,498 @@
+"""E = C P at many points and on grids: tables per axis, plain or compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.machine import Machine
+from compgen.data.names import ERRORS, error_named
+from compgen.errors import InputError
+from compgen.kinematics.first_order import coefficients, tool_of
+from compgen.kinematics.kernel_switch import one_thread, use_compiled
+
+# Curves of one axis on common nodes: one look-up per position, then all values of that axis from neighbouring rows.
+#
+# A field is a sum over axes and groups, ``factor_g(position) * table_a,g(position of axis a)``, with three values per
+# table. For E = C P the factors are 1, the coordinates and the tool offset (:func:`field_tables`); the exact model takes
+# the motion itself, a translation and a rotation per axis (:func:`motion_tables`).
+
+
+#: Groups of a first-order field: factor 1, coordinates x, y, z, tool offset x, y, z.
+ONE, COORDINATES, TOOL = 0, (1, 2, 3), (4, 5, 6)
+_MOST_BUCKETS = 4096
+
+
+@dataclass(frozen=True)
+class NodeIndex:
+    """Finds the interval of a position among ascending ``nodes_mm`` (n,), n > 1, in constant time.
+
+    Even nodes need a multiplication only. Others are looked up in buckets of the shortest interval, so that at most
+    one node lies inside a bucket (``single``), or in as many buckets as are allowed.
+    """
+
+    nodes_mm: FloatArray
+
+    @property
+    def last(self) -> int:
+        """Number of the last interval."""
+        return len(self.nodes_mm) - 2
+
+    @cached_property
+    def even(self) -> bool:
+        """Whether the nodes are equidistant up to rounding."""
+        due = np.linspace(self.nodes_mm[0], self.nodes_mm[-1], len(self.nodes_mm))
+        return bool(np.abs(self.nodes_mm - due).max() <= 4 * np.spacing(np.abs(self.nodes_mm).max()))
+
+    @cached_property
+    def buckets_per_mm(self) -> float:
+        """Inverse width of a bucket; for even nodes a bucket is an interval."""
+        gaps, length = np.diff(self.nodes_mm), float(self.nodes_mm[-1] - self.nodes_mm[0])
+        if self.even:
+            return (self.last + 1) / length
+        return float(min(_MOST_BUCKETS - 1.0, 1.001 * length / gaps.min())) / length
+
+    def _bucket(self, inside_mm: FloatArray) -> NDArray[np.intp]:
+        with np.errstate(invalid="ignore"):  # nan stays nan in the share
+            bucket: NDArray[np.intp] = ((inside_mm - self.nodes_mm[0]) * self.buckets_per_mm).astype(np.intp)
+        return bucket
+
+    @cached_property
+    def start(self) -> NDArray[np.intp]:
+        """First interval of each bucket: that of the last node which lies in a lower bucket; not for even nodes."""
+        if self.even:
+            return np.zeros(1, dtype=np.intp)
+        buckets = self._bucket(self.nodes_mm)
+        first = np.searchsorted(buckets, np.arange(buckets[-1] + 1), side="left") - 1
+        return np.clip(first, 0, self.last).astype(np.intp)
+
+    @cached_property
+    def single(self) -> bool:
+        """Whether no bucket holds more than one node that begins an interval."""
+        return bool(np.bincount(self._bucket(self.nodes_mm)[1:-1]).max(initial=0) <= 1)
+
+    @cached_property
+    def upper_mm(self) -> FloatArray:
+        """Upper end of each interval, infinite for the last."""
+        return np.append(self.nodes_mm[1:-1], np.inf)
+
+    @cached_property
+    def per_gap(self) -> FloatArray:
+        """Inverse length of each interval."""
+        return 1.0 / np.diff(self.nodes_mm)
+
+    def locate(self, position_mm: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        """Interval (m,) and share (m,) of its upper node of positions (m,); the end values hold outside the nodes.
+
+        A position that is nan has the share nan and any interval; take with ``mode="clip"``.
+        """
+        inside = np.clip(position_mm, self.nodes_mm[0], self.nodes_mm[-1])
+        if self.even:
+            share = (inside - self.nodes_mm[0]) * self.buckets_per_mm
+            with np.errstate(invalid="ignore"):
+                cell = share.astype(np.intp)
+            np.minimum(cell, self.last, out=cell)
+            share -= cell
+            return cell, share
+        if self.single:
+            cell = self.start.take(self._bucket(inside), mode="clip")
+            cell += inside >= self.upper_mm.take(cell)
+        else:
+            cell = np.searchsorted(self.upper_mm[:-1], inside, side="right")
+        inside -= self.nodes_mm.take(cell)
+        inside *= self.per_gap.take(cell)
+        return cell, inside
+
+
+@dataclass(frozen=True)
+class AxisChannel:
+    """One value of one group over the intervals of an axis: ``left + share * step``, both (n - 1,)."""
+
+    group: int
+    output: int
+    left: FloatArray
+    step: FloatArray
+
+
+@dataclass(frozen=True)
+class AxisTable:
+    """What one axis adds to a field: ``values`` (n, groups, 3) at the nodes of ``index``, linear in between."""
+
+    index: NodeIndex
+    values: FloatArray
+
+    def at(self, position_mm: FloatArray) -> FloatArray:
+        """Values at positions (m,): shape (m, groups, 3)."""
+        cell, share = self.index.locate(position_mm)
+        left = self.values[:-1].take(cell, axis=0, mode="clip")
+        step = np.diff(self.values, axis=0).take(cell, axis=0, mode="clip")
+        return left + share[:, None, None] * step
+
+    @cached_property
+    def groups(self) -> tuple[int, ...]:
+        """Groups that are not zero everywhere."""
+        return tuple(int(group) for group in np.flatnonzero(np.any(self.values != 0.0, axis=(0, 2))))
+
+    @cached_property
+    def channels(self) -> tuple[AxisChannel, ...]:
+        """All values that are not zero everywhere."""
+        used = np.argwhere(np.any(self.values != 0.0, axis=0))
+        columns = [(int(group), int(output), self.values[:, group, output]) for group, output in used]
+        return tuple(
+            AxisChannel(group, output, column[:-1].copy(), np.diff(column)) for group, output, column in columns
+        )
+
+    def packed(self, groups: tuple[int, ...]) -> FloatArray:
+        """Return the values of ``groups`` as flat rows for the kernels, per interval and group left (4), step (4)."""
+        rows = np.zeros((len(self.values) - 1, len(groups), 2, 4))
+        rows[:, :, 0, :3] = self.values[:-1, groups]
+        rows[:, :, 1, :3] = np.diff(self.values[:, groups], axis=0)
+        return rows.reshape(-1)
+
+
+def _at_nodes(curve: Curve, table: AxisTable) -> FloatArray:
+    nodes_mm = table.index.nodes_mm
+    return curve.value if len(curve.value) == len(nodes_mm) else curve.at(nodes_mm)
+
+
+AxisTables = tuple[AxisTable, AxisTable, AxisTable]
+
+
+def _indices(errors: ErrorTable) -> tuple[NodeIndex, NodeIndex, NodeIndex]:
+    """All nodes of the curves of each axis; two nodes at least."""
+    positions: tuple[list[FloatArray], ...] = ([], [], [])
+    for name, curve in errors.curves.items():
+        positions[error_named(name).axis].append(curve.position_mm)
+    unions = [np.unique(np.concatenate(found)) if found else np.zeros(1) for found in positions]
+    x, y, z = (NodeIndex(nodes if len(nodes) > 1 else nodes[0] + np.array([0.0, 1.0])) for nodes in unions)
+    return x, y, z
+
+
+def field_tables(machine: Machine, errors: ErrorTable, tool_mm: FloatArray | None) -> AxisTables:
+    """Return tables of E = C P with seven groups; a tool offset (3,) is folded into group ``ONE``, as are constants.
+
+    Without ``tool_mm`` the groups ``TOOL`` wait for a tool offset at each point.
+    """
+    tables = [AxisTable(index, np.zeros((len(index.nodes_mm), 7, 3))) for index in _indices(errors)]
+    for term in coefficients(machine.chain, machine.squareness_reference):
+        if term.error in errors.curves:
+            table = tables[error_named(term.error).axis]
+            values = term.sign * _at_nodes(errors.curves[term.error], table)
+            group = ONE if term.lever is None else 1 + term.lever
+            if group in TOOL and tool_mm is not None:
+                group, values = ONE, values * tool_mm[group - TOOL[0]]
+            table.values[:, group, term.output] += values
+    for term in coefficients(machine.chain, machine.squareness_reference):
+        if term.error in errors.squareness and term.lever is not None:
+            # a table that has the group anyway takes the constant, else the first
+            table = next((table for table in tables if np.any(table.values[:, 1 + term.lever])), tables[0])
+            table.values[:, 1 + term.lever, term.output] += term.sign * errors.squareness[term.error][0]
+    return tables[0], tables[1], tables[2]
+
+
+def grid_tables(
+    machine: Machine, errors: ErrorTable, tool_mm: FloatArray, levels_mm: Sequence[FloatArray]
+) -> list[FloatArray]:
+    """Return the tables of E = C P at the levels of a grid, (n, 4, 3) per axis: groups ``ONE`` and ``COORDINATES``.
+
+    As :func:`field_tables` at these positions, without tables for positions in between.
+    """
+    values = {name: curve.at(levels_mm[error_named(name).axis]) for name, curve in errors.curves.items()}
+    tables = [np.zeros((1 + len(COORDINATES), 3, len(level))) for level in levels_mm]
+    for term in coefficients(machine.chain, machine.squareness_reference):
+        group = ONE if term.lever is None else 1 + term.lever
+        if term.error in values:
+            factor = term.sign * (tool_mm[group - TOOL[0]] if group in TOOL else 1.0)
+            if factor != 0.0:
+                entry = tables[error_named(term.error).axis][ONE if group in TOOL else group, term.output]
+                entry += values[term.error] if factor == 1.0 else factor * values[term.error]
+        elif term.error in errors.squareness and term.lever is not None:
+            tables[0][group, term.output] += term.sign * errors.squareness[term.error][0]
+    return [np.ascontiguousarray(table.transpose(2, 0, 1)) for table in tables]
+
+
+def motion_tables(errors: ErrorTable) -> AxisTables:
+    """Return tables of the small motions: group 0 the translation in mm, group 1 the rotation vector in rad."""
+    tables = [AxisTable(index, np.zeros((len(index.nodes_mm), 2, 3))) for index in _indices(errors)]
+    for error in ERRORS:
+        if error.name in errors.curves:
+            table = tables[error.axis]
+            group = 0 if error.kind == "linear" else 1
+            table.values[:, group, error.direction] = _at_nodes(errors.curves[error.name], table)
+    return tables[0], tables[1], tables[2]
+
+
+# Calls of the compiled kernels of :mod:`compgen.kinematics.compiled_kernels`;
+# :mod:`compgen.kinematics.kernel_switch` says when they serve.
+#
+# Importing this does not import numba: that alone takes a third of a second.
+
+
+_ROW = 8  # numbers per group and interval
+
+
+def _axis(table: AxisTable, groups: tuple[int, ...]) -> tuple[Any, ...]:
+    """One axis as the kernels take it."""
+    index = table.index
+    ends = float(index.nodes_mm[0]), float(index.nodes_mm[-1]), index.buckets_per_mm
+    nodes = np.array(index.nodes_mm), index.upper_mm, index.per_gap
+    return (*ends, np.uint64(index.last), index.start, *nodes, table.packed(groups))
+
+
+def _even(tables: AxisTables) -> tuple[bool, bool, bool]:
+    x, y, z = (table.index.even for table in tables)
+    return x, y, z
+
+
+def field_at(tables: AxisTables, position_mm: FloatArray, tool_mm: FloatArray | None, out: FloatArray) -> None:
+    """Write E = C P at points (n, 3), with a tool offset each (n, 3) or folded into the tables, to ``out`` (n, 3)."""
+    from compgen.kinematics.compiled_kernels import field_kernel
+
+    used = [
+        tuple(group for group in table.groups if tool_mm is not None or group <= max(COORDINATES)) for table in tables
+    ]
+    offsets = tuple(
+        (*(_ROW * groups.index(group) if group in groups else -1 for group in range(7)), _ROW * len(groups))
+        for groups in used
+    )
+    axes = tuple(_axis(table, groups) for table, groups in zip(tables, used, strict=True))
+    tool = np.zeros((1, 3)) if tool_mm is None else np.ascontiguousarray(tool_mm)
+    field_kernel(offsets, _even(tables), tool_mm is not None)(axes, _apart(position_mm, out), _apart(tool, out), out)
+
+
+def field_on_grid(at_levels: Sequence[FloatArray], levels_mm: Sequence[FloatArray], out: FloatArray) -> None:
+    """Write E = C P on a grid to ``out`` (nx, ny, nz, 3), from the tables at the levels, each (n, 4, 3)."""
+    from compgen.kinematics.compiled_kernels import grid_kernel
+
+    levels, values = map(np.ascontiguousarray, levels_mm), map(np.ascontiguousarray, at_levels)
+    grid_kernel(bool(np.any(at_levels[2][:, 2])))(*levels, *values, out)
+
+
+def exact_at(
+    tables: AxisTables,
+    order: Sequence[tuple[int, bool]],
+    tilt: FloatArray,
+    position_mm: FloatArray,
+    tool_mm: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write the exact error at points (n, 3) with tool offsets (1, 3) or (n, 3) to ``out`` (n, 3)."""
+    from compgen.kinematics.compiled_kernels import exact_kernel
+
+    axes = tuple(_axis(table, (0, 1)) for table in tables)
+    passed = np.array([axis for axis, _ in order]), np.array([side for _, side in order])
+    exact_kernel()(
+        axes,
+        np.array(_even(tables)),
+        *passed,
+        tilt,
+        _apart(position_mm, out),
+        _apart(np.ascontiguousarray(tool_mm), out),
+        out,
+    )
+
+
+def _apart(values: FloatArray, out: FloatArray) -> FloatArray:
+    """Return C-ordered values that do not share memory with ``out``: kernels write ahead of what they read."""
+    return values.copy() if np.may_share_memory(values, out) else np.ascontiguousarray(values)
+
+
+# E = C P at many points: sums of tables per axis, in blocks of constant memory.
+#
+# Every entry of C is 1, a coordinate or a tool offset, so with f = (1, x, y, z, tool offset)
+#
+#     E(x, y, z) = sum over g of f_g * (X_g(x) + Y_g(y) + Z_g(z)),
+#
+# each table a vector of three, squareness and signs in it (:mod:`compgen.kinematics.many_points`). A list of points costs one
+# look-up per axis. On a full grid no points are formed: as a matrix of rows (x, y) against columns (z, component) E has
+# a rank of at most nine. The kernels of :mod:`compgen.kinematics.many_points` do the same in one pass
+# (:mod:`compgen.kinematics.kernel_switch` says when).
+
+
+#: Points that are worked on together: their intermediate arrays stay in the cache of one core.
+BLOCK = 16_384
+_GRID_BLOCK = 32_768
+#: From so many points on, loading the kernels (half a second, some seconds for the first time) pays for a single call.
+_POINTS_FOR_KERNELS, _GRID_FOR_KERNELS = 20_000_000, 500_000_000
+
+
+def checked_points(position_mm: FloatArray) -> FloatArray:
+    """Return positions as numbers, or raise if they are not of shape (n, 3)."""
+    position = np.asarray(position_mm, dtype=np.float64)
+    if position.ndim != 2 or position.shape[1] != 3:
+        raise InputError(f"positions have the shape {position.shape}; expected (n, 3): x, y, z in mm for each point")
+    return position
+
+
+def checked_out(out: FloatArray | None, shape: tuple[int, ...]) -> FloatArray:
+    """Return ``out``, or a new array if it is None; raise if the result does not fit into it."""
+    if out is None:
+        return np.empty(shape)
+    if out.shape != shape or out.dtype != np.float64 or not out.flags.c_contiguous or not out.flags.writeable:
+        raise InputError(
+            f"out has the shape {out.shape} and type {out.dtype}; expected a writeable C-ordered float64 array {shape}"
+        )
+    return out
+
+
+def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
+    """Slices that cover ``count`` items, ``size`` at a time."""
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))
+
+
+def volumetric_error_at(
+    machine: Machine,
+    errors: ErrorTable,
+    position_mm: FloatArray,
+    tool_mm: FloatArray | None = None,
+    out: FloatArray | None = None,
+) -> FloatArray:
+    """Error E = C P of the tool tip at commanded positions.
+
+    Parameters
+    ----------
+    machine, errors : what moves, and how wrong.
+    position_mm : shape (n, 3).
+    tool_mm : tool offset, shape (3,) or (n, 3), default the machine's.
+    out : array (n, 3) for the result; new if not given.
+
+    Returns
+    -------
+    array of shape (n, 3), mm.
+    """
+    position = checked_points(position_mm)
+    result = checked_out(out, position.shape)
+    tool = tool_of(machine, tool_mm)
+    each = None if tool.ndim == 1 else np.broadcast_to(tool, position.shape)
+    tables = field_tables(machine, errors, tool if each is None else None)
+    if use_compiled(len(position), _POINTS_FOR_KERNELS):
+        field_at(tables, position, each, result)
+        return result
+    for part in blocks(len(position)):
+        _field_block(tables, position[part], None if each is None else each[part], result[part])
+    return result
+
+
+def _field_block(tables: AxisTables, position_mm: FloatArray, tool_mm: FloatArray | None, out: FloatArray) -> None:
+    """Write the field at a few points (m, 3) to ``out`` (m, 3)."""
+    factors = list(np.ascontiguousarray(position_mm.T))
+    if tool_mm is not None:
+        factors.extend(np.ascontiguousarray(tool_mm.T))
+    sums = _group_sums(tables, factors)
+    for output in range(3):
+        total = sums.pop((ONE, output), None)
+        for group, factor in enumerate(factors, start=1):
+            term = sums.pop((group, output), None)
+            if term is not None:
+                term *= factor
+                total = term if total is None else np.add(total, term, out=total)
+        out[:, output] = 0.0 if total is None else total
+
+
+def _group_sums(tables: AxisTables, coordinates: Sequence[FloatArray]) -> dict[tuple[int, int], FloatArray]:
+    """X_g(x) + Y_g(y) + Z_g(z) by group and component, as far as they are not zero."""
+    sums: dict[tuple[int, int], FloatArray] = {}
+    value, left = np.empty((2, len(coordinates[0])))
+    for table, coordinate in zip(tables, coordinates, strict=False):
+        if not table.channels:
+            continue
+        cell, share = table.index.locate(coordinate)
+        for channel in table.channels:
+            key = channel.group, channel.output
+            channel.step.take(cell, mode="clip", out=value)
+            np.multiply(value, share, out=value)
+            channel.left.take(cell, mode="clip", out=left)
+            if key in sums:
+                sums[key] += left
+                sums[key] += value
+            else:
+                sums[key] = left + value
+    return sums
+
+
+def volumetric_error_on_grid(
+    machine: Machine,
+    errors: ErrorTable,
+    levels_mm: Sequence[FloatArray],
+    tool_mm: FloatArray | None = None,
+    out: FloatArray | None = None,
+) -> FloatArray:
+    """Error E = C P of the tool tip on a full grid, in a single pass over the result.
+
+    Parameters
+    ----------
+    machine, errors : what moves, and how wrong.
+    levels_mm : positions of X, Y and Z, shapes (nx,), (ny,), (nz,), in any order.
+    tool_mm : tool offset, shape (3,), default the machine's.
+    out : array (nx, ny, nz, 3) for the result; new if not given.
+
+    Returns
+    -------
+    array of shape (nx, ny, nz, 3), mm.
+    """
+    levels = [np.asarray(level, dtype=np.float64) for level in levels_mm]
+    if len(levels) != 3 or any(level.ndim != 1 for level in levels):
+        raise InputError("a grid needs three lists of levels in mm: those of X, of Y and of Z")
+    tool = tool_of(machine, tool_mm)
+    if tool.shape != (3,):
+        raise InputError(f"tool offsets have the shape {tool.shape}; a grid has one tool, (3,) in mm")
+    shape = (len(levels[0]), len(levels[1]), len(levels[2]), 3)
+    result = checked_out(out, shape)
+    if result.size == 0:
+        return result
+    at_levels = grid_tables(machine, errors, tool, levels)
+    if use_compiled(result.size // 3, _GRID_FOR_KERNELS):
+        field_on_grid(at_levels, levels, result)
+    else:
+        _grid_by_rank(at_levels, levels, result)
+    return result
+
+
+def _grid_by_rank(at_levels: Sequence[FloatArray], levels: Sequence[FloatArray], out: FloatArray) -> None:
+    """Write the field on a grid as a product: functions of (x, y) times functions of (z, component).
+
+    E_o = 1 * [P_o(x, y)] + z * [Q_o(x, y)] + Z_1,o(z) * [1] + Z_x,o(z) * [x] + Z_y,o(z) * [y], where Z_1 takes z Z_z.
+    """
+    count_x, count_y, count_z, _ = out.shape
+    columns = _functions_of_z(at_levels[2], levels[2])
+    needed = np.any(columns != 0.0, axis=1)
+    needed[3:6] &= np.any(at_levels[0][:, 3], axis=0) | np.any(at_levels[1][:, 3], axis=0)
+    rows = out.reshape(count_x * count_y, 3 * count_z)
+    plane = max(1, BLOCK // count_y)
+    for part in blocks(count_x, plane):
+        for inner in blocks(count_y, BLOCK):
+            left = _functions_of_xy(at_levels, levels, part, inner)[:, needed]
+            first = part.start * count_y + inner.start
+            product, right = rows[first : first + len(left)], columns[needed]
+            with one_thread():
+                for some in blocks(len(left), max(1, 3 * _GRID_BLOCK // right.shape[1])):
+                    np.matmul(left[some], right, out=product[some])
+
+
+def _functions_of_z(values: FloatArray, z_mm: FloatArray) -> FloatArray:
+    """Nine functions of (z, component), shape (9, 3 nz)."""
+    components = np.tile(np.eye(3), len(z_mm))
+    own = values[:, 0] + z_mm[:, None] * values[:, 3]
+    functions = np.vstack([components, components * np.repeat(z_mm, 3), own.reshape(1, -1)])
+    return np.vstack([functions, values[:, 1].reshape(1, -1), values[:, 2].reshape(1, -1)])
+
+
+def _functions_of_xy(
+    at_levels: Sequence[FloatArray], levels: Sequence[FloatArray], part_x: slice, part_y: slice
+) -> FloatArray:
+    """The nine factors (P, Q, 1, x, y) of those functions at levels (x, y), shape (nx * ny, 9)."""
+    x, y = levels[0][part_x, None, None], levels[1][None, part_y, None]
+    along_x, along_y = at_levels[0][part_x, None], at_levels[1][None, part_y]
+    factors = np.empty((x.shape[0], y.shape[1], 9))
+    factors[:, :, 0:3] = along_x[:, :, 0] + x * along_x[:, :, 1] + along_y[:, :, 0] + y * along_y[:, :, 2]
+    factors[:, :, 0:3] += y * along_x[:, :, 2] + x * along_y[:, :, 1]
+    factors[:, :, 3:6] = along_x[:, :, 3] + along_y[:, :, 3]
+    factors[:, :, 6], factors[:, :, 7], factors[:, :, 8] = 1.0, x[:, :, 0], y[:, :, 0]
+    return factors.reshape(-1, 9)

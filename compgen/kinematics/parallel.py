@@ -1,0 +1,541 @@
+"""One function for many items, in processes of this machine or on a Dask cluster: the same results in the same order.
+
+Function and items are pickled, whatever decides about a result is part of the item (a seed too), and every item is computed
+on one thread; so it does not matter where that happens. The processes are those of :mod:`concurrent.futures`, but each with
+a pool of its own: one that is killed breaks its pool, which must not take the items of the others with it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import logging
+import os
+import pickle
+import queue
+import signal
+import sys
+import threading
+import time
+import uuid
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotYet
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from importlib.metadata import distributions
+from multiprocessing import get_context, parent_process
+from multiprocessing.context import BaseContext
+from pathlib import Path
+from socket import gethostname
+from typing import Any, Protocol, TypeVar
+
+from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.kinematics.kernel_switch import one_thread
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Stop = Callable[[], bool]
+Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
+#: How often somebody who waits looks whether to stop, s.
+POLL_S = 0.2
+#: Freed memory that a worker process keeps, and largest block that comes from it, bytes; see ``mallopt(3)``.
+KEPT_BYTES, BLOCK_BYTES = 64 << 20, 32 << 20
+#: Items that are handed out ahead of the first that is not finished, for each call at a time.
+AHEAD = 256
+
+
+class LostError(CompgenError):
+    """The processes that worked on an item ended before they had a result."""
+
+    exit_code = 1
+
+
+class StoppedError(CompgenError):
+    """An item was not begun, because somebody asked to stop."""
+
+    exit_code = 1
+
+
+class RemoteError(CompgenError):
+    """An error of another process that cannot be sent as it is."""
+
+
+class Packed:
+    """Something pickled once; its text names the kind only, because the contents may hold a password."""
+
+    def __init__(self, value: object) -> None:
+        self.kind = type(value).__name__
+        self.content = pickle.dumps(value)
+
+    def __repr__(self) -> str:
+        return f"<packed {self.kind}>"
+
+    def value(self) -> Any:
+        """Return what was packed."""
+        return pickle.loads(self.content)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came of one item: a result or an error, pickled, and the warnings of compgen."""
+
+    content: bytes
+    failed: bool
+    warnings: tuple[str, ...] = ()
+
+    def value(self) -> Any:
+        """Warn as the work did, and return its result or raise its error."""
+        for text in self.warnings:
+            warnings.warn(text, CompgenWarning, stacklevel=2)
+        found = pickle.loads(self.content)
+        if self.failed:
+            raise found
+        return found
+
+
+class Workers(Protocol):
+    """Something that works on ``size`` items at a time; :meth:`call` may be called by as many threads."""
+
+    size: int
+
+    def call(self, function: Packed, item: Packed, stop: Stop) -> Any:
+        """Return ``function(item)``; LostError if the processes that worked on it ended, StoppedError if none did."""
+        ...
+
+    def close(self) -> None:
+        """Begin nothing more, wait for what runs in processes of this machine, and leave."""
+        ...
+
+
+# --- in the process that works -------------------------------------------------------------------------------------
+
+_BUSY = threading.Lock()
+_STOP: list[Any] = []
+#: What this process tells the one that started it: its number, and until when it may work (0: no limit), s.
+_TOLD: list[Any] = []
+
+
+@lru_cache(maxsize=4)
+def _unpacked(content: bytes) -> Any:
+    return pickle.loads(content)
+
+
+def perform(function: Packed, item: Packed) -> Answer:
+    """Compute one item in this process, one at a time, and return what came of it."""
+    with _BUSY, one_thread(), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", CompgenWarning)
+        try:
+            content, failed = pickle.dumps(_unpacked(function.content)(item.value())), False
+        except Exception as error:
+            content, failed = _pickled_error(error), True
+    return Answer(content, failed, tuple(str(w.message) for w in caught if issubclass(w.category, CompgenWarning)))
+
+
+def _pickled_error(error: Exception) -> bytes:
+    """Return the error, or one of its text and exit code where it cannot be sent."""
+    try:
+        content = pickle.dumps(error)
+        pickle.loads(content)
+        return content
+    except Exception:
+        known = isinstance(error, CompgenError)
+        other = RemoteError(str(error) if known else f"{type(error).__name__}: {error}")
+        other.exit_code = error.exit_code if isinstance(error, CompgenError) else 3
+        return pickle.dumps(other)
+
+
+def stopping() -> bool:
+    """Whether this process was asked to stop after what it is doing."""
+    return bool(_STOP and _STOP[0].value)
+
+
+@contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """Have this process killed if the block takes longer, whatever it does; only one that :class:`Processes` started."""
+    for told in _TOLD:
+        told[1] = time.monotonic() + seconds
+    try:
+        yield
+    finally:
+        for told in _TOLD:
+            told[1] = 0.0
+
+
+def _begin(stop: Any, told: Any) -> None:
+    """Make this process leave signals to the one that started it, and end with it."""
+    _STOP[:], _TOLD[:] = [stop], [told]
+    told[0] = os.getpid()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)  # no SIG_IGN, which commands started here would inherit
+    parent = parent_process()
+
+    def end_with_parent() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    # freed memory is kept: to give every array back and fetch it again takes a tenth to a third of the time
+    with suppress(OSError, AttributeError, TypeError):  # other systems do it their way
+        library = ctypes.CDLL(None)
+        library.mallopt(-1, KEPT_BYTES)  # M_TRIM_THRESHOLD
+        library.mallopt(-3, BLOCK_BYTES)  # M_MMAP_THRESHOLD
+
+
+# --- processes of this machine -------------------------------------------------------------------------------------
+
+
+class _Lane:
+    """One process, and a new one when it is killed."""
+
+    def __init__(self, context: BaseContext, stop: Any, told: Any) -> None:
+        self._context, self._stop, self._told = context, stop, told
+        self._pool: ProcessPoolExecutor | None = None
+
+    def perform(self, function: Packed, item: Packed) -> Future[Answer]:
+        if self._pool is None:
+            self._told[:] = (0.0, 0.0)
+            options: Any = {"initializer": _begin, "initargs": (self._stop, self._told)}
+            self._pool = ProcessPoolExecutor(1, self._context, **options)
+        return self._pool.submit(perform, function, item)
+
+    @property
+    def pid(self) -> int:
+        """Number of the process, 0 if it did not come so far."""
+        return int(self._told[0])
+
+    def overdue(self) -> bool:
+        """Whether the process works for longer than it may."""
+        return bool(0.0 < self._told[1] < time.monotonic())
+
+    def kill(self) -> None:
+        """End the process, whatever it does."""
+        with suppress(OSError):
+            os.kill(self.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool = None
+
+
+class Processes:
+    """Processes of this machine; one that is killed is replaced, and its item tried once more.
+
+    Parameters
+    ----------
+    count : processes at a time.
+    copied : where the system can, a process begins as a copy of this one, which saves seconds; only for a program that
+        has no threads at work.
+    died : told of each process that ended over an item: the item, its number, and whether :func:`limited` ended it.
+    """
+
+    def __init__(
+        self, count: int, *, copied: bool = False, died: Callable[[Any, int, bool], None] = lambda *_: None
+    ) -> None:
+        context = get_context("fork" if copied and sys.platform.startswith("linux") else "spawn")
+        self.size, self._died = count, died
+        try:
+            self._stop = context.RawValue("b", 0)  # without a lock, which a killed process might keep
+            self._lanes = [_Lane(context, self._stop, context.RawArray("d", 2)) for _ in range(count)]
+        except OSError as error:  # memory that processes share is a file to the system
+            raise CompgenError(f"processes cannot be started here: {error.strerror or error}") from error
+        self._idle: queue.LifoQueue[_Lane] = queue.LifoQueue()
+        for lane in self._lanes:
+            self._idle.put(lane)
+
+    def call(self, function: Packed, item: Packed, stop: Stop) -> Any:
+        """Return ``function(item)``; see :class:`Workers`."""
+        lane = self._idle.get()
+        try:
+            for _ in range(2):
+                if stop() or self._stop.value:
+                    raise StoppedError("not begun: stopped")
+                try:
+                    return self._waited(lane, lane.perform(function, item), stop).value()
+                except BrokenExecutor:
+                    late = lane.overdue()
+                    lane.close()
+                    self._died(item.value(), lane.pid, late)
+                if late:
+                    raise LostError("the process that worked on it took too long and was ended")
+        finally:
+            self._idle.put(lane)
+        raise LostError("the process that worked on it was killed, twice (out of memory?)")
+
+    def _waited(self, lane: _Lane, future: Future[Answer], stop: Stop) -> Answer:
+        while True:
+            try:
+                return future.result(POLL_S)
+            except NotYet:
+                if stop():
+                    self._stop.value = 1
+                if lane.overdue():
+                    lane.kill()
+
+    def close(self) -> None:
+        """Begin nothing more, wait for what runs, end the processes."""
+        self._stop.value = 1
+        for lane in self._lanes:
+            lane.close()
+
+
+# --- all items -----------------------------------------------------------------------------------------------------
+
+
+def spread(
+    workers: Workers,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    *,
+    lost: Callable[[Item, CompgenError], Result] | None = None,
+    stop: Stop = lambda: False,
+) -> Iterator[Result]:
+    """Yield ``function(item)`` for each item, in their order; only some of them are under way at a time.
+
+    Parameters
+    ----------
+    workers : that do the work.
+    function : can be pickled; an error that it raises ends everything.
+    items : can be pickled.
+    lost : gives the result of an item whose processes ended, or that was not begun; without it the error is raised.
+    stop : asked now and then; once it is true nothing more is begun.
+    """
+    packed = Packed(function)
+
+    def work(item: Item) -> Result:
+        try:
+            found: Result = workers.call(packed, Packed(item), stop)
+            return found
+        except (LostError, StoppedError) as error:
+            if lost is None:
+                raise
+            return lost(item, error)
+
+    pool = ThreadPoolExecutor(workers.size, thread_name_prefix="compgen")
+    try:
+        yield from _in_order(pool, work, iter(items), AHEAD * workers.size)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _in_order(
+    pool: ThreadPoolExecutor, work: Callable[[Item], Result], items: Iterator[Item], most: int
+) -> Iterator[Result]:
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) >= most:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    except CancelledError as error:
+        raise StoppedError("stopped") from error
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def opened_workers(workers: int, cluster: str | None) -> Workers | None:
+    """Return what does the work: None for this process, which is the case for one worker and no cluster."""
+    if cluster is not None:
+        return Cluster(cluster)
+    return Processes(workers) if workers > 1 else None
+
+
+# --- tasks on an existing Dask cluster; needs the optional extra ``cluster`` -----------------------------------------
+
+#: How long to try to reach the scheduler, s.
+CONNECT_S = 5.0
+#: How often somebody who waits for a task looks at the cluster, s.
+CLUSTER_POLL_S = 1.0
+#: How long a cluster may be without a worker before its tasks count as lost, s.
+NO_WORKER_S = 60.0
+#: How often Dask tries a task again that a worker could not even begin.
+RETRIES = 2
+#: Least and most tasks at the scheduler at a time; between them two for each thread of the workers.
+LEAST, MOST = 8, 256
+#: What must be the same everywhere for the same bytes.
+PACKAGES = ("compgen", "numpy", "scipy")
+
+
+class ClusterError(CompgenError):
+    """The cluster cannot be used: not reached, other versions, workers on other machines."""
+
+
+class _BlamedError(Exception):
+    """Several workers were lost while this task ran or waited on them."""
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a worker has to be like: versions of packages, and the machine (empty: any)."""
+
+    versions: tuple[tuple[str, str], ...]
+    host: str = ""
+
+
+def facts(*, host: bool) -> Facts:
+    """Return the facts of this process."""
+    return Facts(_versions(), _host() if host else "")
+
+
+@cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    return tuple((name, next((item.version for item in distributions(name=name)), "none")) for name in PACKAGES)
+
+
+@cache
+def _host() -> str:
+    """Name this start of this computer."""
+    try:
+        return f"{gethostname()} {Path('/proc/sys/kernel/random/boot_id').read_text(encoding='ascii').strip()}"
+    except OSError:
+        return gethostname()
+
+
+def objection(required: Facts, found: Facts, who: str) -> str:
+    """Say why a scheduler or worker cannot be used, empty if it can."""
+    here, there = dict(required.versions), dict(found.versions)
+    other = [f"{name} {there.get(name, 'none')} in place of {here[name]}" for name in here if here[name] != there[name]]
+    if other:
+        return f"{who} has {', '.join(other)}; the same versions belong everywhere, so that results are the same"
+    if required.host and required.host != found.host:
+        return f"{who} runs on {found.host.split(' ')[0]}, this is {required.host.split(' ')[0]}"
+    return ""
+
+
+def perform_there(required: Facts, function: Packed, item: Packed) -> Answer | str:
+    """Compute one item on a worker, or say why that worker must not."""
+    return objection(required, facts(host=bool(required.host)), "a worker") or perform(function, item)
+
+
+class Cluster:
+    """An existing Dask cluster; a lost worker's items are tried elsewhere.
+
+    Parameters
+    ----------
+    address : of the scheduler, e.g. ``tcp://10.0.0.5:8786``.
+    same_host : why every worker has to run on this machine; empty if it need not.
+
+    Raises
+    ------
+    InputError
+        if Dask is not installed.
+    ClusterError
+        if the scheduler does not answer within a few seconds, or the cluster cannot be used.
+    """
+
+    def __init__(self, address: str, *, same_host: str = "") -> None:
+        if importlib.util.find_spec("distributed") is None:
+            raise InputError("--cluster needs Dask; install compgen[cluster]")
+        self.address, self._same_host = address, same_host
+        self._required = facts(host=bool(same_host))
+        self._empty_since: float | None = None
+        self._client = _connected(address)
+        try:
+            self._check()
+            threads = sum(self._client.nthreads().values())
+        except BaseException:
+            self.close()
+            raise
+        self.size = min(max(2 * threads, LEAST), MOST)
+
+    def _check(self) -> None:
+        """Refuse a cluster of other versions, or, where that counts, of other machines."""
+        found = self._client.get_versions(packages=list(PACKAGES))
+        sides = {"the scheduler": found["scheduler"], **{f"worker {k}": v for k, v in found["workers"].items()}}
+        for who, item in sides.items():
+            packages = {} if item is None else item["packages"]
+            there = Facts(tuple((name, str(packages.get(name) or "none")) for name in PACKAGES))
+            self._refuse(objection(Facts(self._required.versions), there, who))
+        if self._required.host:
+            for who, item in self._client.run(facts, host=True).items():
+                self._refuse(objection(self._required, item, f"worker {who}"))
+
+    def _refuse(self, reason: str) -> None:
+        if reason:
+            why = f"; {self._same_host}" if " runs on " in reason else ""
+            raise ClusterError(f"the cluster {self.address} cannot be used: {reason}{why}")
+
+    def call(self, function: Packed, item: Packed, stop: Stop) -> Any:
+        """Return ``function(item)``; see :class:`compgen.kinematics.parallel.Workers`."""
+        if stop():
+            raise StoppedError("not begun: stopped")
+        if self._empty_since is not None:
+            self._look()
+        for _ in range(2):  # it may be blamed for another task, which took the worker with it: once more
+            try:
+                answer = self._answer(function, item, stop)
+            except _BlamedError:
+                continue
+            if isinstance(answer, str):
+                self._refuse(answer)
+            return answer.value()
+        raise LostError("every worker of the cluster that worked on it was lost")
+
+    def _answer(self, function: Packed, item: Packed, stop: Stop) -> Any:
+        """Submit the item and wait for it; polled, because the cluster may be lost and the user may ask to stop."""
+        from distributed import CancelledError, KilledWorker
+
+        key = f"compgen-{uuid.uuid4().hex}"  # the default one could show arguments
+        future = self._client.submit(
+            perform_there, self._required, function, item, key=key, pure=False, retries=RETRIES
+        )
+        try:
+            while True:
+                try:
+                    return future.result(timeout=CLUSTER_POLL_S)
+                except KilledWorker as error:
+                    raise _BlamedError from error
+                except CancelledError as error:
+                    raise LostError(f"the scheduler {self.address} was lost") from error
+                except TimeoutError:
+                    if stop():
+                        raise StoppedError("stopped; what runs on the cluster is kept when it ends") from None
+                    self._look()
+                except Exception as error:  # the worker could not begin it: what it raises is not of the item
+                    raise ClusterError(f"the cluster {self.address} cannot run compgen: {error}") from error
+        finally:
+            if not future.done():
+                future.cancel()
+            future.release()
+
+    def _look(self) -> None:
+        """Raise LostError if the scheduler is gone, or no worker has been there for a while."""
+        if self._client.status != "running":
+            raise LostError(f"the scheduler {self.address} was lost")
+        try:
+            workers = self._client.nthreads()
+        except (OSError, TimeoutError) as error:
+            raise LostError(f"the scheduler {self.address} was lost") from error
+        now = time.monotonic()
+        since = self._empty_since = None if workers else self._empty_since or now
+        if since is not None and now - since > NO_WORKER_S:
+            raise LostError(f"the cluster {self.address} has had no worker for {NO_WORKER_S:.0f} s")
+
+    def close(self) -> None:
+        """Leave the cluster; tasks that were not begun are forgotten by it."""
+        self._client.close()
+
+
+def _connected(address: str) -> Any:
+    from distributed import Client
+
+    make: Any = Client
+    for name in ("distributed", "tornado"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is raised
+    try:
+        return make(address, timeout=CONNECT_S, set_as_default=False, name="compgen")
+    except (OSError, TimeoutError, ValueError, KeyError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ClusterError(
+            f"no Dask scheduler answers at {address} within {CONNECT_S:.0f} s ({reason}); start one with "
+            "`dask scheduler`, or give its address, for example tcp://10.0.0.5:8786"
+        ) from error

@@ -1,0 +1,604 @@
+"""What a planned measurement will determine, how well, and which effects it can never show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.display import Drawable, Overview, Panel
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.lengths import Lengths, Points
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM, error_named
+from compgen.effects import Card, Effect, Readings, catalogue
+from compgen.effects.catalogue import INVISIBLE, Pair, VisiblePart, alike_pairs, separating, visible_parts
+from compgen.effects.structure import SignError, Squareness
+from compgen.errors import InputError
+from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
+from compgen.identify.adjust.problem import LengthProblem, length_problem
+from compgen.identify.adjust.rank import ZERO_EIGENVALUE, Rank, describe_rank, unknown_names
+from compgen.identify.adjust.unknowns import ErrorParameters, State, check_travel, error_parameters
+from compgen.identify.covariance import error_values
+from compgen.identify.identification import table_of_values
+from compgen.identify.options import IdentifyOptions, ReadingNoise, reading_noise
+from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
+from compgen.kinematics.kernel_switch import one_thread
+from compgen.kinematics.volume_grid import volume_grid
+from compgen.plan.stations import PlannedStations
+from compgen.simulate.trajectory import approach_of
+
+# The least-squares problem of a measurement that has not been made: its normal matrix, and what follows from it.
+
+
+#: A target nearer to a station than this can not be measured; the line of sight has no direction there.
+NEAREST_MM = 1.0
+#: A quantity with more than this share of its size in directions without data is not determined.
+UNDETERMINED_SHARE = 1e-4
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A planned measurement as a least-squares problem whose errors are zero.
+
+    Parameters
+    ----------
+    machine, stations, noise : what measures what, and how well.
+    lengths : the readings that it will have, without errors.
+    problem : all weights 1; the weights follow the distances, so they change with the stations.
+    tool_mm : tool offsets, (3,) or (n, 3).
+    """
+
+    machine: Machine
+    stations: PlannedStations
+    noise: ReadingNoise
+    lengths: Lengths
+    problem: GridProblem | LengthProblem
+    tool_mm: FloatArray
+
+    def normal_matrix(self, stations_mm: FloatArray) -> FloatArray:
+        """Normal matrix (size, size) in 1/mm^2 with the stations at the given places (S, 3)."""
+        distance = np.linalg.norm(self.lengths.position_mm + self.tool_mm - stations_mm[self.lengths.station], axis=1)
+        weight = 1.0 / self.noise.sigma_mm(distance) ** 2
+        state = State(np.zeros(self.problem.parameters.size), stations_mm, np.zeros(self.problem.groups))
+        return self.problem.weighted(weight).normal_matrix(state)
+
+    def distances_mm(self) -> FloatArray:
+        """Distance of station and target of each reading, (n,)."""
+        centre = self.stations.position_mm[self.lengths.station]
+        return np.asarray(np.linalg.norm(self.lengths.position_mm + self.tool_mm - centre, axis=1))
+
+    def error_rows(
+        self, position_mm: FloatArray, layout: ErrorParameters | None = None, tool_mm: FloatArray | None = None
+    ) -> FloatArray:
+        """Derivative of E by the unknown errors at commanded points (n, 3): C B, shape (n, 3, errors)."""
+        chosen = layout or self.problem.parameters
+        bases = [chosen.basis(axis, position_mm[:, axis]) for axis in range(3)]
+        return chosen.design(c_matrix(self.machine, position_mm, tool_mm), bases)
+
+    def nodes_without_data(self) -> dict[str, list[float]]:
+        """Nodes in mm by axis whose coefficient no reading touches."""
+        found = {}
+        for axis, name in enumerate(AXES):
+            basis = self.problem.parameters.basis(axis, np.unique(self.lengths.position_mm[:, axis]))
+            empty = np.abs(basis).max(axis=0) < 1e-12
+            found[name] = self.machine.axes[axis].nodes_mm[empty].tolist()
+        return {name: nodes for name, nodes in found.items() if nodes}
+
+
+def planned(machine: Machine, stations: PlannedStations, points: Points, noise: ReadingNoise) -> Planned:
+    """Set up the problem of a planned measurement: every station reads every point once in each of its passes.
+
+    Raises
+    ------
+    InputError
+        for a point outside the travel, or a station at a point.
+    """
+    check_travel(machine, points.position_mm)
+    count, passes = len(points), len(stations.passes)
+    tool = tool_of(machine, points.tool_mm)
+    several = tool.ndim == 2 and bool(np.any(np.ptp(tool, axis=0) > 1e-9))
+    if tool.ndim == 2 and not several:
+        tool = tool[0]
+    names = modelled_errors(machine, np.unique(tool, axis=0) if several else None)
+    station, setup = np.repeat(stations.passes, count, axis=0).T
+    position_mm = np.tile(points.position_mm, (passes, 1))
+    tools = np.tile(tool, (passes, 1)) if several else tool
+    distance = np.linalg.norm(position_mm + tools - stations.position_mm[station], axis=1)
+    lengths = Lengths(
+        stations=stations.names,
+        station=station,
+        point=[str(k + 1) for k in range(count)] * passes,
+        position_mm=position_mm,
+        length_mm=distance,
+        tool_mm=tools if several else np.broadcast_to(tools, position_mm.shape),
+        labels={"setup": setup},
+    )
+    layout = error_parameters(machine, names, several_tools=several)
+    _, group = np.unique(np.column_stack([station, setup]), axis=0, return_inverse=True)
+    problem = grid_problem(layout, position_mm, tools, station, group.ravel(), distance)
+    found = Planned(machine, stations, noise, lengths, problem or length_problem(machine, lengths, layout), tools)
+    nearest = int(np.argmin(found.distances_mm()))
+    if found.distances_mm()[nearest] < NEAREST_MM:
+        where = ", ".join(f"{value:g}" for value in position_mm[nearest])
+        raise InputError(
+            f"station {stations.names[station[nearest]]!r} coincides with the target at ({where}) mm; move it"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a normal matrix says about the unknowns.
+
+    ``scale`` (size,) gives the matrix a unit diagonal, ``eigenvalues`` (size,) and ``vectors`` (size, size) are those
+    of the scaled matrix; directions with an eigenvalue below the limit are not determined.
+    """
+
+    scale: FloatArray
+    eigenvalues: FloatArray
+    vectors: FloatArray
+
+    @property
+    def null(self) -> NDArray[np.bool_]:
+        """Which directions have no data, (size,)."""
+        return np.asarray(self.eigenvalues < ZERO_EIGENVALUE)
+
+    @cached_property
+    def factor(self) -> FloatArray:
+        """F (size, rank) with F F^T the covariance of what is determined, mm and rad."""
+        kept = ~self.null
+        return np.asarray(self.scale[:, None] * self.vectors[:, kept] / np.sqrt(self.eigenvalues[kept]))
+
+    def of(self, unknowns: slice) -> Prediction:
+        """Return the prediction of a part of the unknowns."""
+        return Prediction(self.scale[unknowns], self.eigenvalues, self.vectors[unknowns])
+
+    def u(self, rows: FloatArray) -> FloatArray:
+        """Standard uncertainty of linear functions of the unknowns, rows (..., size): shape (...,), nan if open."""
+        spread = rows @ self.factor
+        u = np.sqrt(np.einsum("...k,...k->...", spread, spread))
+        if self.null.any():
+            scaled = rows * self.scale
+            lost = np.linalg.norm(scaled @ self.vectors[:, self.null], axis=-1)
+            u = np.where(lost > UNDETERMINED_SHARE * np.linalg.norm(scaled, axis=-1), np.nan, u)
+        return np.asarray(u)
+
+
+def predict_unknowns(matrix: FloatArray) -> Prediction:
+    """Return the prediction of a normal matrix (size, size)."""
+    diagonal = np.diag(matrix)
+    empty = diagonal <= 1e-14 * np.median(diagonal[diagonal > 0])
+    scale = 1.0 / np.sqrt(np.where(empty, 1.0, diagonal))
+    scaled = np.where(empty[:, None] | empty, 0.0, matrix * scale * scale[:, None])
+    return Prediction(scale, *np.linalg.eigh(scaled))
+
+
+def planned_rank(found: Planned, matrix: FloatArray) -> Rank:
+    """Return the rank with the combinations in words."""
+    lengths = found.lengths
+    _, group = np.unique(np.column_stack([lengths.station, lengths.labels["setup"]]), axis=0, return_inverse=True)
+    return describe_rank(matrix, unknown_names(found.problem, lengths.stations, lengths.station, group.ravel()))
+
+
+# What a measurement will determine, and how well, before it is made.
+
+
+#: Points of the volume whose rows of C B are made together.
+CHUNK_POINTS = 1024
+
+
+@dataclass(frozen=True)
+class VolumeUncertainty:
+    """Standard uncertainty of E = C P over the grid of nodes and the middles between them, reference point fixed.
+
+    Parameters
+    ----------
+    position_mm : the points, shape (n, 3).
+    u_mm : standard uncertainty of each component, shape (n, 3), nan where it is not determined.
+    """
+
+    position_mm: FloatArray
+    u_mm: FloatArray
+
+    @property
+    def total_mm(self) -> FloatArray:
+        """Root of the sum of the squares of the three components, (n,)."""
+        return np.asarray(np.sqrt(np.sum(self.u_mm**2, axis=1)))
+
+    @property
+    def worst_um(self) -> float:
+        """Largest total in um; infinite if a point is not determined."""
+        return float(self.total_mm.max()) / MM_PER_UM if np.isfinite(self.u_mm).all() else np.inf
+
+    @property
+    def rms_um(self) -> float:
+        """Root mean square of the total in um; infinite if a point is not determined."""
+        return float(np.sqrt(np.mean(self.total_mm**2))) / MM_PER_UM if np.isfinite(self.u_mm).all() else np.inf
+
+    def summary(self) -> dict[str, Any]:
+        """Return the object ``volume`` of ``plan.json``; None where a point is not determined."""
+        open_points = ~np.isfinite(self.u_mm).all(axis=1)
+        report: dict[str, Any] = {"points": len(self.u_mm), "undetermined_points": int(np.count_nonzero(open_points))}
+        whole = not open_points.any()
+        for k, axis in enumerate("xyz"):
+            report[f"u_{axis}_max_um"] = float(self.u_mm[:, k].max()) / MM_PER_UM if whole else None
+            report[f"u_{axis}_rms_um"] = float(np.sqrt(np.mean(self.u_mm[:, k] ** 2))) / MM_PER_UM if whole else None
+        report["u_max_um"] = self.worst_um if whole else None
+        report["u_rms_um"] = self.rms_um if whole else None
+        report["worst_at_mm"] = self.position_mm[int(np.argmax(self.total_mm))].tolist() if whole else None
+        return report
+
+
+@dataclass(frozen=True, repr=False)
+class Plan(Drawable):
+    """What a planned measurement determines.
+
+    Parameters
+    ----------
+    planned : the measurement.
+    rank : numerical rank, condition and the combinations without data in words.
+    nodes_without_data : nodes in mm by axis that no reading touches.
+    errors : zero values with the predicted standard uncertainties, nan where they are not determined.
+    volume : uncertainty of E over the working volume.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> stations = compgen.planned_stations({"A": (-900, -1100, -400), "B": (100, -1100, -400), "C": (100, 100, -300)})
+    >>> grid = np.meshgrid(*(axis.nodes_mm for axis in machine.axes), indexing="ij")
+    >>> points = compgen.Points(np.column_stack([item.ravel() for item in grid]))
+    >>> predicted: compgen.Plan = compgen.plan(machine, stations, points)
+    >>> predicted
+    <Plan: 3993 readings, rank 149 of 149: everything is determined>
+    """
+
+    planned: Planned
+    rank: Rank
+    nodes_without_data: dict[str, list[float]]
+    errors: ErrorTable
+    volume: VolumeUncertainty
+
+    @property
+    def readings(self) -> int:
+        """Number of readings."""
+        return len(self.planned.lengths)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the measurement will not do, in words; empty if everything is determined."""
+        found = list(self.rank.combinations) if self.rank.rank < self.rank.size else []
+        if not found and self.readings <= self.rank.size:
+            found.append(f"{self.readings} readings for {self.rank.size} unknowns leave nothing to check them by")
+        return tuple(found)
+
+    @property
+    def determined(self) -> bool:
+        """Whether the measurement determines every unknown."""
+        return not self.reasons
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of ``plan.json``."""
+        stations, noise = self.planned.stations, self.planned.noise
+        return {
+            "determined": self.determined,
+            "reasons": list(self.reasons),
+            "machine": self.planned.machine.name,
+            "stations": [
+                {"station": name, "position_mm": place.tolist()}
+                for name, place in zip(stations.names, stations.position_mm, strict=True)
+            ],
+            "passes": len(stations.passes),
+            "points": self.readings // len(stations.passes),
+            "readings": self.readings,
+            "rank": self.rank.rank,
+            "unknowns": self.rank.size,
+            "undetermined_directions": self.rank.size - self.rank.rank,
+            "condition": self.rank.condition,
+            "nodes_without_data": self.nodes_without_data,
+            "u_length": {
+                "source": noise.source,
+                "constant_um": noise.constant_um,
+                "proportional_um_per_m": noise.proportional_um_per_m,
+            },
+            "curves": {name: _curve_summary(name, curve) for name, curve in self.errors.curves.items()},
+            "squareness": {
+                name: {"unit": "urad", "u": _known(u * 1e6)} for name, (_, u) in self.errors.squareness.items()
+            },
+            "volume": self.volume.summary(),
+        }
+
+    def overview(self) -> Overview:
+        """Whether everything is determined, and the largest standard uncertainty of each error."""
+        found = "everything is determined" if self.determined else "not everything is determined"
+        title = f"{self.readings} readings, rank {self.rank.rank} of {self.rank.size}: {found}"
+        rows = tuple((name, known, unit) for name, _, _, known, unit in self.errors.overview().rows)
+        return Overview(title, ("error", "u (k = 1)", "unit"), rows, self.reasons)
+
+    def panels(self) -> Sequence[Panel]:
+        """The predicted standard uncertainty of each curve, as a band about zero."""
+        return self.errors.panels()
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _curve_summary(name: str, curve: Curve) -> dict[str, Any]:
+    error = error_named(name)
+    whole = bool(np.isfinite(curve.u).all())
+    return {
+        "unit": error.unit,
+        "determined": whole,
+        "u_max": float(curve.u.max()) / error.si_per_unit if whole else None,
+        "at_mm": float(curve.position_mm[int(np.argmax(curve.u))]) if whole else None,
+    }
+
+
+def plan(machine: Machine, stations: PlannedStations, points: Points, options: IdentifyOptions | None = None) -> Plan:
+    """Predict what a measurement will determine, and with which standard uncertainty.
+
+    Parameters
+    ----------
+    machine : chain, nodes, and which errors its model contains.
+    stations : any number of them; with one or two the ambiguity that is left is reported.
+    points : commanded points; a point that is listed twice is read twice.
+    options : standard uncertainty of a reading.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> stations = compgen.planned_stations({"A": (-900, -1100, -400), "B": (100, -1100, -400), "C": (100, 100, -300)})
+    >>> grid = np.meshgrid(*(axis.nodes_mm for axis in machine.axes), indexing="ij")
+    >>> points = compgen.Points(np.column_stack([item.ravel() for item in grid]))
+    >>> compgen.plan(machine, stations, points).determined
+    True
+    """
+    with one_thread():
+        return plan_of(planned(machine, stations, points, planned_noise(options)))
+
+
+def planned_noise(options: IdentifyOptions | None = None) -> ReadingNoise:
+    """Return the uncertainty of a planned reading: the stated one, else the usual one of a laser tracer."""
+    nothing = np.zeros(0)
+    no_readings = Lengths((), nothing.astype(np.int64), (), nothing.reshape(0, 3), nothing)
+    return reading_noise(no_readings, options or IdentifyOptions())
+
+
+def plan_of(found: Planned) -> Plan:
+    """Return the plan of a measurement that has been set up."""
+    matrix = found.normal_matrix(found.stations.position_mm)
+    rank = planned_rank(found, matrix)
+    prediction = predict_unknowns(matrix)
+    nodes = [axis.nodes_mm for axis in found.machine.axes]
+    grid = volume_grid(found.machine, (nodes[0], nodes[1], nodes[2])).position_mm
+    of_errors = prediction.of(slice(0, found.problem.parameters.size))
+    chunks = [grid[k : k + CHUNK_POINTS] for k in range(0, len(grid), CHUNK_POINTS)]
+    return Plan(
+        planned=found,
+        rank=rank,
+        nodes_without_data=found.nodes_without_data(),
+        errors=_predicted_errors(found, prediction),
+        volume=VolumeUncertainty(grid, np.concatenate([of_errors.u(found.error_rows(chunk)) for chunk in chunks])),
+    )
+
+
+def _predicted_errors(found: Planned, prediction: Prediction) -> ErrorTable:
+    values = error_values(found.problem.parameters)
+    table = table_of_values(
+        (name, position_mm, np.zeros(len(position_mm)), prediction.of(columns).u(matrix))
+        for name, position_mm, columns, matrix in values
+    )
+    reference = " ".join(f"{value:g}" for value in found.machine.reference_point_mm)
+    metadata = {
+        "machine": found.machine.name,
+        "source": "compgen plan",
+        "values": "zero, only u_value is predicted",
+        "reference_point_mm": reference,
+    }
+    return table.replace(metadata=metadata)
+
+
+# What a planned measurement can never see of the catalogue of effects, and what to measure in addition.
+
+
+#: Time between two stops of a plan that says nothing about it, and its feed; only their being constant matters.
+STOP_S = 10.0
+FEED_MM_MIN = 1000.0
+CHUNK_READINGS = 2048
+#: Warming of every channel over a plan without temperatures, K; only that they warm together matters.
+WARMING_K = 1.0
+
+
+@dataclass(frozen=True)
+class PlanVisibility:
+    """Visible fractions, what is hidden and why, effects that look alike.
+
+    Parameters
+    ----------
+    parts : visible part of every effect whose columns the plan can tell.
+    hidden : why an effect does not show at all, by its name.
+    pairs : effects that cannot be told apart.
+    cards : cards of the effects.
+    assumed : what the plan does not say and was assumed, in words.
+    """
+
+    parts: dict[str, VisiblePart]
+    hidden: dict[str, str]
+    pairs: list[Pair]
+    cards: dict[str, Card]
+    assumed: list[str]
+
+    @property
+    def never(self) -> dict[str, str]:
+        """Effects that the plan never sees, with the reason."""
+        faint = {
+            name: f"visible fraction {part.fraction:.3f}: the errors of the machine, stations and dead lengths imitate it"
+            for name, part in self.parts.items()
+            if part.fraction < INVISIBLE
+        }
+        return {**self.hidden, **faint}
+
+    def summary(self) -> dict[str, Any]:
+        """Return the object ``visibility`` of ``plan.json``."""
+        return {
+            "assumed": self.assumed,
+            "fractions": {name: round(part.fraction, 4) for name, part in self.parts.items()},
+            "never": [
+                {"name": name, "reason": reason, "measure": self.cards[name].breaker}
+                for name, reason in self.never.items()
+            ],
+            "alike": [
+                {
+                    "names": list(pair.names),
+                    "correlation": round(pair.correlation, 4),
+                    "shared_directions": pair.shared,
+                    "directions": pair.directions,
+                    "measure": separating(*(self.cards[name] for name in pair.names)),
+                }
+                for pair in self.pairs
+            ],
+        }
+
+
+def plan_visibility(found: Planned, points: Points) -> PlanVisibility:
+    """Project every effect of the catalogue off what errors, stations and dead lengths can do in this plan.
+
+    The order of the points is that in which they are visited. What the points do not say is assumed: one feed, equal
+    times, temperatures that rise together; it stands in the result.
+    """
+    readings, assumed = _readings(found, points)
+    modelled = modelled_errors(found.machine)
+    chosen, hidden, cards = {}, {}, {}
+    for name, effect in catalogue(found.stations.names).items():
+        if isinstance(effect, SignError | Squareness):
+            missing = effect.displacement(readings) is not None  # else the sign means nothing on this chain
+        else:
+            missing = effect.card.name.removeprefix("lever_") not in modelled
+        if "lengths" not in effect.card.kinds or not missing:
+            continue
+        cards[name] = effect.card
+        columns = _columns(effect, readings)
+        if columns is None:
+            hidden[name] = _lacking(effect.card, readings)
+        else:
+            chosen[name] = columns
+    gram, base, where = _gram(found, readings, chosen)
+    parts = visible_parts(gram, base, where)
+    seen = {name: part for name, part in parts.items() if part.fraction >= INVISIBLE}
+    return PlanVisibility(parts, hidden, alike_pairs(gram, base, seen), cards, assumed)
+
+
+def _columns(effect: Effect, readings: Readings) -> FloatArray | None:
+    """Columns of an effect at the middle of its scan positions."""
+    positions = list(effect.positions(readings))
+    fixed = effect.at(positions[len(positions) // 2]) if positions else effect
+    columns = fixed.columns(readings)
+    return None if columns is None or not np.any(columns) else columns
+
+
+def _lacking(card: Card, readings: Readings) -> str:
+    if card.name.startswith("lever_"):
+        return "one tool offset"
+    if card.name == "tool_offset_error":
+        return "one set-up"
+    known = {*readings.covariates, *readings.labels, "station", "approach_x", "approach_y", "approach_z"}
+    lacking = [name for name in card.covariates if name not in known]
+    return f"the plan has no {', '.join(lacking)}" if lacking else "nothing of it varies in this plan"
+
+
+def _readings(found: Planned, points: Points) -> tuple[Readings, list[str]]:
+    """The planned readings with covariates, and what was assumed."""
+    lengths, count = found.lengths, len(points)
+    passes = found.stations.passes[:, 0]
+    stop = np.tile(np.arange(count), len(passes))
+    own_pass = np.repeat([np.count_nonzero(passes[:k] == station) for k, station in enumerate(passes)], count)
+    covariates, assumed = _covariates(points)
+    covariates = {name: values[stop] for name, values in covariates.items()}
+    covariates["time_s"] = np.asarray(covariates["time_s"] + own_pass * count * STOP_S, dtype=np.float64)
+    approach = points.approach
+    if approach is None:
+        approach = approach_of(np.diff(points.position_mm, axis=0, prepend=points.position_mm[:1]))
+        assumed.append("points are visited in the order of the file")
+    setup = lengths.labels["setup"] if "setup" not in points.covariates else points.covariates["setup"][stop]
+    tool_mm = np.broadcast_to(found.tool_mm, lengths.position_mm.shape)
+    line_mm = lengths.position_mm + tool_mm - found.stations.position_mm[lengths.station]
+    range_mm = np.asarray(np.linalg.norm(line_mm, axis=1), dtype=np.float64)
+    readings = Readings(
+        machine=found.machine,
+        kind="lengths",
+        position_mm=lengths.position_mm,
+        direction=line_mm / range_mm[:, None],
+        tool_mm=tool_mm,
+        stations=found.stations.names,
+        station=lengths.station,
+        range_mm=range_mm,
+        approach=approach[stop],
+        covariates=covariates,
+        labels={"setup": setup.astype(np.int64)},
+    )
+    return readings, assumed
+
+
+def _covariates(points: Points) -> tuple[dict[str, FloatArray], list[str]]:
+    logged = {name: values for name, values in points.covariates.items() if name != "setup"}
+    assumed: list[str] = []
+    if "time_s" not in logged:
+        logged["time_s"] = STOP_S * np.arange(len(points), dtype=np.float64)
+        assumed.append("stops follow each other at equal times, and all stations read at once")
+    if "feed_mm_min" not in logged:
+        logged["feed_mm_min"] = np.full(len(points), FEED_MM_MIN)
+        assumed.append("one feed")
+    if not any(name.startswith("temp_") for name in logged):
+        warming = np.asarray(WARMING_K * np.linspace(0.0, 1.0, len(points)))
+        names = ("x", "y", "z", "spindle", "ambient", "column_front")
+        logged |= {f"temp_{name}_c": 20.0 + warming for name in names}
+        logged["temp_column_rear_c"] = np.full(len(points), 20.0)
+        assumed.append("temperatures are logged and rise together during the measurement")
+    if "load_kg" not in logged:
+        assumed.append("one load")
+    return logged, assumed
+
+
+def _gram(
+    found: Planned, readings: Readings, chosen: dict[str, FloatArray]
+) -> tuple[FloatArray, int, dict[str, slice]]:
+    """Gram matrix of the base Jacobian and the columns of the effects, readings in units of their uncertainty."""
+    where, start = {}, 0
+    for name, columns in chosen.items():
+        where[name] = slice(start, start + columns.shape[1])
+        start += columns.shape[1]
+    names = modelled_errors(found.machine)  # those of one tool: what further tools show is an effect here
+    layout = error_parameters(found.machine, names)
+    keys = np.column_stack([readings.station, readings.labels["setup"], found.lengths.labels["setup"]])
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    weight = 1.0 / found.noise.sigma_mm(readings.range_mm)
+    size = layout.size + 3 * len(readings.stations) + int(group.max()) + 1
+    gram = np.zeros((size + start, size + start))
+    for first in range(0, len(readings), CHUNK_READINGS):
+        rows = slice(first, first + CHUNK_READINGS)
+        moved = found.error_rows(readings.position_mm[rows], layout, readings.tool_mm[rows])
+        errors = np.einsum("nd,ndp->np", readings.direction[rows], moved)
+        placing = _placing(readings, group.ravel().astype(np.int64), rows, size - layout.size)
+        block = np.hstack([errors, placing, *(columns[rows] for columns in chosen.values())]) * weight[rows, None]
+        gram += block.T @ block
+    return gram, size, where
+
+
+def _placing(readings: Readings, group: NDArray[np.int64], rows: slice, size: int) -> FloatArray:
+    """Derivative of the readings by stations and dead lengths."""
+    station, each = readings.station[rows], np.arange(len(readings.station[rows]))
+    columns = np.zeros((len(station), size))
+    for axis in range(3):
+        columns[each, 3 * station + axis] = -readings.direction[rows, axis]
+    columns[each, 3 * len(readings.stations) + group[rows]] = -1.0
+    return columns

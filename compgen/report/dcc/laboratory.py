@@ -1,0 +1,245 @@
+"""``certificate.toml``: what only the laboratory knows of a calibration. Nothing in it has a default that says something."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from compgen.data.toml_files import Section, choice, flag, number, read_toml, text
+
+#: Where a calibration was done, as the schema names it.
+LOCATIONS = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
+MOST_CHARACTERS = 4000
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A laboratory or a customer; empty texts were not given."""
+
+    name: str
+    city: str
+    country: str
+    street: str = ""
+    street_number: str = ""
+    post_code: str = ""
+    email: str = ""
+    phone: str = ""
+
+
+@dataclass(frozen=True)
+class Person:
+    """Somebody who answers for the certificate."""
+
+    name: str
+    role: str = ""
+    email: str = ""
+    main_signer: bool | None = None
+
+
+@dataclass(frozen=True)
+class Thing:
+    """The machine, its control or an instrument; ``name`` may be empty for the machine: its file names it."""
+
+    name: str
+    serial_number: str
+    manufacturer: str = ""
+    model: str = ""
+    inventory_number: str = ""
+    software_version: str = ""
+    certificate_number: str = ""
+    certificate_sha256: str = ""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition during the measurement: lowest and highest value in a D-SI unit, with the stem of its refTypes."""
+
+    name: str
+    unit: str
+    lowest: float
+    highest: float
+    ref_type: str = ""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """All of ``certificate.toml``."""
+
+    number: str
+    country: str
+    begin: datetime.date
+    end: datetime.date
+    location: str
+    laboratory: Contact
+    customer: Contact
+    persons: tuple[Person, ...]
+    machine: Thing
+    equipment: tuple[Thing, ...]
+    received: datetime.date | None = None
+    issued: datetime.date | None = None
+    laboratory_code: str = ""
+    control: Thing | None = None
+    conditions: tuple[Condition, ...] = ()
+    statements: tuple[tuple[str, str], ...] = ()
+
+
+#: Keys of ``[conditions]``: name, D-SI unit, refType of the public list, limits of sense.
+CONDITIONS: dict[str, tuple[str, str, str, tuple[float, float]]] = {
+    "air_temperature_c": ("Air temperature", "\\degreeCelsius", "basic_temperature", (-60.0, 100.0)),
+    "machine_temperature_c": ("Temperature of the machine", "\\degreeCelsius", "basic_temperature", (-60.0, 100.0)),
+    "humidity_percent": ("Relative humidity of the air", "\\percent", "basic_humidityRelative", (0.0, 100.0)),
+    "pressure_hpa": ("Air pressure", "\\hecto\\pascal", "", (500.0, 1200.0)),
+}
+
+
+def date(value: Any) -> datetime.date:
+    """A date without a time."""
+    if not isinstance(value, datetime.date) or isinstance(value, datetime.datetime):
+        raise ValueError("a date as 2026-11-21, without quotation marks, is expected")
+    return value
+
+
+def country(value: Any) -> str:
+    """A country code of ISO 3166-1."""
+    if not isinstance(value, str) or not re.fullmatch("[A-Z]{2}", value):
+        raise ValueError("two capital letters of ISO 3166-1, such as DE, are expected")
+    return value
+
+
+def sha256(value: Any) -> str:
+    """A SHA-256 as hexadecimal digits."""
+    if not isinstance(value, str) or not re.fullmatch("[0-9a-fA-F]{64}", value):
+        raise ValueError("64 hexadecimal digits are expected")
+    return value.lower()
+
+
+def long_text(value: Any) -> str:
+    """A text of several lines."""
+    if not isinstance(value, str) or not value.strip() or len(value) > MOST_CHARACTERS:
+        raise ValueError(f"a text of at most {MOST_CHARACTERS} characters is expected")
+    return value
+
+
+def range_within(limits: tuple[float, float]) -> Callable[[Any], tuple[float, float]]:
+    """One number, or the lowest and the highest one, within ``limits``."""
+
+    def check(value: Any) -> tuple[float, float]:
+        message = f"a number, or two numbers [lowest, highest], from {limits[0]:g} to {limits[1]:g} are expected"
+        values = value if isinstance(value, list) else [value, value]
+        if len(values) != 2:
+            raise ValueError(message)
+        low, high = (number(item) for item in values)
+        if not limits[0] <= low <= high <= limits[1]:
+            raise ValueError(message)
+        return low, high
+
+    return check
+
+
+#: Keys of every table, in the order in which they are read; "?" marks those that may be left out.
+KEYS: dict[str, tuple[str, ...]] = {
+    "contact": ("name", "city", "country", "street?", "street_number?", "post_code?", "email?", "phone?"),
+    "person": ("name", "role?", "email?", "main_signer?"),
+    "machine": ("name?", "serial_number", "manufacturer", "model?", "inventory_number?"),
+    "control": ("name", "serial_number", "manufacturer?", "model?", "software_version?"),
+    "equipment": (
+        "name", "serial_number", "manufacturer?", "model?", "certificate_number?", "certificate_sha256?",
+    ),
+    "statement": ("name", "text"),
+}  # fmt: skip
+#: Keys that hold something else than one line of text.
+CHECKS: dict[str, Callable[[Any], Any]] = {
+    "country": country,
+    "main_signer": flag,
+    "certificate_sha256": sha256,
+    "text": long_text,
+}
+
+
+def read_certificate(path: str | Path) -> Certificate:
+    """Read ``certificate.toml``.
+
+    Raises
+    ------
+    InputError
+        for a key that is missing, not known, or holds something else than it should; the message names it.
+    """
+    root = read_toml(path)
+    core = root.section("certificate")
+    begin, end = core.take("begin", date), core.take("end", date)
+    if end < begin:
+        raise core.fail("end", f"{end} is before begin, {begin}")
+    laboratory = root.section("laboratory")
+    contact = _values(laboratory, "contact")
+    control = root.section("control", required=False)
+    found = Certificate(
+        number=core.take("number", text),
+        country=core.take("country", country),
+        begin=begin,
+        end=end,
+        location=core.take("location", choice(*LOCATIONS)),
+        laboratory=Contact(**contact),
+        laboratory_code=laboratory.take("code", text, ""),
+        customer=Contact(**_closed(root.section("customer"), "contact")),
+        persons=tuple(Person(**values) for values in _one_or_more(root, "person")),
+        machine=Thing(**_closed(root.section("machine"), "machine")),
+        equipment=tuple(Thing(**values) for values in _one_or_more(root, "equipment")),
+        received=core.take("received", date, None),
+        issued=core.take("issued", date, None),
+        control=Thing(**_closed(control, "control")) if control.data else None,
+        conditions=_conditions(root.section("conditions", required=False)),
+        statements=tuple((item["name"], item["text"]) for item in _all(root, "statement")),
+    )
+    if found.received is not None and found.received > end:
+        raise core.fail("received", f"{found.received} is after the end of the measurement, {end}")
+    if found.issued is not None and found.issued < end:
+        raise core.fail("issued", f"{found.issued} is before the end of the measurement, {end}")
+    for section in (laboratory, core, root):
+        section.finish()
+    return found
+
+
+def _values(section: Section, kind: str) -> dict[str, Any]:
+    """Take the keys of a kind of table; those left out are empty."""
+    found = {}
+    for entry in KEYS[kind]:
+        key = entry.removesuffix("?")
+        check = CHECKS.get(key, text)
+        empty = None if check is flag else ""
+        found[key] = section.take(key, check, empty) if entry.endswith("?") else section.take(key, check)
+    if found.get("certificate_sha256") and not found["certificate_number"]:
+        raise section.fail("certificate_sha256", "needs certificate_number: the certificate that it is the hash of")
+    return found
+
+
+def _closed(section: Section, kind: str) -> dict[str, Any]:
+    """The values of a table that has no further keys."""
+    found = _values(section, kind)
+    section.finish()
+    return found
+
+
+def _all(root: Section, key: str) -> list[dict[str, Any]]:
+    return [_closed(section, key) for section in root.sections(key)]
+
+
+def _one_or_more(root: Section, key: str) -> list[dict[str, Any]]:
+    """An array of tables with at least one entry."""
+    found = _all(root, key)
+    if not found:
+        raise root.fail(key, f"is missing; the schema or ISO/IEC 17025 asks for at least one [[{key}]]")
+    return found
+
+
+def _conditions(section: Section) -> tuple[Condition, ...]:
+    found = []
+    for key, (name, unit, ref_type, limits) in CONDITIONS.items():
+        values = section.take(key, range_within(limits), None)
+        if values is not None:
+            found.append(Condition(name, unit, *values, ref_type))
+    section.finish()
+    return tuple(found)

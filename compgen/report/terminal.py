@@ -1,0 +1,528 @@
+"""Results as tables in the terminal: identification, fit, verification, accuracy, safety, measuring plan."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from compgen.accuracy.compare import Comparison
+from compgen.accuracy.evaluate import Accuracy
+from compgen.accuracy.figure import ComparedFigure, Figure
+from compgen.data.csv_files import FloatArray
+from compgen.data.messages import number_text, one_line, um_text
+from compgen.data.names import COVERAGE, error_named
+from compgen.effects.catalogue import separating
+from compgen.fit import FitResult
+from compgen.identify import Identification
+from compgen.pipeline import RunResult
+from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate
+from compgen.tables import Residuals, Verification
+from compgen.tables.active import MergeReport
+from compgen.tables.diff import TableDifference
+from compgen.tables.signs import ACCEPTED, REJECTED, SAME, CrashTest
+
+# Readable summaries for the terminal, and the JSON of ``volcomp run``.
+
+
+#: Further reasons and rejected readings are in the JSON files only.
+MOST_VERDICT_REASONS = 10
+
+
+def identification_table(result: Identification) -> Group:
+    """Return the summary of an identification."""
+    if result.method == "sixdof":
+        return Group(*_sixdof_lines(result), _errors_table(result))
+    if result.method == "axis-runs":
+        return Group(Text("\n".join(_axis_lines(result))), _errors_table(result))
+    if result.method == "given":
+        text = f"{result.details['values']} values of errors given in {one_line(result.details['file'])}; not identified here"
+        return Group(Text(text), _errors_table(result))
+    lengths = result.method != "deviations"
+    used = f"{int(result.accepted.sum())} of {len(result.accepted)} "
+    used += (
+        f"lengths used, {len({item.station for item in result.stations})} stations"
+        if lengths
+        else "components of measured positions used"
+    )
+    stated = f"{result.u_length_um:g} um" + (f" + {result.u_length_um_per_m:g} um/m" if lengths else "")
+    lines = [
+        f"{used}, rank {result.rank} of {result.unknowns} unknowns, method {result.method}",
+        f"residual {result.rms_um:.3f} um rms, reduced chi-square {result.reduced_chi_square:.3f} "
+        f"({result.degrees_of_freedom} degrees of freedom, {result.u_source} uncertainty {stated})",
+    ]
+    lines += [segment.text for segment in result.segments[:MOST_VERDICT_REASONS]]
+    lines += [
+        f"rejected: {item.station} point {item.point} (line {item.line}): {item.reason}"
+        for item in result.rejected[:MOST_VERDICT_REASONS]
+    ]
+    if len(result.rejected) > MOST_VERDICT_REASONS:
+        lines.append(f"... and {len(result.rejected) - MOST_VERDICT_REASONS} more in identify.json")
+    if result.method == "merged":
+        worst = max(result.details["en"].items(), key=lambda item: item[1])
+        lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")
+    return Group(Text("\n".join(lines)), _errors_table(result))
+
+
+def _axis_lines(result: Identification) -> list[str]:
+    """What was measured along each axis, and how it repeats."""
+    lines = [
+        f"{name}: {item['targets']} targets from {item['from_mm']:g} to {item['to_mm']:g} mm, {item['runs']} runs"
+        for name, item in result.details["axes"].items()
+    ]
+    return [*lines, f"scatter within targets and directions {result.rms_um:.3f} um rms, method {result.method}"]
+
+
+def _sixdof_lines(result: Identification) -> list[Text]:
+    """What was measured, repeatability and uncertainty in the units of the instrument."""
+    axes = result.details["axes"]
+    parts = [
+        f"{name}: mode {item['mode']}, {item['runs']} runs, {item['positions']} positions"
+        for name, item in axes.items()
+    ]
+    lines = [f"{'; '.join(parts)}; {result.details['line']} lines", *result.details["table"]]
+    return [Text("\n".join(lines))]
+
+
+def _errors_table(result: Identification) -> Table:
+    table = Table(
+        "error",
+        "largest",
+        "at (mm)",
+        "u (k = 1)",
+        "unit",
+        title="identified errors",
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE,
+    )
+    for name in result.errors.names:
+        unit = error_named(name).si_per_unit
+        if name in result.errors.squareness:
+            value, u = result.errors.squareness[name]
+            table.add_row(
+                name, f"{value / unit:+.3f}", "", number_text(u / unit, missing="not known"), error_named(name).unit
+            )
+        else:
+            curve = result.errors.curves[name]
+            k = int(abs(curve.value).argmax())
+            largest, u = curve.value[k] / unit, curve.u.max() / unit
+            table.add_row(
+                name,
+                f"{largest:+.3f}",
+                f"{curve.position_mm[k]:g}",
+                number_text(u, missing="not known"),
+                error_named(name).unit,
+            )
+    return table
+
+
+def fit_table(result: FitResult) -> Table:
+    """Return what the fit did to each curve."""
+    table = Table(box=box.SIMPLE, pad_edge=False, collapse_padding=True)
+    headings = ("error", "smoothness", "chosen by", "free", "residual rms", "bias max", "unit", "solver", "at a bound")
+    for heading in headings:
+        table.add_column(heading, overflow="fold", min_width=10 if heading == "smoothness" else None)
+    for name, item in result.report.items():
+        table.add_row(
+            name,
+            f"{item.smoothness:.2g}",
+            item.method,
+            f"{item.degrees_of_freedom:.1f}",
+            f"{item.rms_residual:.3f}",
+            f"{item.smoothing_bias_max:.3f}",
+            item.unit,
+            item.solver,
+            str(len(item.active_bounds) or ""),
+        )
+    return table
+
+
+def _pair(figures: Residuals) -> str:
+    return f"{um_text(figures.max_um)} / {um_text(figures.rms_um)}"
+
+
+VERDICTS = {
+    "accepted": ("accepted", "green"),
+    "partial": ("partial", "yellow"),
+    "accepted_with_reservations": ("reservations", "yellow"),
+    "better_after_new_setup": ("new set-up", "yellow"),
+    "not_accepted": ("REJECTED", "bold red"),
+}
+
+
+def _uncertainty(results: Sequence[Verification]) -> str:
+    """What the uncertainty of the measurement adds to the figures after compensation."""
+    known = results[0].uncertainty  # of the errors and points, so much the same for all controls
+    if known is None:
+        return "the uncertainty of the measurement is not known, so neither is that of the figures after"
+    return (
+        f"the uncertainty of the measurement (U, k = 2) comes on top of the figures by the files: +-{um_text(known.max_um)} / "
+        f"{um_text(known.rms_um)} um on after, +-{um_text(known.max_rigid_removed_um)} / "
+        f"{um_text(known.rms_rigid_removed_um)} um on after*"
+    )
+
+
+def verification_table(results: Sequence[Verification]) -> Group:
+    """Return before and after for every control, read from the files, and why tables were not accepted."""
+    volumetric = all(item.volumetric for item in results)
+    what = "tool tip error over the volume" if volumetric else "effect of the measured errors alone on the tool tip"
+    title = f"{what}, max / rms in um, by the files read back"
+    table = Table(
+        title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False, collapse_padding=True
+    )
+    table.add_column("control", overflow="fold", min_width=12)
+    for heading in ("before", "after", "before*", "after*", "not held"):
+        table.add_column(heading, justify="right", overflow="fold", min_width=6)
+    table.add_column("verdict", no_wrap=True, min_width=9)
+    notes: list[Text] = []
+    for item in results:
+        table.add_row(
+            item.controller,
+            _pair(item.before),
+            _pair(item.after),
+            _pair(item.before_rigid_removed),
+            _pair(item.after_rigid_removed),
+            um_text(item.unrepresentable_um),
+            Text(*VERDICTS[item.state]),
+        )
+        if item.accepted and item.state != "accepted":
+            notes.append(Text(f"{item.controller}: {item.headline}", VERDICTS[item.state][1]))
+        notes += [Text(f"{item.controller}: {reason}", "red") for reason in item.reasons[:MOST_VERDICT_REASONS]]
+        if len(item.reasons) > MOST_VERDICT_REASONS:
+            notes.append(
+                Text(f"{item.controller}: and {len(item.reasons) - MOST_VERDICT_REASONS} more in result.json", "red")
+            )
+        notes += [
+            Text(f"{item.controller}: {note}", "yellow")
+            for note in item.notes
+            if item.accepted and note not in item.headline
+        ]
+        if item.next_command:
+            notes.append(Text(f"{item.controller}: next: {one_line(item.next_command)}"))
+        if item.uncorrected_um:
+            listed = ", ".join(f"{name} {um_text(value)} um" for name, value in list(item.uncorrected_um.items())[:8])
+            more = f" and {len(item.uncorrected_um) - 8} more" if len(item.uncorrected_um) > 8 else ""
+            notes.append(Text(f"{item.controller} leaves uncorrected: {listed}{more}"))
+    notes += [Text(_uncertainty(results))] if results else []
+    legend = (
+        "before, after: as it stands, the reference point fixed; before*, after*: the best-fit rigid motion of the "
+        "workpiece taken out; not held: the largest error that no table of this control can express"
+    )
+    judged = dict.fromkeys(f"every entry was judged with the machine's tool and {item.tools}" for item in results)
+    return Group(table, Text(legend), *(Text(text) for text in judged), *notes)
+
+
+def run_json(result: RunResult) -> dict[str, Any]:
+    """Return the object that ``volcomp run --json`` prints; with one control its ``result.json`` plus the rest."""
+    summaries = [item.verification.summary() for item in result.results]
+    common = {
+        "accepted": result.accepted,
+        "identify": result.identification.summary(),
+        "paths": [str(path) for item in result.results for path in item.paths],
+    }
+    if len(summaries) == 1:
+        return {**summaries[0], **common}
+    return {**common, "controllers": {item["controller"]: item for item in summaries}}
+
+
+# Readable summaries of accuracy figures, and of before against after.
+
+
+_HEADINGS = ("figure", "before", "after", "unit", "factor", "En", "verdict")
+#: More targets than these are in the JSON only.
+MOST_TARGETS = 40
+_TARGETS = (
+    ("target mm", "position_mm", ""),
+    ("mean up um", "mean_up_um", "u_mean_up_um"),
+    ("mean down um", "mean_down_um", "u_mean_down_um"),
+    ("B um", "B_um", "u_B_um"),
+    ("s up um", "s_up_um", ""),
+    ("s down um", "s_down_um", ""),
+    ("R um", "R_um", ""),
+)
+_STYLES = {"better": "green", "worse": "bold red", "larger": "red"}
+
+
+def _number(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.2f}"
+
+
+def _with_u(item: Figure) -> str:
+    band = "" if math.isnan(item.u) else f" +/- {item.expanded:.2f}"
+    return f"{item.value:.2f}{band}"
+
+
+def accuracy_table(found: Accuracy) -> Group:
+    """Return all figures with their expanded uncertainties (k = 2)."""
+    parts: list[Table | Text] = []
+    for name, group in found.groups.items():
+        if not group:
+            continue
+        table = Table("figure", "value +/- U (k = 2)", "unit", title=name, title_justify="left", box=box.SIMPLE)
+        for key, item in group.items():
+            table.add_row(key, _with_u(item) + (", U not known" if math.isnan(item.u) else ""), item.unit)
+        parts.append(table)
+        if len(found.targets.get(name, {}).get("position_mm", ())) in range(1, MOST_TARGETS + 1):
+            parts.append(_targets_table(found.targets[name]))
+    return Group(*parts, Text("\n".join(found.statements)))
+
+
+def _targets_table(columns: Mapping[str, FloatArray]) -> Table:
+    """Values at each target; U from the scatter alone."""
+    table = Table(box=box.SIMPLE)
+    for heading, _, _ in _TARGETS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in range(len(columns["position_mm"])):
+        cells = []
+        for _, name, u_name in _TARGETS:
+            value, u = float(columns[name][row]), float(columns[u_name][row]) if u_name else math.nan
+            cells.append(_number(value) + ("" if math.isnan(u) else f" +/- {COVERAGE * u:.2f}"))
+        table.add_row(*cells)
+    return table
+
+
+def comparison_table(found: Comparison) -> Group:
+    """Return before, after, improvement factor, E_n and verdict of every figure; the overall verdict first."""
+    return Group(Text(verdict_text(found), style="bold"), *_tables(found.groups, found.kind), *_prediction(found))
+
+
+def verdict_text(found: Comparison) -> str:
+    """Say in one line how it came out, and by which figures."""
+    if found.kind == "prediction" and found.prediction is not None:
+        return f"prediction and measurement: {found.prediction.verdict}"
+    by = ", ".join(f"{group} {key}" for group, key in found.decisive)
+    return f"AFTER against BEFORE: {found.verdict} (decided by {by})"
+
+
+def _tables(groups: Mapping[str, Mapping[str, ComparedFigure]], kind: str) -> list[Table]:
+    predicted = kind == "prediction"
+    headings = ("figure", "predicted", "measured", "unit", "En") if predicted else _HEADINGS
+    tables = []
+    for name, group in groups.items():
+        table = Table(title=name, title_justify="left", box=box.SIMPLE, pad_edge=False)
+        for heading in headings:
+            left = heading in ("figure", "unit", "verdict")
+            table.add_column(heading, justify="left" if left else "right", no_wrap=True)
+        for key, item in group.items():
+            row: list[str | Text] = [key, _with_u(item.before), _with_u(item.after), item.before.unit]
+            if predicted:
+                table.add_row(*row, _number(item.en))
+                continue
+            factor = _number(item.factor) + ("" if math.isnan(item.u_factor) else f" +/- {2 * item.u_factor:.2f}")
+            verdict = Text(item.verdict, _STYLES.get(item.verdict, ""))
+            table.add_row(*row, factor, _number(item.en), verdict)
+        if group:
+            tables.append(table)
+    return tables
+
+
+def _prediction(found: Comparison) -> list[Text]:
+    lines = list(found.statements)
+    if found.prediction is not None:
+        agreed = found.prediction
+        parts = [f"{key} {_with_u(item)} um" for key, item in agreed.difference.items()]
+        verdict = "cannot be judged against" if agreed.verdict == "unknown" else f"{agreed.verdict} with"
+        share = (
+            ""
+            if math.isnan(agreed.beyond)
+            else f"; {100 * agreed.beyond:.1f} % of {agreed.components} components beyond U"
+        )
+        share += "" if math.isnan(agreed.beyond) else f" (by chance up to {100 * agreed.allowed:.1f} %)"
+        lines.insert(0, f"prediction {verdict} the measurement{share}; difference: {', '.join(parts)}")
+    return [Text("\n".join(lines))]
+
+
+# Readable summaries of the sign crash test, of differences between tables, and of a merge.
+
+
+#: Kinds of wrong ones in the order of the table, with what they are called there.
+KINDS = {
+    "output": "signed axes of the correction",
+    "frame": "signed axes of the frame",
+    "unit": "units",
+    "errors": "errors",
+    "entry": "single entries",
+}
+#: Further components of a difference are in diff.json only.
+MOST_COMPONENTS = 12
+
+
+def crash_table(results: Sequence[CrashTest]) -> Group:
+    """Return how many wrong tables of every kind were rejected, by control, and every one that was not."""
+    table = Table(
+        box=box.SIMPLE, pad_edge=False, title="wrong tables: rejected / same / accepted", title_justify="left"
+    )
+    table.add_column("control", no_wrap=True)
+    for kind in KINDS.values():
+        table.add_column(kind, justify="right")
+    table.add_column("verdict", no_wrap=True)
+    notes: list[Text] = []
+    for item in results:
+        counts = [
+            " / ".join(
+                str(sum(trial.outcome == outcome for trial in item.trials if trial.kind == kind))
+                for outcome in (REJECTED, SAME, ACCEPTED)
+            )
+            for kind in KINDS
+        ]
+        verdict = Text("passed", "green") if item.passed else Text("FAILED", "bold red")
+        table.add_row(item.controller, *counts, verdict)
+        notes += _crash_notes(item)
+    legend = (
+        "same: the wrong table differs from the right one by no more than the verification is meant to see (resolution of "
+        "the format and 0.2 um), so that it does not count"
+    )
+    return Group(table, *notes, Text(legend))
+
+
+def _crash_notes(item: CrashTest) -> list[Text]:
+    notes = [Text(f"{item.controller}: the right tables are not accepted: {reason}", "red") for reason in item.baseline]
+    for trial in item.trials:
+        if trial.outcome == ACCEPTED:
+            text = (
+                f"{item.controller}: ACCEPTED although wrong by {trial.difference_um:.2f} um: {trial.kind} {trial.name}"
+            )
+            notes.append(Text(text, "red"))
+        elif trial.outcome == SAME:
+            text = f"{item.controller}: {trial.kind} {trial.name} changes {trial.difference_um:.3f} um at most"
+            notes.append(Text(text, "yellow"))
+    return notes
+
+
+def difference_table(result: TableDifference) -> Group:
+    """Return the figures of a difference, its largest components, and what else differs."""
+    data = result.summary()
+    table = Table(box=box.SIMPLE, pad_edge=False, title="A minus B at the tool, um", title_justify="left")
+    for heading in ("", "max", "rms", "95 %"):
+        table.add_column(heading, justify="right")
+    for name, figures in (("length", data), *((f"d{axis}", data["axes"][f"d{axis}"]) for axis in "xyz")):
+        table.add_row(name, *(f"{figures[key]:.3f}" for key in ("max_um", "rms_um", "p95_um")))
+    x, y, z = data["largest_at_mm"]
+    lines = [f"largest at X {x:g} Y {y:g} Z {z:g} mm, {data['points']} points"]
+    named = list(data["components_rms_um"].items())
+    lines += [f"  {name}: {value:.3f} um rms" for name, value in named[:MOST_COMPONENTS]]
+    if len(named) > MOST_COMPONENTS:
+        lines.append(f"  and {len(named) - MOST_COMPONENTS} more in diff.json")
+    lines += [f"{item['what']}: A {item['a']}, B {item['b']}" for item in data["geometry"]]
+    return Group(table, Text("\n".join(lines)))
+
+
+def merge_text(report: MergeReport) -> Text:
+    """Return how close the merged table comes to old and new together."""
+    text = (
+        f"old and new together reach {report.total_max_um:.1f} um; the merged tables miss it by "
+        f"{report.difference_max_um:.2f} um max, {report.difference_rms_um:.2f} um rms, with all that this control cannot hold"
+    )
+    if report.lost_um > 0.1:
+        text += f"; {report.lost_um:.2f} um of the old tables belong to no error of the machine's model"
+    return Text(text)
+
+
+# Readable summary of a planned measurement for the terminal.
+
+
+#: Further reasons are in plan.json only.
+MOST_PLAN_REASONS = 8
+#: Further pairs are in plan.json only.
+MOST_PAIRS = 12
+
+
+def plan_table(plan: Plan) -> Group:
+    """Return the verdict, the predicted uncertainty of the volume and that of every error."""
+    stations, rank = plan.planned.stations, plan.rank
+    lines = [
+        f"{plan.readings} readings of {len(stations)} stations, rank {rank.rank} of {rank.size} unknowns",
+        f"uncertainty of a reading ({plan.planned.noise.source}): {plan.planned.noise.constant_um:g} um + "
+        f"{plan.planned.noise.proportional_um_per_m:g} um/m",
+        volume_line("volume", plan),
+    ]
+    notes = [Text(f"not determined: {reason}", "red") for reason in plan.reasons[:MOST_PLAN_REASONS]]
+    if len(plan.reasons) > MOST_PLAN_REASONS:
+        notes.append(Text(f"and {len(plan.reasons) - MOST_PLAN_REASONS} more in plan.json", "red"))
+    table = Table("error", "u (k = 1) max", "at (mm)", "unit", box=box.SIMPLE)
+    for name in plan.errors.names:
+        error = error_named(name)
+        if name in plan.errors.squareness:
+            table.add_row(
+                name,
+                number_text(plan.errors.squareness[name][1] / error.si_per_unit, missing="not determined"),
+                "",
+                error.unit,
+            )
+        else:
+            curve = plan.errors.curves[name]
+            worst = float(curve.u.max()) / error.si_per_unit
+            where = f"{curve.position_mm[int(np.argmax(curve.u))]:g}" if np.isfinite(worst) else ""
+            table.add_row(name, number_text(worst, missing="not determined"), where, error.unit)
+    return Group(Text("\n".join(lines)), *notes, table)
+
+
+def volume_line(title: str, plan: Plan) -> str:
+    """Return a line or two with the uncertainty of E over the volume."""
+    report = plan.volume.summary()
+    if report["undetermined_points"]:
+        return f"{title}: E is not determined at {report['undetermined_points']} of {report['points']} points"
+    axes = ", ".join(f"{axis} {report[f'u_{axis}_max_um']:.3f} / {report[f'u_{axis}_rms_um']:.3f}" for axis in "xyz")
+    together = f"{report['u_max_um']:.3f} / {report['u_rms_um']:.3f} um"
+    return f"{title}: u of E, max / rms: {together}\n  by axis: {axes} um"
+
+
+def suggestion_table(suggestion: Suggestion) -> Group:
+    """Return the places that the search found."""
+    table = Table("station", "x (mm)", "y (mm)", "z (mm)", box=box.SIMPLE)
+    stations = suggestion.plan.planned.stations
+    for name, place in zip(stations.names, stations.position_mm, strict=True):
+        table.add_row(name, *(f"{value:.1f}" for value in place))
+    title = "suggested places" if suggestion.improved else "no better places were found"
+    return Group(Text(volume_line(f"{title} ({suggestion.evaluations} arrangements)", suggestion.plan)), table)
+
+
+def trajectory_table(
+    judged: Sequence[TrajectoryCandidate], chosen: TrajectoryCandidate | None, target_um: float
+) -> Group:
+    """Return the trajectories that were judged, and the one that reaches the target."""
+    table = Table("trajectory", "points", "u max (um)", "u rms (um)", box=box.SIMPLE)
+    for item in judged:
+        table.add_row(
+            item.name,
+            str(len(item.position_mm)),
+            number_text(item.worst_um, missing="not determined"),
+            number_text(item.rms_um, missing="not determined"),
+        )
+    verdict = (
+        f"the smallest trajectory within {target_um:g} um: {chosen.name}"
+        if chosen
+        else f"no trajectory reaches {target_um:g} um with these stations"
+    )
+    return Group(table, Text(verdict, "" if chosen else "red"))
+
+
+def visibility_table(visible: PlanVisibility) -> Group:
+    """Return what the plan can never see of the effects other than geometric errors, and which look alike."""
+    never = Table("what this plan can never see", "why", "measure in addition", box=box.SIMPLE)
+    for (reason, breaker), names in _grouped(visible).items():
+        never.add_row(", ".join(names), reason, breaker)
+    alike = Table("look alike", "correlation", "measure in addition", box=box.SIMPLE)
+    for pair in visible.pairs[:MOST_PAIRS]:
+        first, second = (visible.cards[name] for name in pair.names)
+        shared = f"{pair.correlation:.3f} ({pair.shared} of {pair.directions} directions)"
+        alike.add_row(" and ".join(pair.names), shared, separating(first, second))
+    notes = [Text(f"assumed: {'; '.join(visible.assumed)}")] if visible.assumed else []
+    if len(visible.pairs) > MOST_PAIRS:
+        notes.append(Text(f"and {len(visible.pairs) - MOST_PAIRS} more pairs in plan.json"))
+    return Group(never, alike, *notes)
+
+
+def _grouped(visible: PlanVisibility) -> dict[tuple[str, str], list[str]]:
+    """Effects that are not seen, by reason and by what would show them."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for name, reason in visible.never.items():
+        found.setdefault((reason.partition(":")[0], visible.cards[name].breaker), []).append(name)
+    return found

@@ -1,0 +1,307 @@
+"""A table was active during the measurement: its effect is removed, or the old and the new table become one."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from compgen.controls.shared.base import Monomial, Term
+from compgen.controls.shared.grids import curve_nodes_mm
+from compgen.data.csv_files import FloatArray
+from compgen.data.deviations import Deviations
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.lengths import Lengths, Points
+from compgen.data.machine import Axis, Machine
+from compgen.data.names import MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.errors import CompgenWarning, ConvergenceError, InputError
+from compgen.identify.adjust.unknowns import check_travel
+from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.first_order import coefficients, modelled_errors
+from compgen.kinematics.volume_grid import volume_grid
+from compgen.tables import wanted_correction
+from compgen.tables.judge import figures_of
+from compgen.tables.safety import node_positions
+from compgen.tables.synthesis import Projector, projector
+from compgen.tables.verification import ReadTables, read_tables, table_files
+
+# Double compensation: a table was active while the machine was measured, and its effect is taken out.
+#
+# With the correction c of the active table the machine that was commanded to p was where the bare one is at the
+# command q = p + c(p). So readings are identified at q. Errors M that were identified without regard to the table, and
+# those of the bare machine P, belong together by
+#
+#     e(q; P) + c(p) = e(p; M)
+#
+# with the exact error e; this is solved for P by least squares over the volume, repeated until nothing changes.
+
+
+Measurement = Lengths | Deviations
+
+#: A larger correction is not a compensation but a wrong table or a wrong unit, mm.
+LARGEST_CORRECTION_MM = 20.0
+#: The fixed point is reached when the errors move the tool by less than this, mm.
+CONVERGED_MM = 1e-9
+MOST_PASSES = 30
+
+
+@dataclass(frozen=True)
+class ActiveTables:
+    """Tables that were active while the machine was measured; ``controller`` is the control that they belong to."""
+
+    tables: ReadTables
+    paths: tuple[Path, ...] = ()
+
+    @property
+    def names(self) -> str:
+        """Names of the files, for the comments of a file."""
+        return ", ".join(name for name, _ in self.tables.files)
+
+    @property
+    def controller(self) -> str:
+        """Name of the control."""
+        return self.tables.controller.name
+
+    def correction(self, machine: Machine, points: Points) -> FloatArray:
+        """Return what they added to the commands, shape (n, 3), mm; InputError for what cannot be a compensation."""
+        added = self.tables.correction(machine, points)
+        largest = float(np.max(np.abs(added), initial=0.0))
+        if largest > LARGEST_CORRECTION_MM:
+            raise InputError(
+                f"the active tables move an axis by {largest:g} mm, too far for a compensation; check the control, "
+                "the file and the unit"
+            )
+        return added
+
+    def summary(self, machine: Machine, points: Points) -> dict[str, object]:
+        """Return what goes into reports: control, files, and the largest correction at the measured points, um."""
+        return {
+            "controller": self.controller,
+            "files": [{"name": name, "sha256": digest} for name, digest in self.tables.files],
+            "remarks": list(self.tables.remarks),
+            "largest_correction_um": float(np.max(np.abs(self.correction(machine, points)))) / MM_PER_UM,
+        }
+
+
+def read_active(machine: Machine, paths: Sequence[str | Path], controller: str) -> ActiveTables:
+    """Parse tables that were active while the machine was measured; InputError as :func:`read_tables` has it.
+
+    What reading assumed or kept apart is a CompgenWarning: the file of a control holds more than these tables.
+    """
+    files = table_files(paths, controller)
+    tables = read_tables(machine, files, controller, foreign=True)
+    for text in tables.remarks:
+        warnings.warn(text, CompgenWarning, stacklevel=2)
+    return ActiveTables(tables, tuple(files))
+
+
+def keeping_others(machine: Machine, targets: Sequence[str], active: ActiveTables) -> Machine:
+    """Return the machine with settings that keep what the active files hold of other axes, for the controls ``targets``.
+
+    What is kept is a CompgenWarning; a machine file that sees to it already is returned as it is.
+    """
+    read = active.tables
+    found = read.controller.keeping_others(read.tables, active.paths)
+    for name in dict.fromkeys(targets):
+        for key, value in found.get(name, {}).items():
+            machine = machine.with_setting(name, key, value)
+            shown = [Path(part).name for part in value] if key == "style_from" and isinstance(value, list) else value
+            shown = Path(shown).name if isinstance(shown, str) else shown
+            text = f"{name}: what --active shows of other axes is kept, as {key} = {shown} in the machine file would do"
+            warnings.warn(text, CompgenWarning, stacklevel=2)
+    return machine
+
+
+def without_active(
+    machine: Machine, measurement: Measurement, active: ActiveTables
+) -> tuple[Machine, Measurement, dict[str, object]]:
+    """Return machine, measurement and report as if the bare machine had been measured; exact, nothing is fitted.
+
+    The commanded positions become p + c(p), what the axes were really told; deviations then count from there. The
+    travel of the returned machine is wider where a corrected position lies outside; its nodes and thereby the curves
+    stay.
+    """
+    # Commanded positions outside the travel are refused before the tables widen it.
+    check_travel(machine, measurement.position_mm, measurement.origin)
+    points = Points(measurement.position_mm, measurement.tool_mm, measurement.approach)
+    added = active.correction(machine, points)
+    shifted = measurement.position_mm + added
+    report = active.summary(machine, points)
+    if isinstance(measurement, Deviations):
+        moved = replace(measurement, position_mm=shifted, deviation_mm=measurement.deviation_mm - added)
+        return _widened(machine, shifted), moved, report
+    return _widened(machine, shifted), replace(measurement, position_mm=shifted), report
+
+
+def _widened(machine: Machine, position_mm: FloatArray) -> Machine:
+    axes: list[Axis] = []
+    for k, axis in enumerate(machine.axes):
+        low, high = axis.range_mm
+        ends = (min(low, float(position_mm[:, k].min())), max(high, float(position_mm[:, k].max())))
+        axes.append(replace(axis, range_mm=ends))
+    return replace(machine, axes=(axes[0], axes[1], axes[2]))
+
+
+def bare_errors(
+    machine: Machine, errors: ErrorTable, active: ActiveTables, *, keep_nodes: bool = False
+) -> tuple[ErrorTable, float]:
+    """Return the errors of the bare machine from errors that were identified while tables were active.
+
+    Parameters
+    ----------
+    machine : the machine.
+    errors : of the machine with its active tables, mm and rad.
+    active : these tables.
+    keep_nodes : True to give the curves the nodes of the active tables as well, so that nothing of a finer table is
+        lost; the default keeps to where the machine was measured.
+
+    Returns
+    -------
+    The errors, with the uncertainties of ``errors`` (a table's numbers are exact), and the largest displacement in um
+    that the returned errors do not express: a correction that belongs to no error of the chain, or what a finer table
+    does between the nodes. The frame stays: what the table moved at the reference point is a constant in the curves.
+    """
+    measured = [curve_nodes_mm(machine, errors, axis) for axis in range(3)]
+    control = active.tables.controller
+    own = control.table_nodes_mm(active.tables.tables)
+    both = [np.unique(np.concatenate([measured[k], _within(machine, k, own[k])])) for k in range(3)]
+    terms = _model_terms(machine, errors, both if keep_nodes else measured)
+    solver = projector(machine, terms, anchored=False)
+    position_mm = solver.position_mm
+    added = active.correction(machine, _upwards(position_mm))
+    wanted = exact_error(machine, errors, position_mm) - added
+    values = np.concatenate([term.start for term in solver.basis])
+    for _ in range(MOST_PASSES):
+        found = _table(machine, errors, solver, values)
+        rest = wanted - exact_error(machine, found, position_mm + added)
+        change = solver.project_all(-rest[None])[0]
+        values = values + change
+        if np.max(np.abs(solver.field(change))) < CONVERGED_MM:
+            grid = volume_grid(machine, (both[0], both[1], both[2]))
+            return found, _lost_um(machine, errors, found, active, grid.position_mm)
+    raise ConvergenceError("the effect of the active tables cannot be taken out: the iteration does not settle")
+
+
+def _lost_um(
+    machine: Machine, measured: ErrorTable, found: ErrorTable, active: ActiveTables, position_mm: FloatArray
+) -> float:
+    """Largest displacement at points (n, 3) by which bare errors and active tables miss the measured errors, um."""
+    added = active.correction(machine, _upwards(position_mm))
+    rest = exact_error(machine, measured, position_mm) - added - exact_error(machine, found, position_mm + added)
+    return float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM
+
+
+def _upwards(position_mm: FloatArray) -> Points:
+    """Points approached upwards on every axis, for tables of one direction."""
+    return Points(position_mm, approach=np.ones_like(position_mm))
+
+
+def _within(machine: Machine, axis: int, nodes_mm: FloatArray) -> FloatArray:
+    low, high = machine.axes[axis].range_mm
+    return np.asarray(nodes_mm[(nodes_mm >= low) & (nodes_mm <= high)])
+
+
+def _model_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatArray]) -> list[Term]:
+    """One term per error of the machine's model; values are the errors, carriers minus the columns of C."""
+    carriers: dict[str, list[Monomial]] = {}
+    for part in coefficients(machine.chain, machine.squareness_reference):
+        carriers.setdefault(part.error, []).append(Monomial(part.output, -part.sign, part.lever))
+    terms = []
+    for name in dict.fromkeys([*modelled_errors(machine), *errors.names]):
+        carrier = tuple(carriers[name])
+        if name in SQUARENESS_NAMES:
+            start = np.array([errors.squareness.get(name, (0.0, 0.0))[0]])
+            terms.append(Term(name, None, np.zeros(1), carrier, start))
+            continue
+        error = error_named(name)
+        nodes = nodes_mm[error.axis]
+        start = errors.curves[name].at(nodes) if name in errors.curves else np.zeros(len(nodes))
+        at_mm = machine.axes[error.axis].range_mm if error.is_straightness else None
+        keep_mm = at_mm or (machine.reference_point_mm[error.axis],)
+        terms.append(Term(name, error.axis, nodes, carrier, start, keep_mm=keep_mm))
+    return terms
+
+
+def _table(machine: Machine, errors: ErrorTable, solver: Projector, values: FloatArray) -> ErrorTable:
+    """Return term values as errors; uncertainties and metadata are those of ``errors``."""
+    curves, squareness = {}, {}
+    for term, numbers in zip(solver.basis, solver.by_name(values).values(), strict=True):
+        if term.axis is None:
+            squareness[term.name] = (float(numbers[0]), errors.squareness.get(term.name, (0.0, np.nan))[1])
+            continue
+        old = errors.curves.get(term.name)
+        u = np.full(len(numbers), np.nan) if old is None else np.interp(term.nodes_mm, old.position_mm, old.u)
+        curves[term.name] = Curve(term.nodes_mm, numbers, u)
+    return ErrorTable(curves, squareness, errors.metadata)
+
+
+# One table in place of two: an old table that was active, and the errors that were measured with it.
+#
+# The machine with its old table c_old still errs; the correction of what is left is c_new. Commanded to p it must go to
+#
+#     c_total(p) = c_new(p) + c_old(p + c_new(p))
+#
+# which is the correction of the bare machine, whose errors :func:`compgen.tables.active.bare_errors` gives.
+
+
+@dataclass(frozen=True)
+class MergeReport:
+    """How close the merged table comes to old and new together, over the volume, um.
+
+    ``total_max_um`` is the largest total correction, ``difference_max_um`` and ``difference_rms_um`` what the merged
+    table misses of it, all that the control cannot hold included; ``lost_um`` is the largest part of the old table that
+    no error of the model expresses.
+    """
+
+    total_max_um: float
+    difference_max_um: float
+    difference_rms_um: float
+    lost_um: float
+
+    def summary(self) -> dict[str, float]:
+        """Return the contents of ``merge.json``."""
+        return dict(vars(self))
+
+
+def total_correction(machine: Machine, errors: ErrorTable, active: ActiveTables, position_mm: FloatArray) -> FloatArray:
+    """Return c_total at commanded positions (n, 3): the old correction and that of the errors measured with it, mm."""
+    new = wanted_correction(machine, errors, position_mm)
+    moved = position_mm + new
+    return np.asarray(new + active.correction(machine, Points(moved, approach=np.ones_like(moved))))
+
+
+def merged_errors(machine: Machine, errors: ErrorTable, active: ActiveTables) -> tuple[ErrorTable, float]:
+    """Return the errors of the bare machine at the nodes of old tables and new errors, and what is lost, um."""
+    return bare_errors(machine, errors, active, keep_nodes=True)
+
+
+def merge_report(
+    machine: Machine, errors: ErrorTable, active: ActiveTables, merged: ReadTables, lost_um: float
+) -> MergeReport:
+    """Hold merged tables against the total correction at the nodes of old and merged tables and between them.
+
+    Parameters
+    ----------
+    machine, errors : the errors that were measured with the old tables active.
+    active : the old tables.
+    merged : the new ones, as they were parsed.
+    lost_um : as :func:`merged_errors` gives it.
+    """
+    nodes = []
+    for axis in range(3):
+        parts = [
+            node_positions(machine, read.controller.table_nodes_mm(read.tables)[axis], axis)
+            for read in (active.tables, merged)
+        ]
+        nodes.append(np.unique(np.concatenate(parts)))
+    position_mm = volume_grid(machine, (nodes[0], nodes[1], nodes[2])).position_mm
+    wanted = total_correction(machine, errors, active, position_mm)
+    miss = merged.correction(machine, Points(position_mm, approach=np.ones_like(position_mm))) - wanted
+    if merged.controller.anchored:
+        miss = miss - miss.mean(axis=0)
+    figures = figures_of(np.linalg.norm(miss, axis=1))
+    largest = float(np.max(np.linalg.norm(wanted, axis=1))) / MM_PER_UM
+    return MergeReport(largest, figures["max_um"], figures["rms_um"], lost_um)

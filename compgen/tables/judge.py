@@ -1,0 +1,376 @@
+"""The judgement on a correction, compared with the best possible: residuals, components, dense lines, reversal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from compgen.controls import AnyController
+from compgen.controls.shared.grids import curve_nodes_mm
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves, reversal_name
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.first_order import c_matrix, tool_of
+from compgen.kinematics.gauge import without_rigid_motion
+from compgen.kinematics.volume_grid import VolumeGrid, volume_grid
+from compgen.tables.synthesis import Projector, best_values, projector
+
+# Figures of a residual field over the volume, as it stands and after the best-fit rigid motion is taken out.
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Figures of a field of position errors: largest, root mean square, 95th percentile of the length of the vector.
+
+    ``v_x_um`` ... are the ranges (max - min) of the components over the volume (ISO 230-1 volumetric accuracy).
+    """
+
+    max_um: float
+    rms_um: float
+    p95_um: float
+    v_x_um: float
+    v_y_um: float
+    v_z_um: float
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the figures by name."""
+        return asdict(self)
+
+
+def figures_of(size_mm: FloatArray) -> dict[str, float]:
+    """Return the largest, the root mean square and the 95th percentile of magnitudes (n,), by name, um."""
+    size = np.abs(size_mm) / MM_PER_UM
+    return {
+        "max_um": float(size.max()),
+        "rms_um": float(np.sqrt(np.mean(size**2))),
+        "p95_um": float(np.percentile(size, 95)),
+    }
+
+
+def residuals(error_mm: FloatArray) -> Residuals:
+    """Return the figures of errors (n, 3)."""
+    x, y, z = (float(value) for value in np.ptp(error_mm, axis=0) / MM_PER_UM)
+    return Residuals(**figures_of(np.linalg.norm(error_mm, axis=1)), v_x_um=x, v_y_um=y, v_z_um=z)
+
+
+# A field on a full grid split into what belongs to one axis, to a pair of axes, and to all three.
+#
+# Every component is a place where a wrong sign, a swapped axis or a slip of unit shows, however small it is next to a
+# squareness of millimetres.
+
+
+def components(grid: VolumeGrid, field_mm: FloatArray) -> dict[str, FloatArray]:
+    """Split a field (n, 3) on the grid's points; returns arrays of shape (nx, ny, nz) that broadcast, by name.
+
+    Names: ``X constant``, ``X linear in y`` (slope), ``X(y)`` (the rest of the main effect), ``X(x,z)`` (interaction of
+    a pair), ``X(x,y,z)``. The parts are orthogonal on the grid, so that none hides another.
+    """
+    parts: dict[str, FloatArray] = {}
+    for output, letter in enumerate(AXES):
+        rest = field_mm[:, output].reshape(grid.shape)
+        constant = rest.mean(keepdims=True)
+        parts[f"{letter} constant"] = constant
+        rest = rest - constant
+        for axis in range(3):
+            others = tuple(k for k in range(3) if k != axis)
+            main = rest.mean(axis=others, keepdims=True)
+            rest = rest - main
+            shape = [1, 1, 1]
+            shape[axis] = -1
+            level = grid.levels_mm[axis].reshape(shape)
+            level = level - level.mean()
+            slope = level * (np.sum(level * main) / np.sum(level**2))
+            parts[f"{letter} linear in {AXES[axis].lower()}"] = slope
+            parts[f"{letter}({AXES[axis].lower()})"] = main - slope
+        for axis in (2, 1, 0):
+            pair = rest.mean(axis=axis, keepdims=True)
+            rest = rest - pair
+            name = ",".join(AXES[k].lower() for k in range(3) if k != axis)
+            parts[f"{letter}({name})"] = pair
+        parts[f"{letter}(x,y,z)"] = rest
+    return parts
+
+
+def rms(part_mm: FloatArray) -> float:
+    """Root mean square of a component over the grid (broadcasting does not change it)."""
+    return float(np.sqrt(np.mean(part_mm**2)))
+
+
+# Lines along the axes, sampled densely: a single wrong node of a fine table shows here and not in any mean.
+
+
+#: Positions along a line in addition to the nodes of the tables: evenly spread over the travel.
+SCAN_POSITIONS = 1001
+#: At a point the correction may miss the best possible one by this share of its range, and of the largest range of all
+#: axes without the linear parts (a squareness of millimetres must hide nothing) ...
+POINT_SHARE = 0.3
+#: ... or by this much, whichever is larger; on top come the quantum and this many standard uncertainties of the
+#: errors, up to POINT_SHARE of the whole range.
+POINT_FLOOR_MM = 1.0 * MM_PER_UM
+POINT_UNCERTAINTIES = 5.0
+
+
+def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> FloatArray:
+    """Return the points (n, 3) of nine lines along each axis: the other two at both ends and in the middle."""
+    low, high = machine.lower_mm, machine.upper_mm
+    lines = []
+    for axis in range(3):
+        nodes = nodes_mm[axis][(nodes_mm[axis] >= low[axis]) & (nodes_mm[axis] <= high[axis])]
+        levels = [np.array([low[k], 0.5 * (low[k] + high[k]), high[k]]) for k in range(3)]
+        levels[axis] = np.unique(np.concatenate([np.linspace(low[axis], high[axis], SCAN_POSITIONS), nodes]))
+        lines.append(np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3))
+    return np.vstack(lines)
+
+
+def displacement_uncertainty(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
+) -> FloatArray:
+    """Standard uncertainty of E = C P at positions (n, 3) from those of the errors, shape (3,): the largest, mm.
+
+    Correlations are left out; an uncertainty that is not known counts as zero.
+    """
+    curves = {name: replace(curve, value=np.nan_to_num(curve.u)) for name, curve in errors.curves.items()}
+    squareness = {name: (float(np.nan_to_num(u)), 0.0) for name, (_, u) in errors.squareness.items()}
+    u = ErrorTable(curves, squareness).at(position_mm)
+    return np.asarray(np.sqrt(np.einsum("nij,nj->ni", c_matrix(machine, position_mm, tool_mm) ** 2, u**2)).max(axis=0))
+
+
+def point_reasons(
+    position_mm: FloatArray,
+    correction_mm: FloatArray,
+    best_mm: FloatArray,
+    bent_mm: float,
+    u_mm: FloatArray,
+    resolution_mm: float,
+) -> list[str]:
+    """Name for each axis the point (of n) where the correction (n, 3) misses the best one most, if it is too far.
+
+    ``bent_mm`` is the largest range of the best one without its linear part, ``u_mm`` (3,) the standard uncertainty
+    that the errors give the correction, ``resolution_mm`` the format's.
+    """
+    reasons = []
+    for output, letter in enumerate(AXES):
+        miss = np.abs(correction_mm[:, output] - best_mm[:, output])
+        worst = int(np.argmax(miss))
+        share = POINT_SHARE * float(np.ptp(best_mm[:, output]))
+        limit = max(min(share, POINT_SHARE * bent_mm), POINT_FLOOR_MM) + resolution_mm
+        limit += min(POINT_UNCERTAINTIES * u_mm[output], share)
+        if miss[worst] > limit:
+            x, y, z = position_mm[worst]
+            reasons.append(
+                f"correction {letter} at X {x:g} Y {y:g} Z {z:g} mm: {_um(correction_mm[worst, output])} um in the table, "
+                f"{_um(best_mm[worst, output])} um needed"
+            )
+    return reasons
+
+
+def _um(value_mm: float) -> str:
+    return f"{round(float(value_mm) / MM_PER_UM, 2) + 0.0:+.2f}"
+
+
+# The judgement on a correction: the best that a control could do is prepared once, any correction is compared with it.
+#
+# It knows nothing of files: ``verify`` gives it what parsed tables do, the sign crash test what wrong ones would do.
+
+
+#: One entry of a table may move the tip by this share of the largest correction without its linear part, or this much.
+GOAL_SHARE, GOAL_MM = 0.03, 1.0 * MM_PER_UM
+#: A component of the correction may miss the best possible one by this share of it ...
+COMPONENT_SHARE = 0.3
+#: ... or by this much, whichever is larger; the quantum of the format comes on top, and this many standard
+#: uncertainties of the errors (what smoothing may take away), up to COMPONENT_SHARE of the whole correction.
+COMPONENT_FLOOR_MM = 0.2 * MM_PER_UM
+COMPONENT_UNCERTAINTIES = 0.5
+
+
+@dataclass(frozen=True)
+class Judge:
+    """What a correction is compared with: the best one of the control, on a grid over the volume and on lines.
+
+    Parameters
+    ----------
+    solver, values : the control's basis over the volume, and the best values in it before rounding.
+    grid, best_mm : points (n, 3) over the volume, nodes and middles, and the best correction there (n, 3).
+    line_mm, line_best_mm : points (m, 3) on lines along the axes, and the best correction there (m, 3).
+    bent_mm : largest range of the best correction of an axis without its linear part.
+    goal_mm : what one entry of a table may move the tip by and still pass.
+    slack_mm, u_mm : what quantum and uncertainty explain of a component, and the uncertainty of E, shapes (3,).
+    resolution_mm : largest error of the format's rounding.
+    """
+
+    machine: Machine
+    errors: ErrorTable
+    solver: Projector
+    values: FloatArray
+    grid: VolumeGrid
+    best_mm: FloatArray
+    line_mm: FloatArray
+    line_best_mm: FloatArray
+    bent_mm: float
+    goal_mm: float
+    slack_mm: FloatArray
+    u_mm: FloatArray
+    resolution_mm: float
+
+    def reasons(self, grid_correction_mm: FloatArray, line_correction_mm: FloatArray) -> list[str]:
+        """Say why a correction, given on the grid (n, 3) and on the lines (m, 3), is not acceptable; empty if it is."""
+        return [
+            *self.shrink_reasons(grid_correction_mm),
+            *self.component_reasons(grid_correction_mm),
+            *point_reasons(
+                self.line_mm, line_correction_mm, self.line_best_mm, self.bent_mm, self.u_mm, self.resolution_mm
+            ),
+        ]
+
+    def component_reasons(self, correction_mm: FloatArray) -> list[str]:
+        """Name every component of the correction (n, 3) that misses the best possible one by more than its share."""
+        fields = (correction_mm - self.best_mm, self.best_mm, correction_mm)
+        miss, best, own = (components(self.grid, part) for part in fields)
+        reasons = []
+        for name in miss:
+            limit = max(COMPONENT_SHARE * rms(best[name]), COMPONENT_FLOOR_MM) + self.slack_mm[AXES.index(name[0])]
+            if rms(miss[name]) > limit:
+                ratio = np.sum(own[name] * best[name]) / max(float(np.sum(best[name] ** 2)), 1e-30)
+                hint = "; its sign is reversed" if abs(ratio + 1) < 0.1 else ""
+                reasons.append(
+                    f"correction {name}: {rms(own[name]) / MM_PER_UM:.2f} um rms in the table, "
+                    f"{rms(best[name]) / MM_PER_UM:.2f} um rms needed, they differ by "
+                    f"{rms(miss[name]) / MM_PER_UM:.2f} um{hint}"
+                )
+        return reasons
+
+    def shrink_reasons(self, correction_mm: FloatArray) -> list[str]:
+        """Say so if the exact residual grows with the correction (n, 3), rigid motion taken out."""
+        position_mm = self.grid.position_mm
+        nominal = position_mm + tool_of(self.machine, None)
+        before = exact_error(self.machine, self.errors, position_mm)
+        after = exact_error(self.machine, self.errors, position_mm + correction_mm) + correction_mm
+        rms_before, rms_after = (
+            residuals(without_rigid_motion(nominal, error)).rms_um * MM_PER_UM for error in (before, after)
+        )
+        if rms_after <= rms_before + 1e-9 or rms_after <= self.resolution_mm:
+            return []
+        return [
+            f"the residual does not shrink: {rms_before / MM_PER_UM:.2f} um rms before, {rms_after / MM_PER_UM:.2f} um "
+            "rms after (rigid motion taken out)"
+        ]
+
+
+def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, tables: Any = None) -> Judge:
+    """Prepare the judgement for the tables of one control on a machine with these errors.
+
+    ``tables`` are the parsed ones: where a control has room for some tables only, there is more than one good choice.
+    """
+    basis = control.basis(errors) if tables is None else control.basis_of(errors, tables)
+    solver = projector(machine, basis, anchored=control.anchored)
+    values = best_values(machine, errors, solver)
+    nodes = _nodes(machine, errors, solver)
+    grid = volume_grid(machine, nodes)
+    line_mm = scan_lines(machine, nodes)
+    best_mm = solver.field(values, grid.position_mm)
+    bent_mm = _without_linear_part(grid.position_mm, best_mm)
+    resolution_mm = control.resolution_mm()
+    grid_u_mm = COMPONENT_UNCERTAINTIES * displacement_uncertainty(machine, errors, grid.position_mm)
+    return Judge(
+        machine=machine,
+        errors=errors,
+        solver=solver,
+        values=values,
+        grid=grid,
+        best_mm=best_mm,
+        line_mm=line_mm,
+        line_best_mm=solver.field(values, line_mm),
+        bent_mm=float(np.ptp(bent_mm, axis=0).max()),
+        goal_mm=max(GOAL_MM, GOAL_SHARE * float(np.max(np.linalg.norm(bent_mm, axis=1)))),
+        slack_mm=resolution_mm + np.minimum(grid_u_mm, COMPONENT_SHARE * np.std(best_mm, axis=0)),
+        u_mm=displacement_uncertainty(machine, errors, line_mm),
+        resolution_mm=resolution_mm,
+    )
+
+
+def _without_linear_part(position_mm: FloatArray, field_mm: FloatArray) -> FloatArray:
+    """Take the best-fit constant and slopes (squareness, pitch) out of a field (n, 3) at points (n, 3)."""
+    columns = np.column_stack([np.ones(len(position_mm)), position_mm - position_mm.mean(axis=0)])
+    linear, *_ = np.linalg.lstsq(columns, field_mm, rcond=None)
+    return np.asarray(field_mm - columns @ linear)
+
+
+def _nodes(machine: Machine, errors: ErrorTable, solver: Projector) -> tuple[FloatArray, ...]:
+    """Return the positions of the curves and of the control's tables, by axis."""
+    return tuple(
+        np.unique(
+            np.concatenate(
+                [curve_nodes_mm(machine, errors, axis), *(t.nodes_mm for t in solver.basis if t.axis == axis)]
+            ).round(6)
+        )
+        for axis in range(3)
+    )
+
+
+# Both directions of travel: the mean of what tables do in each, and whether their difference takes the reversal out.
+
+
+Correction = Callable[[Points], FloatArray]
+
+#: Positions along the travel at which the difference of the directions is looked at.
+REVERSAL_POSITIONS = 201
+#: The difference may miss the reversal by this share of its largest value, or by this much, whichever is larger.
+REVERSAL_SHARE = 0.3
+REVERSAL_FLOOR_MM = 0.2 * MM_PER_UM
+
+
+def in_both_directions(points: Points) -> Points:
+    """Return the points twice: reached by positive travel of all axes, then by negative travel of all."""
+    up = np.ones_like(points.position_mm)
+    tool_mm = None
+    if points.tool_mm is not None:
+        tool_mm = np.vstack([np.broadcast_to(points.tool_mm, up.shape)] * 2)
+    return Points(np.vstack([points.position_mm] * 2), tool_mm, np.vstack([up, -up]))
+
+
+def mean_correction(correction: Correction, position_mm: FloatArray, tool_mm: FloatArray | None = None) -> FloatArray:
+    """Return the mean of the corrections after positive and after negative travel of all axes, shape (n, 3), mm."""
+    both = correction(in_both_directions(Points(position_mm, tool_mm)))
+    return np.asarray(0.5 * (both[: len(position_mm)] + both[len(position_mm) :]))
+
+
+def reversal_reasons(
+    machine: Machine, correction: Correction, reversal: ReversalCurves, resolution_mm: float
+) -> list[str]:
+    """Name each reversal that the tables do not take out, or that they add, axis by axis along the travel.
+
+    The correction after positive travel minus the one after negative travel must be minus the reversal value.
+    """
+    reasons = []
+    for axis in range(3):
+        position_mm = np.tile(0.5 * (machine.lower_mm + machine.upper_mm), (REVERSAL_POSITIONS, 1))
+        position_mm[:, axis] = np.linspace(*machine.axes[axis].range_mm, REVERSAL_POSITIONS)
+        up, down = np.ones_like(position_mm), np.ones_like(position_mm)
+        down[:, axis] = -1.0
+        given = correction(Points(position_mm, approach=up)) - correction(Points(position_mm, approach=down))
+        needed = reversal.displacement(position_mm, down) - reversal.displacement(position_mm, up)
+        for component in range(3):
+            miss = np.abs(given[:, component] - needed[:, component])
+            limit = max(REVERSAL_SHARE * float(np.max(np.abs(needed[:, component]))), REVERSAL_FLOOR_MM)
+            worst = int(np.argmax(miss))
+            if miss[worst] > limit + resolution_mm:
+                reasons.append(
+                    f"{reversal_name(axis, component)} at {AXES[axis]} {position_mm[worst, axis]:g} mm: the tables differ by "
+                    f"{given[worst, component] / MM_PER_UM:+.2f} um between positive and negative travel, "
+                    f"{needed[worst, component] / MM_PER_UM:+.2f} um needed"
+                )
+    return reasons
+
+
+def left_by_reversal(reversal: ReversalCurves | None, *, corrected: bool) -> dict[str, float]:
+    """Return in um what a reversal leaves that no table takes out: half of its largest value, by name."""
+    if reversal is None or corrected:
+        return {}
+    largest = {reversal_name(*key): 0.5 * abs(value) for key, value in reversal.largest_mm.items()}
+    return {name: round(value / MM_PER_UM, 3) for name, value in largest.items() if value >= 0.5 * WORTH_MM}

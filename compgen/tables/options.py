@@ -1,0 +1,640 @@
+"""What each option of a control would buy, from the levels that are sold to the explanation of one control's table."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from compgen.controls import CONTROLLERS, AnyController, SourceFile, Term, controller_named
+from compgen.controls.shared.base import Usage
+from compgen.controls.shared.grids import curve_nodes_mm
+from compgen.controls.shared.terms import error_terms, one_dimensional_terms, product_terms
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.lengths import Points
+from compgen.data.machine import Emphasis, Interval, Machine
+from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, error_named
+from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.first_order import tool_of, volumetric_error
+from compgen.kinematics.gauge import without_rigid_motion
+from compgen.kinematics.volume_grid import volume_grid
+from compgen.tables import Export, export
+from compgen.tables.judge import Residuals, in_both_directions, left_by_reversal, residuals
+from compgen.tables.safety import LargestStep, safety_of
+from compgen.tables.synthesis import Projector, basis_field, placed_terms, projector, wanted_correction
+
+# Levels of compensation that controls sell, as bases of terms, and the best that each could do for given errors.
+#
+# A level knows neither quantum nor limits: it is what any control of that kind can reach at most. Each level holds the one
+# before it.
+
+
+Zone = tuple[Interval | None, Interval | None, Interval | None]
+
+#: Levels in their order: key and what the tables of that level hold.
+LABELS = {
+    "nothing": "no table",
+    "pitch": "positioning",
+    "straightness": "+ straightness",
+    "squareness": "+ squareness",
+    "products": "+ angles, as products of tables",
+    "volumetric": "full volumetric",
+    "directional": "+ direction-dependent",
+}
+#: Between the nodes of the curves the bases get further nodes, as long as an axis has no more than this many: curves
+#: that act at their own axis' travel are bent there.
+MOST_NODES = 81
+MOST_PARTS = 4
+
+
+@dataclass(frozen=True)
+class Level:
+    """The best tables of one level: ``values`` of the terms in ``solver``; no solver: no tables.
+
+    ``pitch`` is there for tables without squareness only: it fits the positioning again after the lines are out.
+    """
+
+    key: str
+    solver: Projector | None = None
+    values: FloatArray | None = None
+    pitch: Projector | None = None
+    reversal: ReversalCurves | None = None
+
+    @property
+    def label(self) -> str:
+        """What the tables hold, in words."""
+        return LABELS[self.key]
+
+    def correction(self, position_mm: FloatArray, approach: FloatArray, tool_mm: FloatArray) -> FloatArray:
+        """Return what such a control would add at points (n, 3), reached in directions (n, 3), with a tool (3,): mm.
+
+        Only the volumetric levels know the tool that is in use; the others were made for the machine's own.
+        """
+        added = np.zeros_like(position_mm)
+        if self.solver is not None and self.values is not None:
+            added += basis_field(self.solver.basis, self.values, position_mm, tool_mm)
+        if self.reversal is not None:
+            added -= self.reversal.displacement(position_mm, approach)
+        return added
+
+    def left_alone_um(
+        self, machine: Machine, errors: ErrorTable, tools_mm: Sequence[FloatArray], *, anchored: bool = False
+    ) -> list[dict[str, float]]:
+        """Return the largest displacement (um, first order) that each error by itself leaves, for each tool (3,).
+
+        With ``anchored`` the mean over the volume does not count: such tables cannot hold a constant.
+        """
+        if self.key in ("volumetric", "directional"):  # the control evaluates E = C P with the tool in use
+            return [dict.fromkeys(errors.names, 0.0) for _ in tools_mm]
+        position_mm = _level_points(machine, errors) if self.solver is None else self.solver.position_mm
+        weight = None if self.solver is None else self.solver.weight
+        found: list[dict[str, float]] = [{} for _ in tools_mm]
+        for name in errors.names:
+            part = errors.only(name)
+            added = np.zeros_like(position_mm)
+            if self.solver is not None:
+                wanted = -volumetric_error(machine, part, position_mm)
+                added = self.solver.field(_best(self.solver, self.pitch, wanted))
+            for tool, left in zip(tools_mm, found, strict=True):
+                rest = volumetric_error(machine, part, position_mm, tool) + added
+                rest = rest - np.average(rest, axis=0, weights=weight) if anchored else rest
+                left[name] = float(np.sqrt(np.max(np.einsum("ij,ij->i", rest, rest)))) / MM_PER_UM
+        return found
+
+
+def in_zone(machine: Machine, zone_mm: Zone | None) -> Machine:
+    """Return the machine with its travel cut to a zone (ranges of X, Y, Z, None: all); InputError if it leaves it."""
+    if zone_mm is None:
+        return machine
+    axes = []
+    for letter, axis, part in zip(AXES, machine.axes, zone_mm, strict=True):
+        low, high = axis.range_mm if part is None else part
+        if not axis.range_mm[0] <= low < high <= axis.range_mm[1]:
+            raise InputError(
+                f"the zone goes from {low:g} to {high:g} mm in {letter}; it must lie within the travel "
+                f"{axis.range_mm[0]:g} ... {axis.range_mm[1]:g} mm, the lower end first"
+            )
+        inside = axis.nodes_mm[(axis.nodes_mm > low) & (axis.nodes_mm < high)]
+        axes.append(replace(axis, range_mm=(low, high), nodes_mm=np.array([low, *inside, high])))
+    x, y, z = axes
+    return replace(machine, axes=(x, y, z), emphasis=Emphasis())
+
+
+def level_nodes_mm(machine: Machine, errors: ErrorTable) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the nodes of the bases, by axis: those of the curves within the travel, and some between them."""
+    x, y, z = (_refined(curve_nodes_mm(machine, errors, axis)) for axis in range(3))
+    return x, y, z
+
+
+def _refined(nodes_mm: FloatArray) -> FloatArray:
+    parts = int(np.clip((MOST_NODES - 1) // (len(nodes_mm) - 1), 1, MOST_PARTS))
+    where = np.arange(parts * (len(nodes_mm) - 1) + 1) / parts
+    return np.asarray(np.interp(where, np.arange(len(nodes_mm)), nodes_mm))
+
+
+def _level_points(machine: Machine, errors: ErrorTable) -> FloatArray:
+    levels = [curve_nodes_mm(machine, errors, axis, most=25) for axis in range(3)]
+    return np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _basis(key: str, machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatArray]) -> list[Term]:
+    if key == "volumetric":
+        return error_terms(machine, errors, nodes_mm)
+    pairs = [(output, axis) for output in range(3) for axis in range(3) if output == axis or key != "pitch"]
+    origin_mm = (0.5 * (machine.lower_mm + machine.upper_mm)).tolist()
+    terms = one_dimensional_terms(machine, errors, nodes_mm, pairs, lever_origin_mm=origin_mm)
+    return terms + product_terms(machine, errors, nodes_mm, origin_mm) if key == "products" else terms
+
+
+def _best(solver: Projector, pitch: Projector | None, wanted_mm: FloatArray) -> FloatArray:
+    """Table values (parameters,) closest to a wanted field (n, 3); with ``pitch`` those without squareness.
+
+    Without squareness every straightness table is zero at both ends, since its line is squareness; positioning is then
+    fitted again to what is left.
+    """
+    values = solver.project(wanted_mm)
+    if pitch is None:
+        return values
+    values, along = values.copy(), np.zeros(len(values), dtype=np.bool_)
+    for term, place in placed_terms(solver.basis):
+        if term.carrier[0].output == term.axis:
+            values[place], along[place] = 0.0, True
+        else:
+            values[place] -= np.interp(term.nodes_mm, term.nodes_mm[[0, -1]], values[place][[0, -1]])
+    values[along] = pitch.project(wanted_mm - solver.field(values))
+    return values
+
+
+def levels_of(machine: Machine, errors: ErrorTable, reversal: ReversalCurves | None = None) -> list[Level]:
+    """Return the best tables of every level over the machine's travel; the last only where a reversal is known.
+
+    Straightness without squareness has the straightness of the level that follows, zero at both ends of the travel.
+    """
+    nodes_mm = level_nodes_mm(machine, errors)
+    solvers = {
+        key: projector(machine, _basis(key, machine, errors, nodes_mm), anchored=False)
+        for key in ("pitch", "squareness", "products", "volumetric")
+    }
+    found = [Level("nothing")]
+    for key, solver in solvers.items():
+        wanted = wanted_correction(machine, errors, solver.position_mm)
+        if key == "squareness":
+            values = _best(solver, solvers["pitch"], wanted)
+            found.append(Level("straightness", solver, values, solvers["pitch"]))
+        start = np.concatenate([term.start for term in solver.basis])
+        found.append(Level(key, solver, solver.project(wanted, start)))
+    if reversal is not None:
+        found.append(replace(found[-1], key="directional", reversal=reversal))
+    return found
+
+
+def level_key(basis: Sequence[Term]) -> str:
+    """Return the level that a control's tables belong to, from its basis."""
+    if any(term.name in ERROR_NAMES for term in basis):
+        return "volumetric"
+    if any(part.lever is not None for term in basis for part in term.carrier):
+        return "products"
+    if any(part.output != term.axis for term in basis for part in term.carrier):
+        return "squareness"
+    return "pitch"
+
+
+# What each option of a control would buy: the residual that every level leaves, and every control's own exported table.
+#
+# Levels are judged by the best tables in their basis, controls by the text of their files, read back and emulated.
+
+
+#: Tool lengths that are looked at in addition to the machine's own, along Z, mm.
+TOOL_LENGTHS_MM = (0.0, -100.0, -200.0)
+#: Options of a control that are looked at in addition to what the machine file says: words for them, and the settings.
+VARIANTS: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]] = {
+    "siemens-cec": (("without products", {"products": False}), ("with products", {"products": True}))
+}
+#: Settings that the machine file must state for an export, and what a comparison may take instead: in every mode the
+#: products leave the same residual; of two systems of values the one that leaves less.
+ASSUMED: Mapping[str, Mapping[str, Any]] = {"siemens-cec": {"mult_mode": "S1"}, "mitsubishi": {"mode": "incremental"}}
+
+
+@dataclass(frozen=True)
+class Left:
+    """Residuals over the volume: as it stands with the reference point fixed, and without the best-fit rigid motion."""
+
+    after: Residuals
+    rigid_removed: Residuals
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return both under their names."""
+        return {"after": self.after.as_dict(), "after_rigid_motion_removed": self.rigid_removed.as_dict()}
+
+
+@dataclass(frozen=True)
+class LevelResult:
+    """What the best tables of one level leave.
+
+    ``by_tool`` has one entry per tool: residuals of all errors together, and the largest displacement in um that each
+    error by itself leaves.
+    """
+
+    key: str
+    left: Left
+    by_tool: tuple[tuple[Left, Mapping[str, float]], ...]
+
+    @property
+    def label(self) -> str:
+        """What the tables hold, in words."""
+        return LABELS[self.key]
+
+
+@dataclass(frozen=True)
+class ControlResult:
+    """What the exported file of one control leaves; ``problem`` says why there is none.
+
+    ``level`` is the key of the level it belongs to, ``directional`` whether its tables know the direction of travel,
+    ``own`` whether the settings are those of the machine file, ``broken`` how many limits of the control the tables break.
+    """
+
+    name: str
+    variant: str
+    own: bool
+    level: str | None = None
+    directional: bool = False
+    left: Left | None = None
+    broken: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    problem: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name with the variant."""
+        return f"{self.name}, {self.variant}" if self.variant else self.name
+
+
+@dataclass(frozen=True)
+class Capability:
+    """Result of :func:`capability`; ``tools_mm`` are the tool offsets looked at, the machine's own first."""
+
+    machine: str
+    errors: tuple[str, ...]
+    tools_mm: tuple[tuple[float, float, float], ...]
+    zone_mm: Zone | None
+    points: int
+    levels: tuple[LevelResult, ...]
+    controls: tuple[ControlResult, ...]
+    notes: tuple[str, ...] = field(default_factory=tuple)
+
+    def level(self, key: str) -> LevelResult:
+        """Return one level."""
+        return next(item for item in self.levels if item.key == key)
+
+    def after(self, key: str) -> LevelResult | None:
+        """Return the next level, None after the last."""
+        keys = [item.key for item in self.levels]
+        place = keys.index(key) + 1
+        return self.levels[place] if place < len(keys) else None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the contents of ``options.json``."""
+        return {
+            "machine": self.machine,
+            "errors": list(self.errors),
+            "tools_mm": [list(tool) for tool in self.tools_mm],
+            "zone_mm": None if self.zone_mm is None else [part and list(part) for part in self.zone_mm],
+            "points": self.points,
+            "levels": [self._level_dict(item) for item in self.levels],
+            "controls": [_control_dict(item) for item in self.controls],
+            "notes": list(self.notes),
+        }
+
+    def _level_dict(self, item: LevelResult) -> dict[str, Any]:
+        tools = [
+            {"tool_mm": list(tool), **left.as_dict(), "uncorrected_um": dict(alone)}
+            for tool, (left, alone) in zip(self.tools_mm, item.by_tool, strict=True)
+        ]
+        return {"level": item.key, "holds": item.label, **item.left.as_dict(), "tools": tools}
+
+
+def _control_dict(item: ControlResult) -> dict[str, Any]:
+    figures = {} if item.left is None else item.left.as_dict()
+    return {
+        "controller": item.name,
+        "variant": item.variant,
+        "as_in_machine_file": item.own,
+        "level": item.level,
+        "direction_dependent": item.directional,
+        **figures,
+        "limits_broken": list(item.broken),
+        "notes": list(item.notes),
+        "problem": item.problem or None,
+    }
+
+
+def default_tools_mm(machine: Machine) -> tuple[tuple[float, float, float], ...]:
+    """Return the machine's own tool offset, then 0, -100 and -200 mm along Z, each once."""
+    lengths = [(0.0, 0.0, length) for length in TOOL_LENGTHS_MM]
+    return tuple(dict.fromkeys([machine.tool_offset_mm, *lengths]))
+
+
+def capability(
+    machine: Machine,
+    errors: ErrorTable,
+    *,
+    tools_mm: Sequence[tuple[float, float, float]] = (),
+    zone_mm: Zone | None = None,
+    reversal: ReversalCurves | None = None,
+    templates: Path | None = None,
+    controllers: Sequence[str] | None = None,
+) -> Capability:
+    """Say what every level of option and every control leaves of the errors.
+
+    Parameters
+    ----------
+    machine, errors : what moves, and how wrong; the exact model judges.
+    tools_mm : tool offsets to look at in addition to the machine's own; default 0, -100, -200 mm along Z.
+    zone_mm : ranges of X, Y, Z that matter (None: all); levels are fitted to it, and controls' files with this work zone.
+    reversal : difference between the directions of travel; then all points are looked at from both sides.
+    templates : the user's own templates, searched first.
+    controllers : names of the controls to look at, default all.
+    """
+    zone = in_zone(machine, zone_mm)
+    if zone_mm is not None:
+        machine = replace(machine, emphasis=replace(machine.emphasis, zone_mm=zone_mm))
+    tools = tuple(dict.fromkeys([machine.tool_offset_mm, *tools_mm])) if tools_mm else default_tools_mm(machine)
+    nodes = tuple(curve_nodes_mm(zone, errors, axis) for axis in range(3))
+    points = Points(volume_grid(zone, nodes).position_mm)
+    points = points if reversal is None else in_both_directions(points)
+    levels = tuple(
+        _level_result(zone, errors, item, points, reversal, tools) for item in levels_of(zone, errors, reversal)
+    )
+    controls = [
+        _control_result(variant, changed, errors, points, reversal, templates)
+        for name in (CONTROLLERS if controllers is None else controllers)
+        for variant, changed in _variants(machine, name)
+    ]
+    return Capability(
+        machine=machine.name,
+        errors=errors.names,
+        tools_mm=tools,
+        zone_mm=zone_mm,
+        points=len(points),
+        levels=levels,
+        controls=tuple(controls),
+        notes=tuple(_notes(errors, reversal)),
+    )
+
+
+def _left(
+    machine: Machine,
+    errors: ErrorTable,
+    points: Points,
+    correction_mm: FloatArray,
+    reversal: ReversalCurves | None,
+    tool_mm: FloatArray,
+) -> Left:
+    """Residuals of the exact machine with a correction (n, 3) at the points and a tool (3,)."""
+    error = exact_error(machine, errors, points.position_mm + correction_mm, tool_mm) + correction_mm
+    if reversal is not None and points.approach is not None:
+        error = error + reversal.displacement(points.position_mm, points.approach)
+    nominal = points.position_mm + tool_mm
+    return Left(residuals(error), residuals(without_rigid_motion(nominal, error)))
+
+
+def _level_result(
+    machine: Machine,
+    errors: ErrorTable,
+    level: Level,
+    points: Points,
+    reversal: ReversalCurves | None,
+    tools_mm: Sequence[tuple[float, float, float]],
+) -> LevelResult:
+    approach = np.zeros_like(points.position_mm) if points.approach is None else points.approach
+    by_tool = []
+    reversed_um = left_by_reversal(reversal, corrected=False)
+    left_um = left_by_reversal(reversal, corrected=level.reversal is not None)
+    tools = [np.array(item, dtype=np.float64) for item in tools_mm]
+    for tool, alone in zip(tools, level.left_alone_um(machine, errors, tools), strict=True):
+        correction = level.correction(points.position_mm, approach, tool)
+        left = _left(machine, errors, points, correction, reversal, tool)
+        by_tool.append((left, {**alone, **dict.fromkeys(reversed_um, 0.0), **left_um}))
+    return LevelResult(level.key, by_tool[0][0], tuple(by_tool))
+
+
+def _settings(machine: Machine, name: str) -> Any:
+    """Settings of a control, or None if the machine file does not say all that an export must know."""
+    try:
+        control = controller_named(name)(machine)
+    except CompgenError:
+        return None
+    return control.settings if control.missing() is None else None
+
+
+def _variants(machine: Machine, name: str) -> list[tuple[ControlResult, Machine]]:
+    """The variants of a control, yet without a result, each with the machine that has its settings."""
+    given = _settings(machine, name)
+    found = []
+    for words, changes in VARIANTS.get(name, (("", {}),)):
+        other, notes = _with_settings(machine, name, changes), tuple[str, ...]()
+        if _settings(other, name) is None:
+            stated = machine.controller_settings(name).data
+            assumed = {key: value for key, value in ASSUMED.get(name, {}).items() if key not in stated}
+            other = _with_settings(machine, name, {**assumed, **changes})
+            notes = tuple(f"{key} is not stated in the machine file; {assumed[key]!r} is taken here" for key in assumed)
+        own = given is not None and all(getattr(given, key) == value for key, value in changes.items())
+        found.append((ControlResult(name, words, own or not changes, notes=notes), other))
+    return found
+
+
+def _with_settings(machine: Machine, name: str, changes: Mapping[str, Any]) -> Machine:
+    section = machine.controller_settings(name)
+    data = {**section.data, **changes}
+    changed = toml_files.Section(data, path=section.path, text=section.text, name=section.name)
+    return replace(machine, controllers={**machine.controllers, name: changed})
+
+
+def _control_result(
+    variant: ControlResult,
+    machine: Machine,
+    errors: ErrorTable,
+    points: Points,
+    reversal: ReversalCurves | None,
+    templates: Path | None,
+) -> ControlResult:
+    """Export, read the text back, emulate it at the points; a control that cannot be exported says why."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CompgenWarning)
+            control = controller_named(variant.name)(machine)
+            made = export(machine, errors, variant.name, templates=templates, allow_unverified=True, reversal=reversal)
+            texts = [SourceFile(Path(name), text) for name, text in made.files.items()]
+            tables = control.parse(texts)
+            correction = np.asarray(control.emulate(tables, points))
+            level = level_key(control.basis(errors))
+    except CompgenError as error:
+        return replace(variant, problem=str(error))
+    left = _left(machine, errors, points, correction, reversal, tool_of(machine, None))
+    directional = reversal is not None and bool(control.reversal_in_tables(reversal).curves)
+    return replace(variant, level=level, directional=directional, left=left, broken=tuple(made.violations))
+
+
+def missing_notes(errors: ErrorTable) -> list[str]:
+    """Say which of the 21 errors are not known, and when that matters."""
+    missing = [name for name in ERROR_NAMES if name not in errors.names]
+    if not missing:
+        return []
+    return [
+        f"not in the errors file, so taken as zero: {', '.join(missing)}; with a tool of another offset than the one "
+        "measured with, some of them act too"
+    ]
+
+
+def _notes(errors: ErrorTable, reversal: ReversalCurves | None) -> list[str]:
+    if reversal is None:
+        return [*missing_notes(errors), "no reversal was given: both directions of travel are taken as equal"]
+    return [
+        *missing_notes(errors),
+        "controls without tables of one direction are shown with the whole reversal left; their backlash parameter "
+        "takes out what lies along the axis",
+    ]
+
+
+# Why a control's table is as it is: what it corrects, what stays, what the next option would buy, and what it uses.
+
+
+#: Errors that stay by less than this are taken as corrected, um.
+CORRECTED_UM = 0.1
+
+
+@dataclass(frozen=True)
+class Fate:
+    """What becomes of one error: displacement in um that it causes by itself, and that it leaves; why it stays."""
+
+    name: str
+    before_um: float
+    after_um: float
+    why: str
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Result of :func:`explain`.
+
+    ``nodes`` holds number, first and last node and smallest and largest step (mm) of the tables over each axis,
+    ``rounding_um`` the most that rounding changes a correction, ``steps`` the largest steps between neighbouring nodes.
+    """
+
+    controller: str
+    machine: str
+    level: str
+    fates: tuple[Fate, ...]
+    nodes: Mapping[str, Mapping[str, float]]
+    rounding_um: float
+    steps: tuple[LargestStep, ...]
+    usage: tuple[Usage, ...]
+    violations: tuple[str, ...]
+    options: Capability
+    own: ControlResult | None
+    notes: tuple[str, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {
+            "controller": self.controller,
+            "level": self.level,
+            "errors": [asdict(item) for item in self.fates],
+            "nodes": {axis: dict(item) for axis, item in self.nodes.items()},
+            "rounding_um": self.rounding_um,
+            "steps": [asdict(item) for item in self.steps],
+            "limits": [{**asdict(item), "share": item.share} for item in self.usage],
+            "limits_broken": list(self.violations),
+            "options": self.options.as_dict(),
+        }
+
+
+def explain(
+    machine: Machine,
+    errors: ErrorTable,
+    exported: Export,
+    *,
+    reversal: ReversalCurves | None = None,
+    templates: Path | None = None,
+) -> Explanation:
+    """Explain exported files from their text; ``errors``, ``reversal`` and ``templates`` as they were exported with."""
+    control = controller_named(exported.controller)(machine)
+    tables = control.parse([SourceFile(Path(name), text) for name, text in exported.files.items()])
+    solver = projector(machine, control.basis(errors), anchored=control.anchored)
+    values = np.concatenate([term.start for term in solver.basis])
+    level = level_key(solver.basis)
+    safety = safety_of(machine, control, tables, lambda part: solver.field(values, part))
+    rest = None  # what tables of one direction do not take out
+    if reversal is not None:
+        rest = reversal.without(control.reversal_in_tables(reversal))
+    known = rest if rest is not None and rest.curves else None
+    options = capability(machine, errors, reversal=known, templates=templates, controllers=(control.name,))
+    usage = sorted(control.usage(tables), key=lambda item: -item.share)
+    return Explanation(
+        controller=control.name,
+        machine=machine.name,
+        level=level,
+        fates=tuple(_fates(machine, errors, Level("own", solver), level, anchored=control.anchored))
+        + tuple(_reversal_fates(reversal, rest)),
+        nodes=_nodes(control, tables),
+        rounding_um=control.resolution_mm() / MM_PER_UM,
+        steps=safety.steps,
+        usage=tuple(usage),
+        violations=tuple(exported.violations),
+        options=options,
+        own=next((item for item in options.controls if item.own), None),
+        notes=tuple(missing_notes(errors)),
+    )
+
+
+def _fates(machine: Machine, errors: ErrorTable, own: Level, level: str, *, anchored: bool) -> list[Fate]:
+    tool_mm = tool_of(machine, None)
+    (before,) = Level("nothing").left_alone_um(machine, errors, [tool_mm], anchored=anchored)
+    (after,) = own.left_alone_um(machine, errors, [tool_mm], anchored=anchored)
+    return [
+        Fate(name, before[name], after[name], _why(name, level) if after[name] > CORRECTED_UM else "")
+        for name in sorted(before, key=lambda name: -after[name])
+    ]
+
+
+def _why(name: str, level: str) -> str:
+    """Say in words why a control of this level leaves an error."""
+    error = error_named(name)
+    if level in ("products", "volumetric"):
+        return "the nodes of the tables do not follow it closely"
+    if error.kind == "angular":
+        return (
+            "it acts with a lever that changes with another axis: products of tables or a volumetric function hold it"
+        )
+    if level == "pitch":
+        across = "squareness" if error.kind == "squareness" else "straightness"
+        return f"{across} moves the tool across the axis: tables of one axis over another hold it"
+    return "the nodes of the tables do not follow it closely"
+
+
+def _reversal_fates(reversal: ReversalCurves | None, rest: ReversalCurves | None) -> list[Fate]:
+    before, after = (left_by_reversal(part, corrected=False) for part in (reversal, rest))
+    why = "the tables act in both directions alike: the control's backlash parameter takes the part along the axis"
+    return [Fate(name, value, after.get(name, 0.0), why if name in after else "") for name, value in before.items()]
+
+
+def _nodes(control: AnyController, tables: Any) -> dict[str, dict[str, float]]:
+    found = {}
+    for letter, nodes in zip(AXES, control.table_nodes_mm(tables), strict=True):
+        if len(nodes) > 1:
+            steps = np.diff(nodes)
+            found[letter] = {
+                "nodes": len(nodes),
+                "first_mm": float(nodes[0]),
+                "last_mm": float(nodes[-1]),
+                "smallest_step_mm": float(steps.min()),
+                "largest_step_mm": float(steps.max()),
+            }
+    return found

@@ -1,0 +1,465 @@
+"""Texts of tables through Jinja2: the format of a control, a user's own templates, checks of plug-ins."""
+
+from __future__ import annotations
+
+import ctypes
+import inspect
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from decimal import Decimal
+from pathlib import Path, PurePath
+from typing import Any
+
+from jinja2 import ChoiceLoader, FileSystemLoader, StrictUndefined, TemplateError, TemplateSyntaxError
+from jinja2.runtime import Context
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from compgen.controls import CONTROLLERS, Controller
+from compgen.data import toml_files
+from compgen.data.csv_files import fixed
+from compgen.data.error_table import ErrorTable
+from compgen.data.machine import Machine
+from compgen.data.messages import one_line
+from compgen.data.names import AXES, ERRORS
+from compgen.data.registry import call_problem
+from compgen.errors import InputError
+from compgen.resources import data_folder
+
+# Controller files through Jinja2: strict about missing values, sandboxed, nothing of a user's text is executed.
+
+
+#: Files that are written together with those of the control.
+OWN_FILES = ("manifest.json", "preflight.md", "result.json", "explain.md")
+#: Longest time that one template may take, s, and most characters that it may write or hold in one text.
+LONGEST_S, MOST_CHARACTERS = 60.0, 400_000_000
+#: Largest whole number that a template may calculate, bits.
+MOST_BITS = 10_000
+
+
+class EndlessTemplateError(Exception):
+    """A template takes too long or becomes too large; those of users may hold any loop."""
+
+    def __init__(self, message: str = "it takes too long: does a loop end?") -> None:
+        super().__init__(message)
+
+
+#: What a wrong template may raise: Jinja's own errors, and those of the expressions in it.
+_TEMPLATE_FAULTS = (
+    TemplateError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+    LookupError,
+    AttributeError,
+    RecursionError,
+    UnicodeError,
+    EndlessTemplateError,
+)
+
+
+@dataclass(frozen=True)
+class FileSpec:
+    """One file of a format: its template, its name, and its line end.
+
+    A file with a ``variant`` is written only where the control's context says ``container = <variant>``.
+    """
+
+    template: str
+    name: str
+    line_end: str
+    variant: str = ""
+
+
+@dataclass(frozen=True)
+class Format:
+    """The card of a control's format as ``templates/<name>/format.toml`` has it.
+
+    ``evidence`` is ``"documented"`` or ``"unverified"``; ``unverified`` lists what no public document settles.
+    ``settings`` says what each key of ``[controllers.<name>]`` means; ``example_settings`` are some that the control
+    takes, where keys have no default.
+    """
+
+    name: str
+    title: str
+    summary: str
+    expresses: str
+    evidence: str
+    files: tuple[FileSpec, ...]
+    limits: tuple[str, ...]
+    unverified: tuple[str, ...]
+    sources: tuple[str, ...]
+    settings: Mapping[str, str] = field(default_factory=dict)
+    example_settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise ValueError("a list of texts is expected")
+    return tuple(" ".join(item.split()) for item in value)
+
+
+def _prose(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError("a text is expected")
+    return " ".join(value.split())
+
+
+def template_folders(name: str, folder: Path | None = None) -> list[Path]:
+    """Return where the templates of control ``name`` are looked for: the user's, a plug-in's own, the shipped ones."""
+    own = CONTROLLERS[name].templates if name in CONTROLLERS else None
+    return [*([folder] if folder else []), *([own] if own else []), data_folder("templates")]
+
+
+def check_templates(name: str, folder: Path) -> None:
+    """Check what a plug-in's control brings below ``folder``: the card, every template that it names, their syntax."""
+    card = _read_format(folder / name / "format.toml", name)
+    environment = _environment([folder, data_folder("templates")])
+    for template in (*(spec.template for spec in card.files), "preflight.md.j2"):
+        path = folder / name / template
+        if not path.is_file():
+            raise InputError("is missing", file=path)
+        try:
+            environment.get_template(f"{name}/{template}")
+        except TemplateSyntaxError as error:
+            raise InputError(f"is not a valid template: {one_line(error)}", file=path, line=error.lineno) from error
+
+
+def load_format(name: str, folder: Path | None = None) -> Format:
+    """Load the card of format ``name`` from ``folder`` (the user's templates), else from the shipped ones."""
+    if folder is not None and not folder.is_dir():
+        raise InputError("no such folder; --templates needs a folder with a sub-folder per control", file=folder)
+    for base in template_folders(name, folder):
+        path = base / name / "format.toml"
+        if path.is_file():
+            return _read_format(path, name)
+    raise InputError(f"no format.toml for {name!r} in {folder or data_folder('templates')}")
+
+
+def _meanings(section: toml_files.Section) -> dict[str, str]:
+    return {key: section.take(key, _prose) for key in section.data}
+
+
+def _named(expected: str) -> Callable[[Any], str]:
+    def check(value: Any) -> str:
+        if value != expected:
+            raise ValueError(f"the name of the control, {expected!r}, is expected")
+        return expected
+
+    return check
+
+
+def _file_name(value: Any) -> str:
+    """A plain name of an output file: no folder, none of the names that compgen writes itself."""
+    name = toml_files.text(value)
+    if PurePath(name).name != name or "\\" in name or name.startswith(".") or name.lower() in OWN_FILES:
+        raise ValueError(f"a plain file name without folder, other than {', '.join(OWN_FILES)}, is expected")
+    return name
+
+
+def _read_format(path: Path, name: str) -> Format:
+    root = toml_files.read_toml(path)
+    files = []
+    for section in root.sections("files"):
+        spec = FileSpec(
+            template=section.take("template", toml_files.text),
+            name=section.take("name", _file_name),
+            line_end={"lf": "\n", "crlf": "\r\n"}[section.take("line_end", toml_files.choice("lf", "crlf"), "lf")],
+            variant=section.take("variant", toml_files.text, ""),
+        )
+        section.finish()
+        files.append(spec)
+    card = Format(
+        name=root.take("name", _named(name)),
+        title=root.take("title", toml_files.text),
+        summary=root.take("summary", _prose),
+        expresses=root.take("expresses", _prose),
+        evidence=root.take("evidence", toml_files.choice("documented", "unverified")),
+        files=tuple(files),
+        limits=root.take("limits", _texts),
+        unverified=root.take("unverified", _texts, ()),
+        sources=root.take("sources", _texts),
+        settings=_meanings(root.section("settings", required=False)),
+        example_settings=root.take("example_settings", toml_files.table, {}),
+    )
+    root.finish()
+    if not files or len({spec.name.lower() for spec in files}) != len(files):
+        raise root.fail("files", "expected at least one [[files]], each with its own name")
+    return card
+
+
+class _Bounded(ImmutableSandboxedEnvironment):
+    """A sandbox in which no product or power is larger than a text or a number can sensibly be."""
+
+    intercepted_binops = frozenset({"*", "**"})
+
+    def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:
+        """Calculate, unless the result would not end or fit into the memory."""
+        sizes = [len(item) for item in (left, right) if isinstance(item, str | bytes | list | tuple)]
+        factors = [item for item in (left, right) if isinstance(item, int)]
+        if operator == "*" and sizes and factors and sizes[0] * abs(factors[0]) > MOST_CHARACTERS:
+            raise EndlessTemplateError(f"a text of more than {MOST_CHARACTERS} characters")
+        if len(factors) == 2:
+            bits = [abs(item).bit_length() for item in factors]
+            if (sum(bits) if operator == "*" else bits[0] * abs(factors[1])) > MOST_BITS:
+                raise EndlessTemplateError(f"a number of more than {MOST_BITS} bits")
+        return super().call_binop(context, operator, left, right)
+
+
+def _environment(folders: Sequence[Path]) -> ImmutableSandboxedEnvironment:
+    environment = _Bounded(
+        loader=ChoiceLoader([FileSystemLoader(folder) for folder in folders]),
+        undefined=StrictUndefined,
+        autoescape=False,
+        keep_trailing_newline=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["fixed"] = _fixed_filter
+    environment.filters["plain"] = lambda value: one_line(value)
+    return environment
+
+
+def _fixed_filter(value: float | Decimal, digits: int) -> str:
+    return fixed(float(value), digits)
+
+
+def _inert(value: Any) -> Any:
+    """Text of a user becomes one line of printable ASCII; containers are passed through item by item."""
+    if isinstance(value, str):
+        return one_line(value)
+    if isinstance(value, Mapping):
+        return {key: _inert(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_inert(item) for item in value]
+    return value
+
+
+def render(card: Format, template: str, context: Mapping[str, Any], folder: Path | None = None) -> str:
+    """Render one template of a format.
+
+    Parameters
+    ----------
+    card : the format.
+    template : file name below the format's folder.
+    context : values; texts are flattened to one line of printable ASCII before they reach the template.
+    folder : a user's templates folder, searched before the shipped one.
+    """
+    folders = template_folders(card.name, folder)
+    try:
+        page = _environment(folders).get_template(f"{card.name}/{template}")
+        with _ended_after(LONGEST_S):
+            # An endless template is stopped as soon as the page is too long.
+            parts = page.generate({**{key: _inert(value) for key, value in context.items()}, "format": card})
+            kept, size = [], 0
+            for part in parts:
+                kept.append(part)
+                size += len(part)
+                if size > MOST_CHARACTERS:
+                    raise EndlessTemplateError(f"it writes more than {MOST_CHARACTERS} characters: does a loop end?")
+            return "".join(kept)
+    except _TEMPLATE_FAULTS as error:
+        file, line = _place(error, folders)
+        message = f"the template cannot be rendered: {one_line(error)}"
+        raise InputError(message, file=file or f"templates/{card.name}/{template}", line=line) from error
+
+
+@contextmanager
+def _ended_after(seconds: float) -> Iterator[None]:
+    """Raise EndlessTemplateError in this thread, wherever it is, if the block takes longer.
+
+    A loop that writes nothing cannot be asked to stop; the interpreter can be, from another thread.
+    """
+    thread, lock, over, struck = ctypes.c_ulong(threading.get_ident()), threading.Lock(), False, False
+
+    def strike() -> None:
+        nonlocal struck
+        with lock:
+            if not over:
+                struck = True
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(EndlessTemplateError))
+
+    timer = threading.Timer(seconds, strike)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    except EndlessTemplateError:
+        struck = False  # it has arrived
+        raise
+    finally:
+        with lock:
+            over = True
+            if struck:  # it may still be on its way: take it back
+                # Never without need: in CPython 3.11 a thread without a pending exception then looks for one at every
+                # call, and stops for good where its calls are traced (coverage, debuggers).
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
+        timer.cancel()
+
+
+def _place(error: Exception, folders: Sequence[Path]) -> tuple[str | None, int | None]:
+    """Template file and line of an error: Jinja gives both in syntax errors, and rewrites tracebacks for the rest."""
+    if isinstance(error, TemplateSyntaxError):
+        return error.filename, error.lineno
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if any(Path(frame.filename).is_relative_to(folder) for folder in folders):
+            return frame.filename, frame.lineno
+    return None, None
+
+
+def render_files(card: Format, context: Mapping[str, Any], folder: Path | None = None) -> dict[str, str]:
+    """Render every file of a format and return the texts by file name, with the format's line ends."""
+    texts = {}
+    for spec in card.files:
+        if spec.variant and spec.variant != context.get("container"):
+            continue
+        text = render(card, spec.template, context, folder)
+        texts[spec.name] = text.replace("\n", spec.line_end) if spec.line_end != "\n" else text
+    return texts
+
+
+# Files that a user's own templates add to those of a control: for controls whose format is not public.
+#
+# Some volumetric compensations (SINUMERIK VCS) have no public file format. Whoever knows the format of the own control puts
+# a template ``<templates>/<control>/companion/<file name>.j2`` into a folder of templates; it gets the 21 errors as
+# ``errors21`` in addition to everything that the control's own templates get. Such a file is written and named with its SHA-256,
+# but nothing can be read back from it: what is verified are the files of the control alone.
+
+
+FOLDER, SUFFIX, CRLF_SUFFIX = "companion", ".j2", ".crlf.j2"
+
+
+def errors_context(machine: Machine, errors: ErrorTable) -> list[dict[str, Any]]:
+    """Return all 21 errors in the order of ISO 230-1's names, in the conventions of the program.
+
+    Each has ``name``, ``kind`` (linear, angular, squareness), ``axis`` (X, Y, Z, or "" for a squareness), ``unit``
+    (mm or rad), ``position_mm`` and ``value`` (lists of one length; a squareness has no position and one value) and
+    ``known``: an error that the input does not hold is zero.
+    """
+    return [_error(machine, errors, item.name, item.kind, item.axis) for item in ERRORS]
+
+
+def _error(machine: Machine, errors: ErrorTable, name: str, kind: str, axis: int) -> dict[str, Any]:
+    entry: dict[str, Any] = {"name": name, "kind": kind, "unit": "mm" if kind == "linear" else "rad"}
+    if kind == "squareness":
+        known = name in errors.squareness
+        value = [errors.squareness[name][0] if known else 0.0]
+        return {**entry, "axis": "", "position_mm": [], "value": value, "known": known}
+    curve = errors.curves.get(name)
+    position = machine.axes[axis].nodes_mm if curve is None else curve.position_mm
+    values = [0.0] * len(position) if curve is None else [float(value) for value in curve.value]
+    where = [float(value) for value in position]
+    return {**entry, "axis": AXES[axis], "position_mm": where, "value": values, "known": curve is not None}
+
+
+def companion_files(
+    card: Format, context: Mapping[str, Any], taken: Mapping[str, str], folder: Path | None
+) -> dict[str, str]:
+    """Render the templates ``<folder>/<control>/companion/*.j2`` and return the texts by file name.
+
+    Parameters
+    ----------
+    card : format of the control.
+    context : what the templates get.
+    taken : files of the control, whose names are not free.
+    folder : the user's templates, None: there are none.
+
+    Raises
+    ------
+    InputError
+        for a template that cannot be rendered, and a file name that is taken.
+    """
+    found: dict[str, str] = {}
+    if folder is None:
+        return found
+    for path in sorted((folder / card.name / FOLDER).glob(f"*{SUFFIX}")):
+        crlf = path.name.endswith(CRLF_SUFFIX)
+        name = path.name.removesuffix(CRLF_SUFFIX if crlf else SUFFIX)
+        if not name or name.startswith(".") or name.lower() in {*OWN_FILES, *map(str.lower, (*taken, *found))}:
+            raise InputError(f"{name!r} is not free as a file name; name the template <file name>{SUFFIX}", file=path)
+        text = render(card, f"{FOLDER}/{path.name}", context, folder)
+        found[name] = text.replace("\n", "\r\n") if crlf else text
+    return found
+
+
+# What a control of a plug-in must have; everything that is missing is reported at once, when it is registered.
+
+
+def check_control(name: str, thing: Any) -> tuple[Any, list[str]]:
+    """Return the class of the control and what is wrong with it; one of the former interface gets its adapter."""
+    code: Any = thing if inspect.isclass(thing) else type(thing)
+    former = next((item for item in code.__mro__ if "bound_form" in vars(item)), None)
+    interface = former or Controller
+    if not issubclass(code, interface):
+        return thing, ["it is not a subclass of compgen.controls.Controller"]
+    problems = _method_problems(code, interface)
+    if former and not problems:
+        try:
+            thing = code() if thing is code else thing
+        except Exception as error:  # code of a third party
+            return code, [f"{code.__name__}() fails: {type(error).__name__}: {error}"]
+    problems += _attribute_problems(name, code, interface)
+    if problems:
+        return code, problems
+    control = thing.bound_form() if former else code
+    if control.templates is None:
+        file = inspect.getsourcefile(code)
+        control.templates = Path(file).resolve().parent / "templates" if file else None
+    problems = _template_problems(name, control.templates)
+    return code if problems else control, problems
+
+
+def _method_problems(code: type, interface: type) -> list[str]:
+    """Methods that the class lacks or that cannot be called as those of the interface."""
+    problems = []
+    abstract: frozenset[str] = getattr(code, "__abstractmethods__", frozenset())
+    missing = [item for item in vars(interface) if item in abstract]
+    if missing:
+        texts = [f"{item}({', '.join(_arguments(interface, item))})" for item in missing]
+        problems.append(f"{code.__name__} has no {', '.join(texts)}")
+    for item in vars(interface):
+        method = getattr(code, item, None)
+        if item not in missing and item[0] != "_" and callable(getattr(interface, item)):
+            bound = method.__get__(object()) if inspect.isfunction(method) else method
+            problems += call_problem(bound, _arguments(interface, item), f"{code.__name__}.{item}")
+    if interface is Controller:
+        own = code.__mro__[: code.__mro__.index(Controller)]
+        if not hasattr(code, "settings_class") and not any("read_settings" in vars(item) for item in own):
+            problems.append(f"{code.__name__} has no settings_class, the dataclass of its settings")
+        problems += call_problem(code, _BINDING, code.__name__)
+    return problems
+
+
+#: What the class of a control is called with.
+_BINDING = ("machine", "settings")
+
+
+def _arguments(interface: type, method: str) -> list[str]:
+    return [key for key in inspect.signature(getattr(interface, method)).parameters if key != "self"]
+
+
+def _attribute_problems(name: str, code: Any, interface: Any) -> list[str]:
+    problems = []
+    own = getattr(code, "name", None)
+    if own != name:
+        problems.append(f"{code.__name__}.name has to be {name!r}, it is {'missing' if own is None else repr(own)}")
+    for item in ("anchored", "bidirectional"):
+        if not isinstance(getattr(code, item), bool):
+            problems.append(f"{code.__name__}.{item} has to be True or False")
+    if code.bidirectional is True and code.with_reversal is interface.with_reversal:
+        arguments = ", ".join(_arguments(interface, "with_reversal"))
+        problems.append(f"{code.__name__} is bidirectional, so it needs with_reversal({arguments})")
+    return problems
+
+
+def _template_problems(name: str, folder: Any) -> list[str]:
+    if not isinstance(folder, Path) or not (folder / name / "format.toml").is_file():
+        place = f"{folder}/{name}" if folder else f"templates/{name}"
+        return [f"its folder {place} with format.toml and the templates is missing"]
+    try:
+        check_templates(name, folder)
+    except InputError as error:
+        return [str(error)]
+    return []

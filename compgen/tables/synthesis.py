@@ -1,0 +1,259 @@
+"""The best tables that a control can hold: least squares of its basis against the wanted correction field.
+
+The wanted correction c*(p) brings the exact machine to where it was told to go: tip(p + c*(p)) = p + tool offset. It
+contains what a first-order model leaves out, e.g. the 4 um over a metre that come with a squareness of 2.9 mrad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import block_diag, coo_array, csr_array, hstack
+
+from compgen.controls.shared.base import Term
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine, Vector3
+from compgen.errors import ConvergenceError
+from compgen.kinematics.curves import free_basis, hat_entries, hat_matrix
+from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.first_order import tool_of
+from compgen.kinematics.volume_grid import volume_sample
+
+#: Where the volume leaves a choice, values stay at their start at the positions ``Term.keep_mm``; where even that
+#: leaves one, everywhere. Both weights lie far below that of any data (the normal matrix has unit diagonal).
+KEEP = 1e-7
+RIDGE = 1e-11
+#: A table's end interval of which less than this lies within the travel says too little about the node outside.
+LEAST_SHARE = 0.5
+#: Steps towards what a control applies that is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
+APPLIED_STEPS = 3
+
+#: What a control adds to the commands: values by term, points -> (n, 3), mm.
+Applied = Callable[[Mapping[str, FloatArray], Points], FloatArray]
+
+
+def wanted_correction(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
+) -> FloatArray:
+    """Return what must be added to commands (n, 3) so that the exact machine goes where it was told to, mm."""
+    correction = np.zeros_like(position_mm)
+    for _ in range(50):
+        previous = correction
+        moved = position_mm + previous
+        correction = -exact_error(machine, errors, moved, tool_mm)
+        if np.max(np.abs(correction - previous)) < 1e-10:
+            return correction
+    raise ConvergenceError("the errors are too large for a compensation: tip(p + c) = p has no solution by iteration")
+
+
+@dataclass(frozen=True)
+class Projector:
+    """Least squares of a basis over sample points, with the normal matrix factorised once.
+
+    ``position_mm`` (n, 3) with ``weight`` (n,) and ``sample_tool_mm`` (3,) or (n, 3) are the sample; elsewhere the tool
+    is ``tool_mm``. ``transform`` (parameters, free) builds in the zeros at the reference point; ``offsets`` is 3 when a
+    constant per axis is fitted together with the tables because the control cannot express it. ``design`` (3 n, free +
+    offsets) is sparse.
+    """
+
+    basis: tuple[Term, ...]
+    position_mm: FloatArray
+    weight: FloatArray
+    tool_mm: FloatArray
+    sample_tool_mm: FloatArray
+    transform: csr_array
+    offsets: int
+    design: csr_array
+    factor: tuple[FloatArray, bool]
+    scale: FloatArray
+
+    def project(self, wanted_mm: FloatArray, start: FloatArray | None = None) -> FloatArray:
+        """Return all table values (parameters,) whose field is closest to ``wanted_mm`` (n, 3)."""
+        if start is None:
+            return np.asarray(self.project_all(wanted_mm[None])[0])
+        return np.asarray(start + self.project_all((wanted_mm - self.field(start))[None])[0])
+
+    def project_all(self, wanted_mm: FloatArray) -> FloatArray:
+        """Return table values (k, parameters) for k wanted fields (k, n, 3) at once."""
+        weighted = wanted_mm * self.weight[:, None]
+        right = self.design.T @ weighted.reshape(len(wanted_mm), -1).T
+        solution = self.scale[:, None] * np.asarray(cho_solve(self.factor, right * self.scale[:, None]))
+        return np.asarray((self.transform @ solution[: self.transform.shape[1]]).T)
+
+    def field(self, values: FloatArray, position_mm: FloatArray | None = None) -> FloatArray:
+        """Return the correction field of table values at the sample points or at others, shape (n, 3), mm."""
+        if position_mm is None:
+            return basis_field(self.basis, values, self.position_mm, self.sample_tool_mm)
+        return basis_field(self.basis, values, position_mm, self.tool_mm)
+
+    def by_name(self, values: FloatArray) -> dict[str, FloatArray]:
+        """Split a vector of all table values by term."""
+        return {term.name: values[place] for term, place in placed_terms(self.basis)}
+
+
+def placed_terms(basis: Sequence[Term]) -> Iterator[tuple[Term, slice]]:
+    """Yield each term of a basis with the place of its values in the vector of all values."""
+    first = 0
+    for term in basis:
+        yield term, slice(first, first + len(term.nodes_mm))
+        first += len(term.nodes_mm)
+
+
+def basis_field(basis: Sequence[Term], values: FloatArray, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
+    """Return the correction field of a basis with the given values (all terms in a row) at points (n, 3)."""
+    field = np.zeros((len(position_mm), 3))
+    for term, place in placed_terms(basis):
+        field += term.carrier_field(position_mm, tool_mm) * term.curve(values[place], position_mm)[:, None]
+    return field
+
+
+def _design(basis: Sequence[Term], position_mm: FloatArray, tool_mm: FloatArray) -> csr_array:
+    """Design matrix (3 n, parameters) at points (n, 3), sparse: each table has two values at a point."""
+    rows, columns, entries = [], [], []
+    points = np.arange(len(position_mm))
+    for term, place in placed_terms(basis):
+        carrier = term.carrier_field(position_mm, tool_mm)
+        if term.axis is None or len(term.nodes_mm) == 1:
+            left, share = np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
+        else:
+            left, share = hat_entries(term.nodes_mm, position_mm[:, term.axis])
+        right = np.minimum(left + 1, len(term.nodes_mm) - 1)
+        for output in sorted({part.output for part in term.carrier}):
+            for node, weight in ((left, 1.0 - share), (right, share)):
+                rows.append(3 * points + output)
+                columns.append(place.start + node)
+                entries.append(carrier[:, output] * weight)
+    where = (np.concatenate(rows), np.concatenate(columns))
+    size = sum(len(term.nodes_mm) for term in basis)
+    return coo_array((np.concatenate(entries), where), shape=(3 * len(points), size)).tocsr()
+
+
+def projector(
+    machine: Machine, basis: Sequence[Term], *, anchored: bool, tools_mm: Sequence[Vector3] = ()
+) -> Projector:
+    """Factorise the least-squares problem of a basis over the machine's volume.
+
+    Parameters
+    ----------
+    machine : its travel is sampled at the tables' nodes and between them, its work zone by its weight.
+    basis : the control's terms.
+    anchored : True if a constant offset per axis is no part of what the control can do.
+    tools_mm : every point is sampled with each of these tool offsets; by default with the machine's own.
+    """
+    nodes = tuple(
+        np.unique(np.concatenate([[low, high], *(term.nodes_mm for term in basis if term.axis == axis)]))
+        for axis, (low, high) in enumerate(item.range_mm for item in machine.axes)
+    )
+    sample = volume_sample(machine, nodes, emphasis=machine.emphasis)
+    position_mm, weight = sample.position_mm, sample.weight
+    tool_mm = own_tool_mm = tool_of(machine, None)
+    if tools_mm:
+        tool_mm = np.repeat(np.array(tools_mm, dtype=np.float64), len(position_mm), axis=0)
+        position_mm, weight = np.tile(position_mm, (len(tools_mm), 1)), np.tile(weight, len(tools_mm))
+    transform = _transform(machine, basis)
+    offsets = 3 if anchored else 0
+    size = transform.shape[1] + offsets
+    design = _design(basis, position_mm, tool_mm) @ transform
+    if offsets:
+        constants = coo_array(np.tile(np.eye(3), (len(position_mm), 1)))
+        design = hstack([design, constants], format="csr")
+    normal = (design.T @ (design.multiply(np.repeat(weight, 3)[:, None])).tocsr()).toarray()
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
+    regular = RIDGE * np.eye(size)
+    regular[transform.shape[1] :] = 0.0
+    rows = np.asarray(_keep_rows(basis) @ transform)
+    rows *= scale[: transform.shape[1]]
+    rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
+    regular[: transform.shape[1], : transform.shape[1]] += KEEP * rows.T @ rows
+    factor = cho_factor(normal * scale[:, None] * scale + regular, lower=True)
+    sampled = (position_mm, weight, own_tool_mm, tool_mm)
+    return Projector(tuple(basis), *sampled, transform, offsets, design, factor, scale)
+
+
+def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
+    blocks = []
+    for term in basis:
+        rows = []
+        if term.axis is not None:
+            if term.zero_at_mm is not None:
+                rows.append(hat_matrix(term.nodes_mm, np.array([term.zero_at_mm]))[0])
+            rows += [row for row in hat_matrix(term.nodes_mm, np.array(term.zeros_mm)) if len(term.zeros_mm)]
+            rows += _beyond_travel(term.nodes_mm, *machine.axes[term.axis].range_mm)
+        blocks.append(free_basis(np.array(rows), len(term.nodes_mm)))
+    return csr_array(block_diag(blocks))
+
+
+def _beyond_travel(nodes_mm: FloatArray, low_mm: float, high_mm: float) -> list[FloatArray]:
+    """Rows that make nodes beyond the travel continue the line of the two inside, where few points determine them."""
+    rows: list[FloatArray] = []
+    if len(nodes_mm) < 3:
+        return rows
+    steps = np.diff(nodes_mm)
+    for node, next_node, third, share in (
+        (0, 1, 2, (nodes_mm[1] - low_mm) / steps[0]),
+        (-1, -2, -3, (high_mm - nodes_mm[-2]) / steps[-1]),
+    ):
+        if share < LEAST_SHARE:
+            ratio = (nodes_mm[node] - nodes_mm[next_node]) / (nodes_mm[next_node] - nodes_mm[third])
+            row = np.zeros(len(nodes_mm))
+            row[node], row[next_node], row[third] = 1.0, -(1.0 + ratio), ratio
+            rows.append(row)
+    return rows
+
+
+def _keep_rows(basis: Sequence[Term]) -> FloatArray:
+    """Rows (k, parameters) whose product with the values gives them at the positions ``keep_mm`` of every term."""
+    blocks, total = [], sum(len(term.nodes_mm) for term in basis)
+    for term, place in placed_terms(basis):
+        rows = np.zeros((len(term.keep_mm) if term.axis is not None else 0, total))
+        if len(rows):
+            rows[:, place] = hat_matrix(term.nodes_mm, np.array(term.keep_mm))
+        blocks.append(rows)
+    return np.vstack(blocks)
+
+
+def synthesize(
+    machine: Machine,
+    errors: ErrorTable,
+    basis: Sequence[Term],
+    *,
+    anchored: bool,
+    at_axes: bool = False,
+    applied: Applied | None = None,
+) -> dict[str, FloatArray]:
+    """Return the table values by term that come closest to the wanted correction over the volume.
+
+    The machine's work zone and tools (``machine.emphasis``) say what counts more. ``applied`` says what a control adds
+    that does not simply sum its tables, see :func:`best_values`.
+    """
+    solver = projector(machine, basis, anchored=anchored)
+    return solver.by_name(best_values(machine, errors, solver, at_axes=at_axes, applied=applied))
+
+
+def best_values(
+    machine: Machine, errors: ErrorTable, solver: Projector, *, at_axes: bool = False, applied: Applied | None = None
+) -> FloatArray:
+    """Return all values (parameters,) of the best tables, over the tools of ``machine.emphasis`` if it has some.
+
+    With ``at_axes`` the tables are looked up where the axes stand: they hold minus the error there, not c*. A control
+    whose correction ``applied(values by term, points)`` (n, 3) is not the sum of the basis, but close to it, gets
+    values for which that correction is the wanted one (Gauss-Newton).
+    """
+    if machine.emphasis.tools_mm:
+        solver = projector(machine, solver.basis, anchored=bool(solver.offsets), tools_mm=machine.emphasis.tools_mm)
+    wanted_at = (lambda *given: -exact_error(*given)) if at_axes else wanted_correction
+    wanted = wanted_at(machine, errors, solver.position_mm, solver.sample_tool_mm)
+    start = np.concatenate([term.start for term in solver.basis])
+    values = solver.project(wanted, start)
+    if applied is not None:
+        tool_mm = np.broadcast_to(solver.sample_tool_mm, solver.position_mm.shape)
+        points = Points(solver.position_mm, np.array(tool_mm))
+        for _ in range(APPLIED_STEPS):
+            beyond = applied(solver.by_name(values), points) - solver.field(values)
+            values = solver.project(wanted - beyond, start)
+    return values

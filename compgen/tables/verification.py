@@ -1,0 +1,879 @@
+"""The round trip: read the written text back, emulate the control, and state the verdict on tables and measurement."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from compgen.controls import AnyController, SourceFile, controller_named
+from compgen.data.csv_files import FloatArray, format_csv
+from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
+from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.files import read_bytes, sha256_of
+from compgen.data.lengths import Points
+from compgen.data.machine import Machine
+from compgen.data.messages import one_line, um_text
+from compgen.data.names import COVERAGE, ERROR_NAMES, MM_PER_UM, error_named
+from compgen.errors import CompgenWarning, InputError
+from compgen.identify.covariance import Covariance, covariance_or_independent, error_design
+from compgen.identify.identification import Identification
+from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.first_order import observable_errors, tool_of, volumetric_error
+from compgen.kinematics.gauge import rigid_fields, without_rigid_motion
+from compgen.tables.entries import entry_check
+from compgen.tables.judge import (
+    Judge,
+    Residuals,
+    in_both_directions,
+    judge_of,
+    left_by_reversal,
+    mean_correction,
+    residuals,
+    reversal_reasons,
+)
+from compgen.tables.safety import Safety, SafetyLimits, safety_of
+from compgen.tables.synthesis import Projector, wanted_correction
+
+# The verdict on tables and on the measurement behind them: one state, one headline, and what speaks against it.
+#
+# ``reasons`` are about the tables, objections about the measurement: how well the model describes its readings, and how
+# much of the machine it shows.
+
+
+State = Literal["accepted", "partial", "accepted_with_reservations", "better_after_new_setup", "not_accepted"]
+#: From the best to the worst; where several apply the last one is the verdict.
+STATES: tuple[State, ...] = (
+    "accepted",
+    "partial",
+    "accepted_with_reservations",
+    "better_after_new_setup",
+    "not_accepted",
+)
+#: Residuals of the readings above this share of what the tables take away (rms) leave nothing to be sure of.
+RESIDUAL_SHARE = 1.0 / 3.0
+#: The error as it stands counts as worse if its rms grows by this much.
+WORSE_FROM_UM = 0.01
+#: Points at which the uncertainty over the volume is looked at, and numbers kept in memory for it.
+UNCERTAINTY_POINTS, MOST_NUMBERS = 1500, 20_000_000
+#: Codes of the objections that `--allow-misfit` overrides.
+MISFIT_CODES = ("residual_too_large", "step_between_runs", "step_between_blocks", "step_between_files", "step", "drift")
+
+
+@dataclass(frozen=True)
+class Objection:
+    """What speaks against the measurement: ``code`` for programs, ``text`` for people.
+
+    ``blocking`` ones leave the tables not accepted, the others lead to reservations.
+    """
+
+    code: str
+    text: str
+    blocking: bool = False
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the entry of ``result.json``."""
+        return {"code": self.code, "text": self.text, "blocking": self.blocking}
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How many of the errors that the machine's chain shows are known.
+
+    Parameters
+    ----------
+    observable : names of the errors that can be told apart on this machine with one tool.
+    determined : those of them that the errors file holds.
+    left_out : those that the machine file's ``errors`` leaves out of the model.
+    """
+
+    observable: tuple[str, ...]
+    determined: tuple[str, ...]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Names of the observable errors that are not known."""
+        return tuple(name for name in self.observable if name not in self.determined)
+
+    @property
+    def text(self) -> str:
+        """Say what was measured, and what was not."""
+        kinds = list(dict.fromkeys(_kind(name) for name in self.determined))
+        only = f"{' and '.join(kinds)} only, " if 0 < len(kinds) <= 2 else ""
+        return f"{only}{len(self.determined)} of {len(self.observable)} errors measured"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the object ``measured`` of ``result.json``."""
+        return {
+            "determined": len(self.determined),
+            "observable": len(self.observable),
+            "text": self.text,
+            "errors": list(self.determined),
+            "missing": list(self.missing),
+            "left_out_by_machine_file": list(self.left_out),
+        }
+
+
+def _kind(name: str) -> str:
+    error = error_named(name)
+    if error.kind == "linear":
+        return "straightness" if error.is_straightness else "positioning"
+    return "angles" if error.kind == "angular" else "squareness"
+
+
+def coverage_of(machine: Machine, errors: ErrorTable) -> Coverage:
+    """Return how many of the machine's observable errors a table of errors holds."""
+    observable = observable_errors(machine)
+    known = tuple(name for name in observable if name in errors.names)
+    listed = machine.errors if isinstance(machine.errors, tuple) else ERROR_NAMES
+    return Coverage(observable, known, tuple(name for name in observable if name not in listed))
+
+
+# --- uncertainty ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FigureUncertainty:
+    """What the uncertainty of the measurement adds to the figures after compensation: expanded, k = 2, um.
+
+    The files hold what was identified; the machine differs from that by the uncertainty of the errors, which no
+    verification of the files can show.
+    """
+
+    rms_um: float
+    max_um: float
+    rms_rigid_removed_um: float
+    max_rigid_removed_um: float
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the object ``after_uncertainty`` of ``result.json``."""
+        return {
+            "coverage_factor": COVERAGE,
+            "U_rms_um": self.rms_um,
+            "U_max_um": self.max_um,
+            "U_rms_rigid_motion_removed_um": self.rms_rigid_removed_um,
+            "U_max_rigid_motion_removed_um": self.max_rigid_removed_um,
+        }
+
+
+def figure_uncertainty(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, covariance: Covariance | None = None
+) -> FigureUncertainty | None:
+    """Return the uncertainty that the errors give the figures over points (n, 3); None where it is not known.
+
+    Without a joint covariance the standard uncertainties of the values count, taken as independent.
+    """
+    known = covariance_or_independent(errors, covariance, machine.name)
+    if known is None:
+        return None
+    most = max(50, min(UNCERTAINTY_POINTS, MOST_NUMBERS // (3 * max(len(known.error), 1))))
+    places = np.unique(np.linspace(0, len(position_mm) - 1, most).astype(int))
+    chosen = position_mm[places]
+    spread = error_design(machine, known, chosen) @ known.errors_factor
+    flat = spread.reshape(3 * len(chosen), -1)
+    rigid, _ = np.linalg.qr(rigid_fields((chosen + tool_of(machine, None) - chosen.mean(axis=0)) / 1000.0))
+    rest = flat - rigid @ (rigid.T @ flat)
+    rms, largest = _size_um(flat)
+    rms_rest, largest_rest = _size_um(rest)
+    return FigureUncertainty(rms, largest, rms_rest, largest_rest)
+
+
+def _size_um(flat: FloatArray) -> tuple[float, float]:
+    variance = np.einsum("ij,ij->i", flat, flat).reshape(-1, 3).sum(axis=1)
+    scale = COVERAGE / MM_PER_UM
+    return scale * float(np.sqrt(variance.mean())), scale * float(np.sqrt(variance.max()))
+
+
+# --- the measurement -----------------------------------------------------------------------------------------------
+
+
+def measurement_objections(
+    result: Identification, taken_away_um: float | None, *, allow_misfit: bool = False
+) -> tuple[Objection, ...]:
+    """Say what speaks against a measurement.
+
+    Parameters
+    ----------
+    result : what was identified.
+    taken_away_um : rms of what the tables take out of the error over the volume; None for tables that are wrong.
+    allow_misfit : whether a misfit that would leave the tables not accepted is a reservation only.
+    """
+    return tuple(
+        replace(item, blocking=False) if allow_misfit and item.code in MISFIT_CODES else item
+        for item in _objections(result, taken_away_um)
+    )
+
+
+def _objections(result: Identification, taken_away_um: float | None) -> Iterator[Objection]:
+    for text in result.objections:
+        yield Objection("contradiction", text, blocking=True)
+    misfit = result.misfit
+    if misfit is not None:
+        for cause in misfit.causes:
+            text = f"{cause.text} explains {100.0 * cause.share:.0f} % of the residuals of the readings"
+            yield Objection(cause.code, text, blocking=True)
+    if taken_away_um is not None and result.degrees_of_freedom > 0 and result.rms_um > RESIDUAL_SHARE * taken_away_um:
+        text = (
+            f"the residuals of the readings, {um_text(result.rms_um)} um rms, are more than a third of the "
+            f"{um_text(taken_away_um)} um rms that the tables take away"
+        )
+        yield Objection("residual_too_large", text, blocking=True)
+    if misfit is not None and misfit.beyond:
+        yield Objection("misfit", misfit.text)
+
+
+def blocking_reasons(objections: Sequence[Objection]) -> list[str]:
+    """Return why objections leave the tables not accepted, with what to do."""
+    hint = "; `volcomp diagnose` looks for what the model lacks, --allow-misfit accepts the tables nevertheless"
+    return [item.text + (hint if item.code in MISFIT_CODES else "") for item in objections if item.blocking]
+
+
+def taken_away_um(before_rms_um: float, after_rms_um: float) -> float:
+    """Return the rms of what tables take out of a field of errors, from the rms before and after, um.
+
+    What stays is what the tables do not reach, so both parts add up by their squares.
+    """
+    return float(np.sqrt(max(before_rms_um**2 - after_rms_um**2, 0.0)))
+
+
+# --- the verdict ---------------------------------------------------------------------------------------------------
+
+
+def worst(states: Sequence[State]) -> State:
+    """Return the worst of some states; "accepted" for none."""
+    return max(states, key=STATES.index, default="accepted")
+
+
+# The round trip: parse the written text, emulate the control, and look at what the exact machine then does.
+
+
+#: Errors that stay uncorrected by less than this are not named.
+NAMED_FROM_MM = 0.1 * MM_PER_UM
+
+#: Largest controller file that is read; the largest tables that the controls take have some 200 000 rows.
+MOST_BYTES, MOST_LINES = 20_000_000, 250_000
+
+#: A correction below this is none; 1e-9 mm is far below what any control resolves.
+ZERO_MM = 1e-9
+#: A control that cannot express more than this share of the largest error gives a partial compensation.
+PARTIAL_SHARE = 0.1
+
+
+@dataclass(frozen=True, repr=False)
+class ReadTables(Displayed):
+    """Controller tables as they were parsed from text, with the control that understands them.
+
+    ``files`` are names and SHA-256; ``contradictions`` say where a plan next to the tables has other numbers;
+    ``remarks`` say what reading assumed, passed over and kept apart.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import numpy as np
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> leaning = compgen.ErrorTable(squareness={"EC0Y": (30e-6, 1e-6)})  # dX = -Y EC0Y: +15 um at Y = -500
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = compgen.export(machine, leaning, "isg-csv").write(folder)
+    ...     tables: compgen.ReadTables = compgen.read_tables(machine, paths, "isg-csv")
+    >>> added = tables.correction(machine, compgen.Points(np.array([[-400.0, -500.0, -100.0]])))
+    >>> (1e3 * added).round(3).tolist()  # the control adds minus the error
+    [[-15.0, 0.0, 0.0]]
+    """
+
+    controller: AnyController
+    tables: Any
+    files: tuple[tuple[str, str], ...]
+    contradictions: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def correction(self, machine: Machine, points: Points) -> FloatArray:
+        """Return what the control adds to the command at each point, shape (n, 3), mm."""
+        return np.asarray(self.controller.emulate(self.tables, points))
+
+    def mean_correction(
+        self, machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | None = None
+    ) -> FloatArray:
+        """Return what the control adds at positions (n, 3), the mean of both directions of travel, shape (n, 3), mm.
+
+        ``tool_mm`` are the tool offsets (n, 3), None for the machine's own.
+        """
+        if not self.controller.bidirectional:
+            return self.correction(machine, Points(position_mm, tool_mm))
+
+        def added(points: Points) -> FloatArray:
+            return self.correction(machine, points)
+
+        return mean_correction(added, position_mm, tool_mm) - self.anchor_offset_mm(machine)
+
+    def anchor_offset_mm(self, machine: Machine) -> FloatArray:
+        """Return the mean of both directions where an anchored control's tables are zero, shape (3,), mm.
+
+        They are zero there in one direction only, by a constant, which does no harm.
+        """
+        if not (self.controller.bidirectional and self.controller.anchored):
+            return np.zeros(3)
+        anchor_mm = self.controller.anchor_mm()[None]
+        return np.asarray(mean_correction(lambda points: self.correction(machine, points), anchor_mm)[0])
+
+    def overview(self) -> Overview:
+        """The control and the files."""
+        names = tuple(name for name, _ in self.files)
+        return Overview(f"{self.controller.name}: {shortened(names)}", notes=(*self.contradictions, *self.remarks))
+
+
+def read_tables(
+    machine: Machine, paths: Sequence[str | Path] | str | Path, controller: str, *, foreign: bool = False
+) -> ReadTables:
+    """Parse controller files.
+
+    Parameters
+    ----------
+    machine : its ``[controllers.<name>]`` settings say how the control reads them.
+    paths : the files, or the folder of an export, whose manifest names them.
+    controller : name of the control.
+    foreign : read archives and files of other programs as well, with remarks on what was passed over. Files that this
+        program wrote are read strictly all the same.
+
+    Raises
+    ------
+    InputError
+        with file and line for whatever is malformed.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> errors = compgen.read_errors("examples/zha-gantry.truth.errors.csv")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = compgen.export(machine, errors, "isg-csv").write(folder)
+    ...     tables = compgen.read_tables(machine, paths, "isg-csv")
+    >>> tables
+    <ReadTables: isg-csv: volcomp0.csv, volcomp0.lis>
+    """
+    control = controller_named(controller)(machine)
+    files = table_files([paths] if isinstance(paths, str | Path) else paths, controller)
+    if not files:
+        raise InputError("no table file was given")
+    contents = [(path, _read_limited(path, any_text=foreign)) for path in files]
+    return _parsed(control, contents, foreign=foreign)
+
+
+def parse_tables(machine: Machine, contents: Mapping[str, bytes], controller: str) -> ReadTables:
+    """Parse the contents of controller files by their names as strictly as :func:`read_tables` does."""
+    named = [(Path(name), content) for name, content in contents.items()]
+    return _parsed(controller_named(controller)(machine), named, foreign=False)
+
+
+def _parsed(control: AnyController, contents: Sequence[tuple[Path, bytes]], *, foreign: bool) -> ReadTables:
+    hashes = tuple((path.name, sha256_of(content)) for path, content in contents)
+    try:
+        sources = [SourceFile(path, _decode(path, content)) for path, content in contents]
+        tables = control.parse(sources)
+    except InputError:
+        other = _foreign_tables(control, contents) if foreign else None
+        if other is None:
+            raise
+        return ReadTables(control, other[0], hashes, (), tuple(other[1]))
+    others = tuple(control.contradictions(tables, sources))
+    remarks = tuple(control.remarks(tables, sources))
+    return ReadTables(control, tables, hashes, others, remarks)
+
+
+def table_files(paths: Sequence[str | Path], controller: str) -> list[Path]:
+    """Return the files, and in place of a folder those that its manifest names; InputError where it does not fit."""
+    found: list[Path] = []
+    for path in map(Path, paths):
+        found += _files_of_export(path, controller) if path.is_dir() else [path]
+    return found
+
+
+def _files_of_export(folder: Path, controller: str) -> list[Path]:
+    """The tables of an export; where it was made for several controls, those of its sub-folder of this control."""
+    own = folder / controller
+    place = next((place for place in (folder, own) if (place / "manifest.json").is_file()), None)
+    if place is None:
+        message = "is a folder without manifest.json; give the table files, or the folder of an export"
+        raise InputError(message, file=folder)
+    path = place / "manifest.json"
+    try:
+        manifest = json.loads(read_bytes(path, MOST_BYTES))
+        made_for, prefix = manifest["controller"], manifest.get("file_prefix", "")
+        names = [(item["name"], item.get("sha256")) for item in manifest["files"]]
+        if not names or not all(isinstance(name, str) and name == Path(name).name for name, _ in names):
+            raise ValueError("no file")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError("is not the manifest of an export", file=path) from error
+    if made_for != controller:
+        message = f"names tables of {one_line(made_for)[:40]}, but {controller} was requested"
+        raise InputError(message, file=path, field="controller")
+    for name, digest in names:
+        table = place / f"{prefix}{name}"
+        if digest != sha256_of(read_bytes(table, MOST_BYTES + 1)):
+            message = f"{table.name} was changed after the export that wrote {path}"
+            warnings.warn(message, CompgenWarning, stacklevel=5)
+    return [place / f"{prefix}{name}" for name, _ in names]
+
+
+#: Every file that this program writes says so in one of its first lines.
+_OWN_FILE = re.compile(rb"\b(?:compgen|volcomp) (?:\d+\.\d|unknown)")
+
+
+def _foreign_tables(control: AnyController, contents: Sequence[tuple[Path, bytes]]) -> tuple[Any, list[str]] | None:
+    """What the control's reader of other files makes of them; None for files of our own, which stay strict."""
+    if any(_OWN_FILE.search(content[:4000]) for _, content in contents):
+        return None
+    sources = [SourceFile(path, _any_text(content)) for path, content in contents]
+    other = control.parse_foreign(sources)
+    if other is not None or all(source.text.isascii() for source in sources):
+        return other
+    # A control without a reader of other files: the comments may hold any character, the rest stays strict.
+    plain = [SourceFile(source.path, source.text.encode("ascii", "replace").decode()) for source in sources]
+    return control.parse(plain), ["comments hold characters that are not ASCII: passed over"]
+
+
+def _any_text(content: bytes) -> str:
+    """Text in whatever encoding: comments of real files hold umlauts and more."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return content.decode("utf-16", "replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def _read_limited(path: Path, *, any_text: bool = False) -> bytes:
+    """Contents of a file; one that is far larger than any table is refused before anybody looks for numbers in it."""
+    content = read_bytes(path, MOST_BYTES + 1)
+    lines = content.count(b"\n")
+    if len(content) <= MOST_BYTES and lines <= MOST_LINES:
+        return content
+    if not any_text:
+        _decode(path, content)
+    what = f"{MOST_LINES} lines" if lines > MOST_LINES else f"{MOST_BYTES // 1_000_000} MB"
+    message = f"is longer than {what}; no controller table is"
+    raise InputError(message, file=path, line=min(lines, MOST_LINES) + 1)
+
+
+def _decode(path: Path, content: bytes) -> str:
+    try:
+        text = content.decode("ascii")
+        at = text.find("\0")
+    except UnicodeDecodeError as error:
+        text, at = "", error.start
+    if at < 0:
+        return text
+    what = "a NUL character" if text else "a byte that is not ASCII"
+    line = content[:at].count(b"\n") + 1
+    raise InputError(f"contains {what}; controller tables are ASCII text", file=path, line=line)
+
+
+#: Smaller errors of the tool tip are drawn as this one: the reference point has none, and the picture is logarithmic.
+LEAST_DRAWN_UM = 1e-3
+
+
+@dataclass(frozen=True, repr=False)
+class Verification(Drawable):
+    """Result of :func:`verify`; residuals of the exact model over the same points before and after.
+
+    ``reasons`` says why the tables are not accepted (empty: accepted). ``unrepresentable_um`` is the largest residual
+    that the best table of this control leaves (a constant offset is left out if the control cannot hold one), and
+    ``uncorrected_um`` names the errors behind it with the largest displacement that stays. ``reservations`` are what the
+    control says of tables that break no limit: what is inferred, has no room, or is not known.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> errors = compgen.read_errors("examples/zha-gantry.truth.errors.csv")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = compgen.export(machine, errors, "isg-csv").write(folder)
+    ...     tables = compgen.read_tables(machine, paths, "isg-csv")
+    >>> result: compgen.Verification = compgen.verify(machine, tables, errors)
+    >>> result.controller, result.state
+    ('isg-csv', 'accepted')
+    >>> result.before.max_um > 1000 * result.after.max_um
+    True
+    """
+
+    controller: str
+    before: Residuals
+    after: Residuals
+    before_rigid_removed: Residuals
+    after_rigid_removed: Residuals
+    unrepresentable_um: float
+    uncorrected_um: dict[str, float]
+    points: int
+    files: tuple[tuple[str, str], ...]
+    reasons: tuple[str, ...]
+    reservations: tuple[str, ...]
+    measured: Coverage
+    safety: Safety = field(repr=False)
+    position_mm: FloatArray = field(repr=False)
+    error_before_mm: FloatArray = field(repr=False)
+    error_after_mm: FloatArray = field(repr=False)
+    machine: str = ""
+    objections: tuple[Objection, ...] = ()
+    uncertainty: FigureUncertainty | None = None
+    next_command: str = ""
+    tools: str = ""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the tables may be loaded, whatever reservations the verdict has."""
+        return not self.reasons
+
+    @property
+    def volumetric(self) -> bool:
+        """Whether figures over the volume can be claimed: every error that the machine's chain shows is known."""
+        return not self.measured.missing
+
+    @property
+    def worse_as_it_stands(self) -> bool:
+        """Whether the tables make the rms error larger for a workpiece that is left where it is."""
+        return self.after.rms_um > self.before.rms_um + WORSE_FROM_UM
+
+    @property
+    def state(self) -> State:
+        """The verdict in one word."""
+        found: list[State] = []
+        if self.partial or not self.volumetric:
+            found.append("partial")
+        if self.objections or self.reservations:
+            found.append("accepted_with_reservations")
+        if self.worse_as_it_stands:
+            found.append("better_after_new_setup")
+        if not self.accepted:
+            found.append("not_accepted")
+        return worst(found)
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence, with the one figure that it rests on."""
+        if not self.accepted:
+            more = f" (and {len(self.reasons) - 1} more)" if len(self.reasons) > 1 else ""
+            return f"not accepted: {self.reasons[0]}{more}"
+        parts = [*(item.text for item in self.objections if not item.blocking), *self.reservations]
+        reserved = f"accepted with reservations: {'; '.join(parts)}" if parts else ""
+        whole = [self._setup_text, reserved, self._partial_text]
+        return "; ".join(text for text in whole if text) or f"accepted: {self.figure}"
+
+    @property
+    def figure(self) -> str:
+        """What the tables do, in one figure: rms over the volume as it stands, with the uncertainty of the measurement."""
+        change = f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms"
+        known = "not known" if self.uncertainty is None else f"{um_text(self.uncertainty.rms_um)} um"
+        bounds = f"uncertainty of the measurement U = {known}" + ("" if self.uncertainty is None else ", k = 2")
+        if self.volumetric:
+            return f"the error over the volume goes from {change} as it stands ({bounds})"
+        return f"the effect of the measured errors alone goes from {change} ({bounds}); the error over the volume is not known"
+
+    @property
+    def _setup_text(self) -> str:
+        if not self.worse_as_it_stands:
+            return ""
+        before, after = self.before_rigid_removed, self.after_rigid_removed
+        return (
+            f"better only after the workpiece is set up anew: as it stands the error grows from {um_text(self.before.rms_um)} to "
+            f"{um_text(self.after.rms_um)} um rms; with the best-fit rigid motion of the workpiece taken out it goes from "
+            f"{um_text(before.rms_um)} to {um_text(after.rms_um)} um rms"
+        )
+
+    @property
+    def _partial_text(self) -> str:
+        parts = []
+        if not self.volumetric:
+            parts.append(self.measured.text)
+        if self.partial:
+            parts.append(self._beyond_text)
+        if not parts:
+            return ""
+        return f"partial: {'; '.join(parts)}" + ("" if self.worse_as_it_stands else f"; {self.figure}")
+
+    @property
+    def _beyond_text(self) -> str:
+        share = 100.0 * self.after_rigid_removed.rms_um / max(self.before_rigid_removed.rms_um, 1e-12)
+        return (
+            f"this control cannot express {um_text(self.unrepresentable_um)} um of the error; {share:.0f} % of the rms stays "
+            "with the best-fit rigid motion taken out"
+        )
+
+    @property
+    def partial(self) -> bool:
+        """Whether the control cannot express a good part of the error: the table is right, but much stays."""
+        return self.unrepresentable_um > PARTIAL_SHARE * self.before.max_um
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What else the user should know of accepted tables."""
+        notes = [*self.reservations, *self.safety.warnings]
+        if self.partial:
+            notes.append(self._beyond_text)
+        if self.after.max_um > self.before.max_um + 0.05 and not self.worse_as_it_stands:
+            notes.append(
+                f"as it stands the largest error grows from {self.before.max_um:.1f} to {self.after.max_um:.1f} um, "
+                "by a rigid motion of the workpiece"
+            )
+        return tuple(notes)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the contents of ``result.json``."""
+        return {
+            "accepted": self.accepted,
+            "verdict": self.state,
+            "headline": self.headline,
+            "objections": [item.as_dict() for item in self.objections],
+            "measured": self.measured.as_dict(),
+            "volumetric": self.volumetric,
+            "partial": self.partial,
+            "notes": list(self.notes),
+            "reasons": list(self.reasons),
+            "controller": self.controller,
+            "machine": self.machine,
+            "points": self.points,
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
+            "before_rigid_motion_removed": self.before_rigid_removed.as_dict(),
+            "after_rigid_motion_removed": self.after_rigid_removed.as_dict(),
+            "after_uncertainty": None if self.uncertainty is None else self.uncertainty.as_dict(),
+            "unrepresentable_um": self.unrepresentable_um,
+            "uncorrected_um": self.uncorrected_um,
+            "next_command": self.next_command or None,
+            "judged_with_tools": self.tools,
+            "safety": self.safety.summary(),
+            "files": [{"name": name, "sha256": digest} for name, digest in self.files],
+        }
+
+    def overview(self) -> Overview:
+        """Verdict, and the error of the tool tip over the volume before and after."""
+        fields = {
+            "before": self.before,
+            "after": self.after,
+            "before, rigid motion removed": self.before_rigid_removed,
+            "after, rigid motion removed": self.after_rigid_removed,
+        }
+        rows = tuple((name, um_text(x.max_um), um_text(x.rms_um), um_text(x.p95_um)) for name, x in fields.items())
+        change = f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms"
+        title = f"{self.controller}: {self.state.replace('_', ' ')}, tool-tip error {change}"
+        return Overview(title, ("tool-tip error (um)", "max", "rms", "95 %"), rows, (self.headline, *self.notes))
+
+    def panels(self) -> Sequence[Panel]:
+        """How many of the points have an error of the tool tip below which size."""
+        lines = []
+        for name, error_mm in (("before", self.error_before_mm), ("after", self.error_after_mm)):
+            size_um = np.maximum(np.sort(np.linalg.norm(error_mm, axis=1)) / MM_PER_UM, LEAST_DRAWN_UM)
+            lines.append(PlottedLine(name, size_um, np.linspace(0.0, 100.0, len(size_um))))
+        x_label = "error of the tool tip (um)"
+        return [Panel(self.controller, "points below (%)", tuple(lines), x_label=x_label, x_scale="log")]
+
+
+def verify(
+    machine: Machine,
+    tables: ReadTables,
+    errors: ErrorTable,
+    points: Points | None = None,
+    limits: SafetyLimits | None = None,
+    reversal: ReversalCurves | None = None,
+    covariance: Covariance | None = None,
+) -> Verification:
+    """Judge parsed tables against the errors of the machine.
+
+    Parameters
+    ----------
+    machine : the machine.
+    tables : from :func:`read_tables`.
+    errors : usually the identified errors; the exact model moves with them.
+    points : where the residuals are reported; default the grid of the nodes of curves and tables and the middles
+        between them. The judgement itself is always made on that grid and on lines along the axes.
+    limits : for the steps of the tables, see :func:`compgen.tables.safety.safety_of`.
+    reversal : what each axis does differently in its two directions, in addition to the errors (their mean); points that do
+        not say from where they were approached are then looked at from both sides.
+    covariance : joint covariance of the errors, for the uncertainty of the figures; without it that of the single values
+        counts.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> errors = compgen.read_errors("examples/zha-gantry.truth.errors.csv")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = compgen.export(machine, errors, "isg-csv").write(folder)
+    ...     tables = compgen.read_tables(machine, paths, "isg-csv")
+    >>> result = compgen.verify(machine, tables, errors)
+    >>> result.accepted, result.after.max_um < 0.5
+    (True, True)
+    """
+    control = tables.controller
+    judge = judge_of(machine, control, errors, tables.tables)
+    grid_mm, solver = judge.grid.position_mm, judge.solver
+    where = points or Points(grid_mm)
+    if reversal is not None and where.approach is None:
+        where = in_both_directions(where)
+    before, after = _errors_before_after(machine, tables, errors, where, reversal)
+    nominal = where.position_mm + tool_of(machine, where.tool_mm)
+    rest = wanted_correction(machine, errors, grid_mm) - judge.best_mm
+    if control.anchored:
+        rest = rest - rest.mean(axis=0)
+    figures = [residuals(error) for error in (before, after)]
+    rigid_removed = [residuals(without_rigid_motion(nominal, error)) for error in (before, after)]
+    safety, reasons = reasons_against(machine, tables, judge, limits, reversal)
+    useless = _useless_reasons(
+        machine, tables, points_mm=(grid_mm, judge.line_mm), figures=figures, removed=rigid_removed
+    )
+    return Verification(
+        controller=control.name,
+        before=figures[0],
+        after=figures[1],
+        before_rigid_removed=rigid_removed[0],
+        after_rigid_removed=rigid_removed[1],
+        unrepresentable_um=float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM,
+        uncorrected_um={
+            **_uncorrected(machine, errors, solver),
+            **left_by_reversal(_not_in_tables(tables, reversal), corrected=False),
+        },
+        points=len(where),
+        files=tables.files,
+        reasons=tuple(dict.fromkeys([*useless, *reasons])),
+        reservations=(
+            *control.reservations(tables.tables),
+            *control.left_out(errors),
+        ),
+        measured=coverage_of(machine, errors),
+        safety=safety,
+        position_mm=where.position_mm,
+        error_before_mm=before,
+        error_after_mm=after,
+        machine=machine.name,
+        uncertainty=figure_uncertainty(machine, errors, where.position_mm, covariance),
+        tools=machine.tool_range_text,
+    )
+
+
+def reasons_against(
+    machine: Machine,
+    tables: ReadTables,
+    judge: Judge,
+    limits: SafetyLimits | None = None,
+    reversal: ReversalCurves | None = None,
+) -> tuple[Safety, tuple[str, ...]]:
+    """Return what parsed tables would make the axes do, and every reason not to accept them, each once."""
+    control = tables.controller
+    on_grid, on_lines = (tables.mean_correction(machine, part) for part in (judge.grid.position_mm, judge.line_mm))
+    safety = safety_of(machine, control, tables.tables, lambda part: judge.solver.field(judge.values, part), limits)
+    reasons = [
+        *control.violations(tables.tables),
+        *(judge.reasons(on_grid, on_lines) or entry_check(machine, judge, tables, reversal).reasons()),
+        *_reversal_reasons(machine, tables, reversal),
+        *tables.contradictions,
+        *safety.reasons,
+    ]
+    return safety, tuple(dict.fromkeys(reasons))
+
+
+def _useless_reasons(
+    machine: Machine,
+    tables: ReadTables,
+    *,
+    points_mm: Sequence[FloatArray],
+    figures: Sequence[Residuals],
+    removed: Sequence[Residuals],
+) -> list[str]:
+    """Say so of tables that hold zeros only, or with which the machine is worse whatever is done with the workpiece.
+
+    ``figures`` are before and after as it stands, ``removed`` those without the best-fit rigid motion.
+    """
+    largest = 0.0
+    for position_mm in points_mm:
+        for side in (1.0, -1.0):
+            points = Points(position_mm, approach=np.full_like(position_mm, side))
+            largest = max(largest, float(np.abs(tables.correction(machine, points)).max()))
+    step_um = tables.controller.resolution_mm() / MM_PER_UM
+    if largest < ZERO_MM:
+        return [
+            f"the tables hold zeros only and change nothing, while the errors reach {um_text(figures[0].max_um)} um: either this "
+            f"control has no table for them, or its smallest step is too coarse (rounding of an entry: up to {step_um:.3g} um)"
+        ]
+    if figures[1].rms_um > figures[0].rms_um + WORSE_FROM_UM and removed[1].rms_um > removed[0].rms_um:
+        return [
+            f"the tables make the machine worse: {um_text(figures[0].rms_um)} um rms before, {um_text(figures[1].rms_um)} "
+            f"after; with the best-fit rigid motion taken out {um_text(removed[0].rms_um)} before, "
+            f"{um_text(removed[1].rms_um)} after"
+        ]
+    return []
+
+
+def _errors_before_after(
+    machine: Machine, tables: ReadTables, errors: ErrorTable, points: Points, reversal: ReversalCurves | None
+) -> tuple[FloatArray, FloatArray]:
+    """Exact errors of the tip without and with the correction; it is looked up at the commanded position.
+
+    The reversal comes on top of both, by the direction in which each point was approached.
+    """
+    correction = tables.correction(machine, points)
+    before = exact_error(machine, errors, points.position_mm, points.tool_mm)
+    after = exact_error(machine, errors, points.position_mm + correction, points.tool_mm) + correction
+    if reversal is not None and points.approach is not None:
+        moved = reversal.displacement(points.position_mm, points.approach)
+        return before + moved, after + moved
+    return before, after
+
+
+def _reversal_reasons(machine: Machine, tables: ReadTables, reversal: ReversalCurves | None) -> list[str]:
+    control = tables.controller
+    if reversal is None or not control.bidirectional:
+        return []
+    in_tables = control.reversal_in_tables(reversal)
+    rounding_mm = 2.0 * control.resolution_mm()  # of both directions
+    return reversal_reasons(machine, lambda points: tables.correction(machine, points), in_tables, rounding_mm)
+
+
+def _not_in_tables(tables: ReadTables, reversal: ReversalCurves | None) -> ReversalCurves | None:
+    """Part of a reversal that no table of one direction holds."""
+    if reversal is None:
+        return None
+    return reversal.without(tables.controller.reversal_in_tables(reversal))
+
+
+def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dict[str, float]:
+    """Largest displacement in um that the best table leaves of each error alone (first order), where it matters."""
+    names = errors.names
+    wanted = np.stack([-volumetric_error(machine, errors.only(name), solver.position_mm) for name in names])
+    found = {}
+    for name, field_mm, values in zip(names, wanted, solver.project_all(wanted), strict=True):
+        rest = field_mm - solver.field(values)
+        if solver.offsets:
+            rest = rest - np.average(rest, axis=0, weights=solver.weight)
+        largest = float(np.max(np.linalg.norm(rest, axis=1)))
+        if largest > NAMED_FROM_MM:
+            found[name] = round(largest / MM_PER_UM, 3)
+    return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+# The files that hold the outcome of a verification: its figures, and the points behind them.
+
+
+def verification_files(result: Verification) -> dict[str, str]:
+    """Return the texts of ``result.json`` and ``volume.csv``."""
+    return {"result.json": json.dumps(result.summary(), indent=2) + "\n", "volume.csv": format_volume(result)}
+
+
+def format_volume(result: Verification) -> str:
+    """Return the text of ``volume.csv``: error of the tool tip before and after at every point of the figures, um.
+
+    Where a reversal is known every point is listed twice, reached in positive and in negative direction.
+    """
+    columns: dict[str, FloatArray] = {f"{axis}_mm": result.position_mm[:, k] for k, axis in enumerate("xyz")}
+    digits = dict.fromkeys(columns, 6)
+    for prefix, values in (("before", result.error_before_mm), ("after", result.error_after_mm)):
+        columns |= {f"{prefix}_{axis}_um": values[:, k] / MM_PER_UM for k, axis in enumerate("xyz")}
+    return format_csv(columns, {"controller": result.controller}, {**dict.fromkeys(columns, 4), **digits})

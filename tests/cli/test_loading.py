@@ -1,0 +1,105 @@
+"""What a program may load before it needs it: start-up is what a user waits for at every command."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+#: Libraries that take long to load. The lists below name those that a program may have loaded when it ends.
+HEAVY = {
+    "alembic", "apscheduler", "cvxpy", "dask", "flask", "jinja2", "matplotlib", "numba", "numpy", "openpyxl", "osqp",
+    "pandas", "rich", "scipy", "scipy.interpolate", "scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial",
+    "scipy.special", "scipy.stats", "sqlalchemy", "xmlschema",
+}  # fmt: skip
+TABLES = {"numpy", "rich", "jinja2", "scipy", "scipy.linalg", "scipy.sparse", "scipy.special"}
+REPORT = f"""
+import atexit, json, sys
+heavy = {sorted(HEAVY)}
+def say():
+    loaded = [name for name in heavy if name in sys.modules]
+    commands = [name.rpartition(".")[2] for name in sys.modules if name.startswith("compgen.cli.") and "_commands" in name]
+    with open("loaded.json", "w") as file:
+        json.dump([loaded, commands], file)
+atexit.register(say)
+"""
+PROGRAM = "sys.argv = ['volcomp', *{}]\nfrom compgen.__main__ import main\nmain()"
+
+
+def loaded(tmp_path, code, **environment):
+    """Heavy libraries, and modules of commands, that a fresh process has loaded when it ends."""
+    variables = {name: value for name, value in os.environ.items() if name not in ("COVERAGE_PROCESS_START",)}
+    done = subprocess.run(
+        [sys.executable, "-c", REPORT + code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**variables, "COMPGEN_KERNELS": "plain", **environment},
+    )
+    assert done.returncode == 0, done.stderr
+    libraries, commands = json.loads((tmp_path / "loaded.json").read_text())
+    return set(libraries), set(commands), done.stdout
+
+
+def test_import_compgen_loads_nothing(tmp_path):
+    assert loaded(tmp_path, "import compgen")[:2] == (set(), set())
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"]])
+def test_the_main_help_loads_neither_numpy_nor_any_command(tmp_path, words):
+    libraries, commands, output = loaded(tmp_path, PROGRAM.format(words))
+    assert (libraries, commands) == (set(), set())
+    assert "crash-test" in output or "version" in output
+
+
+def completed(tmp_path, line):
+    variables = {"_VOLCOMP_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
+    return loaded(tmp_path, PROGRAM.format([]), **variables)
+
+
+def test_completion_of_a_command_loads_no_command(tmp_path):
+    libraries, commands, output = completed(tmp_path, "volcomp di")
+    assert output.split() == ["plain,diagnose", "plain,diff"]
+    assert (libraries, commands) == (set(), set())
+
+
+def test_completion_of_an_option_knows_the_options_and_loads_that_command_alone(tmp_path):
+    libraries, commands, output = completed(tmp_path, "volcomp fit --max")
+    assert output.split() == ["plain,--max-abs", "plain,--max-slope", "plain,--max-curvature"]
+    assert commands == {"identify_commands"}
+    assert libraries <= TABLES
+
+
+@pytest.mark.parametrize(
+    ("words", "module", "allowed"),
+    [
+        (["machines", "--json"], "listing_commands", TABLES),
+        (["controllers", "--json"], "listing_commands", TABLES),
+        (["recal", "--help"], "fleet_commands", {"rich"}),
+        (["recal", "run", "--help"], "fleet_commands", {"rich"}),
+        (["serve", "--help"], "fleet_commands", {"rich"}),
+        (["identify", "zha-gantry", "L", "--out", "o"], "identify_commands", TABLES),
+        (["fit", "zha-gantry", "E", "--out", "o"], "identify_commands", TABLES | {"scipy.optimize", "scipy.spatial"}),
+        (["predict", "zha-gantry", "E", "--points", "P", "--out", "o"], "plan_commands", TABLES),
+        (
+            ["export", "zha-gantry", "E", "--controller", "isg-csv", "--out", "o"],
+            "table_commands",
+            TABLES | {"scipy.optimize", "scipy.spatial"},
+        ),
+    ],
+)
+def test_a_command_loads_its_own_module_and_no_library_that_it_does_not_need(tmp_path, words, module, allowed):
+    (tmp_path / "p.points.csv").write_text("x_mm,y_mm,z_mm\n-400,100,-200\n")
+    examples = ROOT / "examples"
+    files = {
+        "L": str(examples / "zha-gantry.lengths.csv"),
+        "E": str(examples / "zha-gantry.truth.errors.csv"),
+        "P": str(tmp_path / "p.points.csv"),
+    }
+    libraries, commands, _ = loaded(tmp_path, PROGRAM.format([files.get(word, word) for word in words]))
+    assert commands == {module}
+    assert libraries <= allowed
