@@ -9,8 +9,8 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from compgen.simulate.ray_tracer import Tracer
-from compgen.sixdof.optics import SIGNALS, Optics
+from compgen.instruments.sixdof_instrument import SIGNALS, Optics
+from compgen.simulate.sixdof import Tracer
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402  (the backend is chosen before)
