@@ -12,8 +12,8 @@ import re
 import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -61,27 +61,22 @@ def plain_decimals(rows: list[list[str]], lines: Sequence[int], decimal: str | N
     if _BLANKS.search(together):
         rows = [[_BLANKS.sub("", c) if _THOUSANDS_BLANK.fullmatch(c) else c for c in row] for row in rows]
     if decimal is not None:
-        return [
-            [_said(cell, decimal, line) for cell in row] for row, line in zip(rows, lines, strict=True)
-        ], decimal == "comma"
+        mark, other = (",", ".") if decimal == "comma" else (".", ",")
+        meant = re.compile(rf"[+-]?(\d*|[1-9]\d{{0,2}}([{other}]\d{{3}})+)([{mark}]\d*)?([eE][+-]?\d+)?")
+        read = []
+        for row, line in zip(rows, lines, strict=True):
+            numbers = [meant.fullmatch(cell) is not None for cell in row]
+            for cell, good in zip(row, numbers, strict=True):
+                if not good and (_COMMA.fullmatch(cell) or _POINT.fullmatch(cell)):
+                    message = f"{shown(cell)} has no decimal {decimal}, and parts no thousands"
+                    raise InputError(message, line=line, field="--decimal")
+            read.append(
+                [c.replace(other, "").replace(mark, ".") if n else c for c, n in zip(row, numbers, strict=True)]
+            )
+        return read, decimal == "comma"
     if "," not in together:
         return rows, False
-    comma, point, either = _first_lines(rows, lines)
-    if comma and point:
-        message = (
-            f"a decimal comma here, a decimal point in line {point}; write all numbers in one way, or say --decimal"
-        )
-        raise InputError(f"{message} comma or point (the other parts thousands)", line=comma)
-    if either and not (comma or point):
-        raise InputError(
-            "numbers such as 1,000 may be 1000 or 1.000; say --decimal point (1000) or comma (1.000)", line=either
-        )
-    changed = comma or any(_THOUSANDS_COMMA.fullmatch(cell) for row in rows for cell in row)
-    return [[_plain(cell) for cell in row] for row in rows] if changed else rows, bool(comma)
-
-
-def _first_lines(rows: list[list[str]], lines: Sequence[int]) -> tuple[int, int, int]:
-    """Return the lines of the first decimal comma, decimal point, and number that may have a comma or thousands (0: none)."""
+    # the lines of the first decimal comma, decimal point, and number that may have a comma or thousands (0: none)
     comma = point = either = 0
     for row, line in zip(rows, lines, strict=True):
         for cell in row:
@@ -91,19 +86,19 @@ def _first_lines(rows: list[list[str]], lines: Sequence[int]) -> tuple[int, int,
                 comma = comma or line
             elif _POINT.fullmatch(cell) or _THOUSANDS_COMMA.fullmatch(cell):
                 point = point or line
-    return (comma or either, point, 0) if point else (comma, point, either)
-
-
-def _said(cell: str, decimal: str, line: int) -> str:
-    """Return a number in the way that the user says; other text stays."""
-    mark, other = (",", ".") if decimal == "comma" else (".", ",")
-    if re.fullmatch(rf"[+-]?(\d*|[1-9]\d{{0,2}}([{other}]\d{{3}})+)([{mark}]\d*)?([eE][+-]?\d+)?", cell):
-        return cell.replace(other, "").replace(mark, ".")
-    if _COMMA.fullmatch(cell) or _POINT.fullmatch(cell):
-        raise InputError(
-            f"{shown(cell)} has no decimal {decimal}, and parts no thousands", line=line, field="--decimal"
+    if point:  # a number such as 1,000 has a decimal comma then, or is in conflict with the point
+        comma, either = comma or either, 0
+    if comma and point:
+        message = (
+            f"a decimal comma here, a decimal point in line {point}; write all numbers in one way, or say --decimal"
         )
-    return cell
+        raise InputError(f"{message} comma or point (the other parts thousands)", line=comma)
+    if either and not comma:
+        raise InputError(
+            "numbers such as 1,000 may be 1000 or 1.000; say --decimal point (1000) or comma (1.000)", line=either
+        )
+    changed = comma or any(_THOUSANDS_COMMA.fullmatch(cell) for row in rows for cell in row)
+    return [[_plain(cell) for cell in row] for row in rows] if changed else rows, bool(comma)
 
 
 def _plain(cell: str) -> str:
@@ -197,7 +192,9 @@ def grid_of_text(source: Text) -> CellGrid:
     count = source.text.count("\n")
     if count > MOST_ROWS:
         raise source.fail(f"has {count} lines; at most {MOST_ROWS} are read: thin it out or split it")
-    content, numbers = _filled_lines(source.text)
+    lines = source.text.split("\n")
+    numbers = [k for k, line in enumerate(lines, start=1) if line and not line.isspace()]
+    content = [lines[k - 1] for k in numbers] if len(numbers) < len(lines) else lines
     separator = _separator(content[:_SAMPLE_LINES])
     cells = len(content) * (1 + max((line.count(separator or " ") for line in content[:_SAMPLE_LINES]), default=0))
     if cells > MOST_CELLS:
@@ -221,38 +218,25 @@ def grid_of_text(source: Text) -> CellGrid:
     return grid
 
 
-def _filled_lines(text: str) -> tuple[list[str], list[int]]:
-    """Return the lines that are not blank, and their numbers from 1."""
-    lines = text.split("\n")
-    numbers = [k for k, line in enumerate(lines, start=1) if line and not line.isspace()]
-    return ([lines[k - 1] for k in numbers] if len(numbers) < len(lines) else lines), numbers
-
-
 def _separator(lines: Sequence[str]) -> str | None:
-    """Return the mark that parts the most numbers in a block of lines with equally many cells; None for blanks.
+    """Return the mark that separates the most numbers in a block of lines with equally many cells; None for blanks.
 
-    A later mark must be clearly better: decimal commas part numbers too.
+    A block counts with its numbers times their share among its filled cells. A later mark must be clearly better: decimal
+    commas separate numbers too.
     """
     best, score = None, 0.0
     for mark, margin in ((";", 1.0), ("\t", 1.0), ("|", 1.0), (",", 1.2), (None, 1.2)):
-        own = _longest_block(
-            [[cell.strip().strip('"') for cell in line[:_SAMPLE_CHARACTERS].split(mark)] for line in lines]
-        )
-        if own > margin * score:
-            best, score = mark, own
-    return best
-
-
-def _longest_block(rows: Sequence[Sequence[str]]) -> float:
-    """Return the most numbers that adjacent rows of one width hold, times their share among the filled cells there."""
-    best, numbers, filled, width = 0.0, 0, 0, -1
-    for row in rows:
-        if len(row) != width:
-            numbers, filled, width = 0, 0, len(row)
-        count = sum(_NUMERAL.fullmatch(cell) is not None for cell in row)
-        numbers, filled = numbers + count, filled + (len(_filled(row)) if count else 0)
-        if width > 1 and numbers:
-            best = max(best, numbers * numbers / filled)
+        longest, numbers, filled, width = 0.0, 0, 0, -1
+        for line in lines:
+            row = [cell.strip().strip('"') for cell in line[:_SAMPLE_CHARACTERS].split(mark)]
+            if len(row) != width:
+                numbers, filled, width = 0, 0, len(row)
+            count = sum(_NUMERAL.fullmatch(cell) is not None for cell in row)
+            numbers, filled = numbers + count, filled + (len(_filled(row)) if count else 0)
+            if width > 1 and numbers:
+                longest = max(longest, numbers * numbers / filled)
+        if longest > margin * score:
+            best, score = mark, longest
     return best
 
 
@@ -328,8 +312,12 @@ def _down(grid: CellGrid, k: int) -> _Layout | None:
     if 2 * words < len(names) and not _numbers_runs(row, grid.rows[first]):
         return None
     top, joined = _joined_names(grid, k)
-    width = len(joined) if units else MOST_COLUMNS
-    if not _like(_filled(joined), grid.rows[first], width):
+    # the row has the width of the header and mostly numbers (names of stations or axes may be among them); one of about
+    # twice the width is let through here and refused later: decimal commas between commas
+    cells, named = _filled(grid.rows[first]), len(_filled(joined))
+    count = sum(parse_number(cell) is not None for cell in cells)
+    wide = 2 * named - 1 <= len(cells) <= (len(joined) if units else MOST_COLUMNS)
+    if not count or 3 * count < len(cells) or named >= 2 * len(cells) or not (len(cells) <= named or wide):
         return None
     joined = [
         f"{name} [{unit}]" if unit else name
@@ -382,18 +370,20 @@ def _numbers_runs(row: Sequence[str], below: Sequence[str]) -> bool:
 def _joined_names(grid: CellGrid, k: int) -> tuple[int, list[str]]:
     """Return the first row of names above row k, and the names: what stands over several columns belongs to each of them."""
     names = [name.lstrip("#% ") if n == 0 else name for n, name in enumerate(grid.rows[k])]
-    while (
-        names
-        and not names[-1]
-        and not any(row[len(names) - 1 : len(names)] != [""] for row in grid.rows[k + 1 : k + 3])
-    ):
+    below = grid.rows[k + 1 : k + 3]
+    while names and not names[-1] and all(row[len(names) - 1 : len(names)] == [""] for row in below):
         names.pop()
     top = k
-    while (
-        top > 0 and grid.lines[top] == grid.lines[top - 1] + 1 and _needs_more(names) and _is_group(grid.rows[top - 1])
-    ):
+    while top > 0 and grid.lines[top] == grid.lines[top - 1] + 1:
+        other = names[1:]
+        bare = all(way(name) is not None or name.isdigit() or _unit_in_cell(name) for name in other)
+        if all(names) and len(set(other)) == len(other) and not bare:
+            break  # the names say which run a column is
+        over, last = grid.rows[top - 1], ""
+        group = _filled(over[1:])  # runs, directions or deviations, which several columns have in common
+        if not group or _has_number(over[:1]) or not all(is_known_name(cell) for cell in group):
+            break
         top -= 1
-        over, last = grid.rows[top], ""
         for n in range(1, max(len(names), len(over))):
             cell = over[n] if n < len(over) else ""
             last = cell or last
@@ -408,30 +398,6 @@ def _joined_names(grid: CellGrid, k: int) -> tuple[int, list[str]]:
     return top, names
 
 
-def _needs_more(names: Sequence[str]) -> bool:
-    """Whether names leave open which run a column is: empty, the same twice, or nothing but directions, numbers and units."""
-    other = list(names[1:])
-    bare = all(way(name) is not None or name.isdigit() or _unit_in_cell(name) for name in other)
-    return not all(names) or len(set(other)) < len(other) or bare
-
-
-def _is_group(row: Sequence[str]) -> bool:
-    """Whether a row above the names may say what several columns have in common: runs, directions, deviations."""
-    cells = [cell for cell in row[1:] if cell]
-    return bool(cells) and not _has_number(row[:1]) and all(is_known_name(cell) for cell in cells)
-
-
-def _like(names: Sequence[str], row: Sequence[str], most: int) -> bool:
-    """Whether a row has the width of the header and mostly numbers (names of stations or axes may stand there too).
-
-    A row of about twice the width is let through, up to ``most``: decimal commas between commas, refused further on.
-    """
-    cells = _filled(row)
-    numbers = sum(parse_number(cell) is not None for cell in cells)
-    fits = len(names) < 2 * len(cells) and (len(cells) <= len(names) or 2 * len(names) - 1 <= len(cells) <= most)
-    return numbers >= 1 and fits and 3 * numbers >= len(cells)
-
-
 def _across(grid: CellGrid, k: int) -> _Layout | None:
     """Return the table of which row k is the first and whose targets go across, a row for each run; None if there is none."""
     row = grid.rows[k]
@@ -440,10 +406,19 @@ def _across(grid: CellGrid, k: int) -> _Layout | None:
     if not labels or len(numbers) < 2 or None in numbers[:2] or not row[0] or _is_comment(row):
         return None
     end = k + 1
-    while end < len(grid.rows) and _is_run_row(grid, end, labels):
+    while end < len(grid.rows) and grid.lines[end] == grid.lines[end - 1] + 1:
+        below = grid.rows[end]  # a run has a label and then numbers
+        if not _filled(below[:labels]) or not _has_number(below[labels:]) or _is_comment(below):
+            break
         end += 1
     cells = grid.rows[k:end]
-    names = _row_names(cells, labels)
+    # the first cells name a row: an empty one of several means the same as above, a bare number a run
+    names, last = [], [""] * labels
+    for own in cells:
+        cut = zip(own[:labels], last, strict=False)
+        last = [cell or (above if n < labels - 1 else "") for n, (cell, above) in enumerate(cut)]
+        parts = [f"run {cell}" if re.fullmatch(r"\d{1,3}(\.0)?", cell) else cell for cell in last]
+        names.append(" ".join(part.removesuffix(".0") for part in parts if part))
     count = sum(parse_number(cell) is not None for own in cells for cell in own[labels:])
     if (
         any(_is_position(name) for name in names[:3])
@@ -463,46 +438,19 @@ def _across(grid: CellGrid, k: int) -> _Layout | None:
     return _Layout(k, k, end, tuple(names), count, labels)
 
 
-def _is_run_row(grid: CellGrid, k: int, labels: int) -> bool:
-    """Whether row k has a label and then numbers, right below the row before."""
-    row = grid.rows[k]
-    follows = grid.lines[k] == grid.lines[k - 1] + 1
-    return follows and bool(_filled(row[:labels])) and _has_number(row[labels:]) and not _is_comment(row)
-
-
-def _row_names(rows: Sequence[Sequence[str]], labels: int) -> list[str]:
-    """Return the names of rows by their first cells; an empty one of several means the same as above, a bare number a run."""
-    names, last = [], [""] * labels
-    for row in rows:
-        last = [
-            cell or (above if n < labels - 1 else "")
-            for n, (cell, above) in enumerate(zip(row[:labels], last, strict=False))
-        ]
-        parts = [f"run {cell}" if re.fullmatch(r"\d{1,3}(\.0)?", cell) else cell for cell in last]
-        names.append(" ".join(part.removesuffix(".0") for part in parts if part))
-    return names
-
-
 def _turned(
     grid: CellGrid, layout: _Layout, metadata: dict[str, str], comments: dict[str, str], decimal: str | None
 ) -> Table:
     """Return a table with a row for each target from one with a column for each."""
     names = _single_names(grid, layout.names, grid.lines[layout.first])
     below = grid.rows[layout.first : layout.end]
-    width = max(len(_trimmed(row)) for row in below) - layout.labels
+    width = max(n for row in below for n, cell in enumerate(row, start=1) if cell) - layout.labels
     cells = [[row[layout.labels + n] if layout.labels + n < len(row) else "" for row in below] for n in range(width)]
     lines = [grid.lines[layout.first]] * width
     note = "the targets go across: each row of the file is a run"
     return _finished(
         replace(grid, notes=(*grid.notes, note)), names, cells, lines, lines[0], metadata, comments, decimal
     )
-
-
-def _trimmed(row: Sequence[str]) -> Sequence[str]:
-    end = len(row)
-    while end and not row[end - 1]:
-        end -= 1
-    return row[:end]
 
 
 def _check_beside(grid: CellGrid, start: int, end: int, least: int = 1) -> None:
@@ -584,7 +532,30 @@ def _table(
 ) -> Table:
     line = grid.lines[layout.first - 1 if not _are_units(grid.rows[layout.first - 1]) else layout.first - 2]
     names = _single_names(grid, layout.names, line)
-    rows, lines, notes = _rows_below(grid, names, layout.first)
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    notes: list[str] = []  # what is left out: statistics, and remarks below the table
+    for k, (row, at) in enumerate(
+        zip(grid.rows[layout.first :], grid.lines[layout.first :], strict=True), layout.first
+    ):
+        if not any(row) or row[0].startswith("#"):
+            continue
+        if rows and not _as(rows[0], row):
+            if at > lines[-1] + 1 + len(notes) or not _has_number(row):
+                for other, below in zip(grid.rows[k:], grid.lines[k:], strict=True):
+                    again = any(other) and not other[0].startswith("#") and _as(rows[0], other)
+                    if again and len(_filled(other)) >= len(names):
+                        message = f"rows of numbers follow again, below line {at} where the table ended: put each table into a"
+                        raise grid.fail(f"{message} file or sheet of its own", below)
+                _check_beside(grid, k, len(grid.rows))
+                notes.append(f"line {at} and everything below is not part of the table and was left out")
+                break
+            label = next(iter(_filled(row)))
+            if statistic_in(label) is not None and parse_number(rows[0][row.index(label)]) is not None:
+                notes.append(f"line {at}, {label!r}, is a statistic over the rows and was left out")
+                continue
+        rows.append(_fitted(grid, names, row, at))
+        lines.append(at)
     if not rows:
         raise grid.fail("has a header but no rows", line)
     return _finished(replace(grid, notes=(*grid.notes, *notes)), names, rows, lines, line, metadata, comments, decimal)
@@ -607,43 +578,6 @@ def _finished(
     return Table(grid, names, header_line, plain, lines, metadata, comments)
 
 
-def _rows_below(grid: CellGrid, names: Sequence[str], first: int) -> tuple[list[list[str]], list[int], list[str]]:
-    """Return rows, their lines, and remarks on what was left out: statistics, and remarks below the table.
-
-    Raises InputError if rows of numbers follow once more below the remarks: there is a second table.
-    """
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    notes: list[str] = []
-    for k, (row, line) in enumerate(zip(grid.rows[first:], grid.lines[first:], strict=True), start=first):
-        if not any(row) or row[0].startswith("#"):
-            continue
-        if rows and not _as(rows[0], row):
-            if line > lines[-1] + 1 + len(notes) or not _has_number(row):
-                _check_below(grid, names, rows[0], k)
-                return (
-                    rows,
-                    lines,
-                    [*notes, f"line {line} and everything below is not part of the table and was left out"],
-                )
-            label = next(iter(_filled(row)))
-            if statistic_in(label) is not None and parse_number(rows[0][row.index(label)]) is not None:
-                notes.append(f"line {line}, {label!r}, is a statistic over the rows and was left out")
-                continue
-        rows.append(_fitted(grid, names, row, line))
-        lines.append(line)
-    return rows, lines, notes
-
-
-def _check_below(grid: CellGrid, names: Sequence[str], first: Sequence[str], end: int) -> None:
-    """Refuse a second table below row ``end``, where the first one ended."""
-    for row, line in zip(grid.rows[end:], grid.lines[end:], strict=True):
-        if any(row) and not row[0].startswith("#") and _as(first, row) and len(_filled(row)) >= len(names):
-            message = f"rows of numbers follow again, below line {grid.lines[end]} where the table ended: put each table into a"
-            raise grid.fail(f"{message} file or sheet of its own", line)
-    _check_beside(grid, end, len(grid.rows))
-
-
 def _as(first: Sequence[str], row: Sequence[str]) -> bool:
     """Whether a row has numbers where the first row has them; an empty cell or the error of a spreadsheet may stand there."""
     numeric = [k for k, cell in enumerate(first) if parse_number(cell) is not None]
@@ -653,19 +587,15 @@ def _as(first: Sequence[str], row: Sequence[str]) -> bool:
 
 
 def _fitted(grid: CellGrid, names: Sequence[str], row: Sequence[str], line: int) -> list[str]:
-    if len(row) == len(names):
-        if max(map(len, row)) > MOST_CELL:
-            raise grid.fail(f"a cell has more than {MOST_CELL} characters", line)
-        return row  # type: ignore[return-value]
-    if len(_filled(row[len(names) :])):
+    if _filled(row[len(names) :]):
         hint = ""
         if len(row) >= 2 * len(names) - 1:
             hint = "; decimal commas and commas between columns cannot be told apart: save with semicolons or points"
         raise grid.fail(f"has {len(row)} cells, the header has {len(names)}{hint}", line)
-    cells = list(row[: len(names)])
-    if any(len(cell) > MOST_CELL for cell in cells):
+    cells = row if len(row) == len(names) else [*row[: len(names)], *[""] * (len(names) - len(row))]
+    if max(map(len, cells)) > MOST_CELL:
         raise grid.fail(f"a cell has more than {MOST_CELL} characters", line)
-    return cells + [""] * (len(names) - len(cells))
+    return cells  # type: ignore[return-value]
 
 
 # Excel workbooks (.xlsx): checked as archives before they are opened, then read row by row without formulas.
@@ -692,11 +622,22 @@ def read_sheets(path: Path, name: str | None = None) -> tuple[list[tuple[str, Ce
     """
     check_size(path, MOST_PACKED)
     _check_archive(path)
-    with _opened(path) as book:
-        hidden = [sheet.title for sheet in book.worksheets if sheet.sheet_state != "visible" and sheet.title != name]
-        if len(hidden) == len(book.worksheets):
-            hidden = []
-        found = [(sheet.title, _grid(path, sheet)) for sheet in book.worksheets if sheet.title not in hidden]
+    # reads .xlsx in a stream, without Excel; the one well-kept reader of that format; imported here: slow to load
+    from openpyxl import load_workbook
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # styles and extensions that it does not know do not matter
+            with closing(load_workbook(path, read_only=True, data_only=True, keep_links=False)) as book:
+                sheets = book.worksheets
+                hidden = [sheet.title for sheet in sheets if sheet.sheet_state != "visible" and sheet.title != name]
+                if len(hidden) == len(sheets):
+                    hidden = []
+                found = [(sheet.title, _grid(path, sheet)) for sheet in sheets if sheet.title not in hidden]
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # a damaged workbook shows as any of a dozen exceptions of three packages
+        raise InputError(f"is a damaged workbook: {type(error).__name__}: {error}"[:300], file=path) from error
     filled = [(name, grid) for name, grid in found if grid.rows]
     if not filled:
         raise InputError("is a workbook without any filled cell", file=path)
@@ -715,26 +656,6 @@ def chosen_sheet(path: Path, sheets: list[tuple[str, CellGrid]], name: str | Non
     return sheets[0] if len(sheets) == 1 else None
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open a workbook; whatever the reader trips over becomes an InputError."""
-    # reads .xlsx in a stream, without Excel; the one well-kept reader of that format; imported here: slow to load
-    from openpyxl import load_workbook
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # styles and extensions that it does not know do not matter
-            book = load_workbook(path, read_only=True, data_only=True, keep_links=False)
-            try:
-                yield book
-            finally:
-                book.close()
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # a damaged workbook shows as any of a dozen exceptions of three packages
-        raise InputError(f"is a damaged workbook: {type(error).__name__}: {error}"[:300], file=path) from error
-
-
 def _check_archive(path: Path) -> None:
     """Unpack every part once, in blocks, and count: what is declared may be wrong."""
     try:
@@ -748,33 +669,33 @@ def _check_archive(path: Path) -> None:
                 text = f"unpacks to {declared / MEGABYTE:.0f} MB in {len(members)} parts; at most "
                 raise InputError(f"{text}{MOST_UNPACKED / MEGABYTE:.0f} MB in {MOST_MEMBERS} are read", file=path)
             for member in members:
-                _check_member(path, archive, member)
+                ratio = member.file_size / max(1, member.compress_size)
+                if member.file_size > MEGABYTE and ratio > MOST_RATIO:
+                    message = f"{shown(member.filename)} unpacks to {ratio:.0f} times its size"
+                    raise InputError(f"{message}: it is not a measurement (a zip bomb?)", file=path)
+                if member.filename.startswith("xl/worksheets/") and member.file_size > MOST_SHEET:
+                    message = f"has a sheet of {member.file_size / MEGABYTE:.0f} MB unpacked; at most "
+                    message += f"{MOST_SHEET / MEGABYTE:.0f} MB are read"
+                    raise InputError(
+                        f"{message}: save that sheet as CSV, which is read up to a million rows", file=path
+                    )
+                if not member.filename.endswith((".xml", ".rels", ".vml")):
+                    continue
+                tail = b""
+                with archive.open(member) as stream:
+                    while block := stream.read(_BLOCK):
+                        seen = (tail + block).upper() if b"<!" in tail + block or b"<\0" in tail + block else b""
+                        if any(mark.upper() in seen for mark in _FORBIDDEN):
+                            raise InputError(
+                                f"{shown(member.filename)} declares XML entities; it is refused", file=path
+                            )
+                        tail = block[-64:]
     except InputError:
         raise
     except (zipfile.BadZipFile, OSError, ValueError, RuntimeError, NotImplementedError, EOFError) as error:
         raise InputError(f"is a damaged or cut workbook: {error}", file=path) from error
     except Exception as error:  # zlib.error and its kin
         raise InputError(f"is a damaged workbook: {type(error).__name__}", file=path) from error
-
-
-def _check_member(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
-    if member.file_size > MEGABYTE and member.file_size > MOST_RATIO * max(1, member.compress_size):
-        message = (
-            f"{shown(member.filename)} unpacks to {member.file_size / max(1, member.compress_size):.0f} times its size"
-        )
-        raise InputError(f"{message}: it is not a measurement (a zip bomb?)", file=path)
-    if member.filename.startswith("xl/worksheets/") and member.file_size > MOST_SHEET:
-        message = f"has a sheet of {member.file_size / MEGABYTE:.0f} MB unpacked; at most {MOST_SHEET / MEGABYTE:.0f} MB are read"
-        raise InputError(f"{message}: save that sheet as CSV, which is read up to a million rows", file=path)
-    if not member.filename.endswith((".xml", ".rels", ".vml")):
-        return
-    tail = b""
-    with archive.open(member) as stream:
-        while block := stream.read(_BLOCK):
-            seen = (tail + block).upper() if b"<!" in tail + block or b"<\0" in tail + block else b""
-            if any(mark.upper() in seen for mark in _FORBIDDEN):
-                raise InputError(f"{shown(member.filename)} declares XML entities; it is refused", file=path)
-            tail = block[-64:]
 
 
 def _grid(path: Path, sheet: Any) -> CellGrid:

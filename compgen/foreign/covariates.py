@@ -217,34 +217,28 @@ def times_of(
         ]
     numbers = [parse_number(cell) for cell in cells]
     if all(value is not None for value in numbers):
-        return _of_numbers(findings, column, np.array(numbers, dtype=np.float64), dated=time is None)
+        # seconds, minutes, ... by the unit; without one days of a spreadsheet, where all of them are of this century
+        values = np.array(numbers, dtype=np.float64)
+        given = findings.options.units.get("time")
+        unit = covariate_unit(given, "time") if given else column.unit
+        if given and unit is None:
+            raise InputError(f"{given!r} is not a unit of time; use {', '.join(S_PER_TIME)}", field="--unit time")
+        if unit in S_PER_TIME:
+            return values * S_PER_TIME[unit], None
+        days = [found for value in values if (found := serial_date(float(value))) is not None]
+        if len(days) < len(values):
+            what = "say --unit time=s (ms, min, h)" if time is not None else "it is not a date"
+            raise InputError(f"it holds numbers without a unit; {what}")
+        findings.notes.append(
+            f"the numbers in {shown(column.name)} are taken as days of a spreadsheet (1 is 1900-01-01)"
+        )
+        return _of_dates(findings, days)
     written = [read_date(cell) for cell in cells]
     wrong = next((k for k, item in enumerate(written) if item is None), None)
     if wrong is not None:
         line = findings.table.lines[wrong]
         raise InputError(f"{shown(cells[wrong])} is not a date or time (line {line})")
     return _of_dates(findings, [item for item in written if item is not None])
-
-
-def _of_numbers(
-    findings: TableFindings, column: NamedColumn, values: FloatArray, *, dated: bool
-) -> tuple[FloatArray | None, str | None]:
-    """Seconds, minutes, ... by the unit; without one days of a spreadsheet, where all of them are of this century."""
-    given = findings.options.units.get("time")
-    unit = covariate_unit(given, "time") if given else column.unit
-    if given and unit is None:
-        raise InputError(f"{given!r} is not a unit of time; use {', '.join(S_PER_TIME)}", field="--unit time")
-    if unit in S_PER_TIME:
-        return values * S_PER_TIME[unit], None
-    serial = [serial_date(float(value)) for value in values]
-    if all(item is not None for item in serial):
-        findings.notes.append(
-            f"the numbers in {shown(column.name)} are taken as days of a spreadsheet (1 is 1900-01-01)"
-        )
-        return _of_dates(findings, [item for item in serial if item is not None])
-    raise InputError(
-        "it holds numbers without a unit; " + ("it is not a date" if dated else "say --unit time=s (ms, min, h)")
-    )
 
 
 def _of_dates(findings: TableFindings, dates: Sequence[Written]) -> tuple[FloatArray | None, str | None]:
@@ -259,28 +253,21 @@ def _of_dates(findings: TableFindings, dates: Sequence[Written]) -> tuple[FloatA
             )
         return clock - clock[0], None
     order = order_of(dates, findings.options.dates)
-    if order is None:
-        return _in_any_order(findings, dates)
+    if order is None:  # times within one day do not depend on the order, others are asked about
+        days = sorted({tuple(sorted(day.date().isoformat() for day in date.days.values())) for date in dates})
+        found = f"{shown(dates[0].text)} may be {' or '.join(dict.fromkeys(days[0]))}"
+        if len(days) > 1:
+            findings.doubts.append(f"{found}; say --dates dmy, mdy or ymd")
+            return None, None
+        findings.notes.append(f"the date {found}: it is left out; say --dates dmy, mdy or ymd to keep it")
+        if any(date.clock_s is None for date in dates):
+            return None, None
+        clock = np.array([date.clock_s for date in dates], dtype=np.float64)
+        return clock - clock.min(), None
     at = [_seconds(date, order) for date in dates]
     first = int(np.argmin(at))
     clocked = all(date.clock_s is not None for date in dates)
     return (np.array(at) - at[first] if clocked else None), iso(dates[first], order)
-
-
-def _in_any_order(findings: TableFindings, dates: Sequence[Written]) -> tuple[FloatArray | None, str | None]:
-    """Dates whose order stays open: times within one day do not depend on it, others are asked for."""
-    days = sorted({tuple(sorted(day.date().isoformat() for day in date.days.values())) for date in dates})
-    shown_days = " or ".join(dict.fromkeys(days[0]))
-    if len(days) > 1:
-        findings.doubts.append(f"{shown(dates[0].text)} may be {shown_days}; say --dates dmy, mdy or ymd")
-        return None, None
-    findings.notes.append(
-        f"the date {shown(dates[0].text)} may be {shown_days}: it is left out; say --dates dmy, mdy or ymd to keep it"
-    )
-    if any(date.clock_s is None for date in dates):
-        return None, None
-    clock = np.array([date.clock_s for date in dates], dtype=np.float64)
-    return clock - clock.min(), None
 
 
 def _seconds(date: Written, order: Order) -> float:
@@ -328,17 +315,10 @@ STEADY_K = 1.0
 _QUOTED = re.compile(r"\"([^\"]{4,60})\"")
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """Temperatures of the whole test by contract name (degC), its date in ISO form if it is clear, and remarks."""
-
-    temperatures_c: Mapping[str, float]
-    measured_at: str | None
-    notes: tuple[str, ...]
-
-
-def surroundings_of(environment: Mapping[str, str], user_date: str, chosen: Order | None) -> Surroundings:
-    """Return what can be used of the section ENVIRONMENT and of the date in the user text.
+def surroundings_of(
+    environment: Mapping[str, str], user_date: str, chosen: Order | None
+) -> tuple[dict[str, float], str | None, list[str]]:
+    """Return temperatures of the whole test by contract name (degC), its date in ISO form if it is clear, and remarks.
 
     Parameters
     ----------
@@ -351,9 +331,13 @@ def surroundings_of(environment: Mapping[str, str], user_date: str, chosen: Orde
     unused = []
     for key, channel in _HEADER_CHANNELS.items():
         text = environment.get(key, "")
-        value = _steady_temperature(text)
-        if value is not None:
-            temperatures[channel] = value
+        words = text.split()
+        numbers = [value for word in words if (value := parse_number(word)) is not None]
+        # beginning and end count where both are usual in degC and close together; a third number is a code, 0 for degC
+        ends = numbers[:2] if len(numbers) == len(words) <= 3 and numbers[2:] in ([], [0.0]) else []
+        usual = bool(ends) and all(USUAL_C[0] <= value <= USUAL_C[1] for value in ends)
+        if usual and max(ends) - min(ends) <= STEADY_K:
+            temperatures[channel] = sum(ends) / len(ends)
         elif text:
             unused.append(f"{key} {shown(text)}")
     if unused:
@@ -366,21 +350,7 @@ def surroundings_of(environment: Mapping[str, str], user_date: str, chosen: Orde
             f"its software has the expansion coefficient {shown(environment['exp coeff'])}: if it compensated the material, "
             "the readings hold at 20 degC already; nothing is corrected here"
         )
-    return Surroundings(temperatures, at, tuple(notes))
-
-
-def _steady_temperature(text: str) -> float | None:
-    """Return the mean of beginning and end if both are usual in degC and close together (a third number is a code)."""
-    words = text.split()
-    numbers = [parse_number(word) for word in words]
-    known = [value for value in numbers if value is not None]
-    if not 1 <= len(words) <= 3 or len(known) != len(words):
-        return None
-    if len(known) == 3 and known[2] != 0.0:
-        return None
-    ends = known[:2]
-    usual = all(USUAL_C[0] <= value <= USUAL_C[1] for value in ends)
-    return sum(ends) / len(ends) if usual and max(ends) - min(ends) <= STEADY_K else None
+    return temperatures, at, notes
 
 
 def _date(stamps: str, user_date: str, chosen: Order | None) -> tuple[str | None, str | None]:
@@ -498,15 +468,12 @@ class _Reader:
     found: RowData = field(default_factory=RowData)
     reasons: dict[str, str] = field(default_factory=dict)
 
-    def _given(self, key: str) -> bool:
-        return key in self.findings.options.columns
-
     def _try(self, key: str, column: NamedColumn, take: Callable[[], Any]) -> Any:
         """Return what ``take`` makes of a column; a column that the user did not name is left out if it cannot be read."""
         try:
             taken = take()
         except InputError as error:
-            if self._given(key):
+            if key in self.findings.options.columns:
                 raise
             self.reasons[column.name] = f"line {error.line} {error.message}" if error.line else error.message
             return None
@@ -619,44 +586,38 @@ class _Reader:
         """Name the columns that were not used."""
         why = "the native format has no column for it" if once else "there is one value for several runs"
         unused = {}
+        other_fields = [column for key, column in self.findings.fields.items() if key not in _READINGS]
         for name in self.findings.table.header:
             column = split_name(name)
             if name in self.used or (name.startswith("column ") and not any(self.findings.table.column(name))):
                 continue
+            letters = re.sub(r"[^a-z]", "", column.word)
+            # a column whose name says what it holds, and that it is no reading, may be left out
+            understood = (
+                column in other_fields
+                or is_temperature(column)
+                or covariate_unit(column.unit or "") is not None
+                or any(word in letters for word in _HARMLESS)
+                or is_index(name)
+                or _OTHER_UNIT.search(name) is not None
+            )
             reason = self.reasons.get(name, why)
             if name in self.findings.options.ignore:
                 reason = LEFT_OUT
             elif name not in self.reasons and column.word in ("uncertainty", "unsicherheit", "u"):
                 reason = f"{reason}; a standard uncertainty (k = 1) of lengths is named by --map u_value=..."
-            elif name not in self.reasons and not self._has_known_name(column) and self.findings.is_numeric(name):
-                reason = self._not_understood(column)
+            elif name not in self.reasons and not understood and self.findings.is_numeric(name):
+                # what looks like data is never left out without a word of the user
+                reason = "it is not understood"
+                run = " --map run1-=... (a run and its direction)," if self.kind == "axis" else ""
+                self.findings.doubts.append(
+                    f"column {shown(name)} holds numbers and is not understood; say what it is, --map FIELD={name},{run} or "
+                    f"leave it out: --ignore {shown(name)}"
+                )
             unused[name] = reason
         if unused:
             self.findings.understood["not_used"] = unused
             self.findings.notes.append(f"not used: {', '.join(unused)}")
-
-    def _has_known_name(self, column: NamedColumn) -> bool:
-        """Whether the name of a column says what it holds, and that it is no reading: so it may be left out."""
-        words = re.sub(r"[^a-z]", "", column.word)
-        known = [field for key, field in self.findings.fields.items() if key not in _READINGS]
-        return (
-            column in known
-            or is_temperature(column)
-            or covariate_unit(column.unit or "") is not None
-            or any(word in words for word in _HARMLESS)
-            or is_index(column.name)
-            or _OTHER_UNIT.search(column.name) is not None
-        )
-
-    def _not_understood(self, column: NamedColumn) -> str:
-        """Ask about a column of numbers: what looks like data is never left out without a word of the user."""
-        run = " --map run1-=... (a run and its direction)," if self.kind == "axis" else ""
-        name = shown(column.name)
-        self.findings.doubts.append(
-            f"column {name} holds numbers and is not understood; say what it is, --map FIELD={column.name},{run} or leave it "
-            f"out: --ignore {name}"
-        )
-        return "it is not understood"
 
 
 def metadata_of(findings: TableFindings, row_data: RowData) -> dict[str, str]:
@@ -666,19 +627,16 @@ def metadata_of(findings: TableFindings, row_data: RowData) -> dict[str, str]:
     Temperatures, operator, instrument, its serial number and the expansion coefficient are kept where they are clear; a
     temperature above a table corrects nothing.
     """
-    comments = {key: _with_point(value) for key, value in findings.table.comments.items()}
+    comments = dict(findings.table.comments)
+    for key, text in comments.items():  # a number with a decimal comma becomes one with a point
+        value = parse_number(text) if text.count(",") == 1 and "." not in text else None
+        comments[key] = text if value is None else repr(value)
     above = {name: value for key, text in findings.table.metadata.items() for name, value in _fact(key, text).items()}
     at = row_data.measured_at or date_in_header(findings)
     if at:
         findings.understood["measured_at"] = at
     dated = {"measured_at": at, "date": at} if at else {}
     return {**above, **comments, "source": findings.table.grid.path.name, **dated}
-
-
-def _with_point(text: str) -> str:
-    """Return a number with a decimal comma as one with a point; other text stays."""
-    value = parse_number(text) if text.count(",") == 1 and "." not in text else None
-    return text if value is None else repr(value)
 
 
 def _fact(key: str, text: str) -> dict[str, str]:

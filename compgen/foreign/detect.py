@@ -17,7 +17,7 @@ from compgen.controls.etalon_exchange import errors_from_etalon, is_exchange_tex
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.csv_files import names_in_header
 from compgen.data.deviations import Deviations
-from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.error_table import ErrorTable
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.data.records import format_of_columns
 from compgen.errors import CompgenError, InputError
@@ -29,7 +29,6 @@ from compgen.foreign.findings import (
     USUAL_URAD,
     Imported,
     ImportOptions,
-    Kind,
     decades_off,
     unit_of_deviations,
     usual_deviation_mm,
@@ -65,18 +64,8 @@ MOST_EXCHANGE_BYTES = 16_000_000
 SLOPE_TOLERANCE = 0.01
 _SIGN_NOTE = "deviations are measured minus target (errors), as the maker's software has them"
 _USER_TEXT = (
-    "machine",
-    "serial no",
-    "date",
-    "by",
-    "axis",
-    "location",
-    "title",
-    "owner",
-    "version no",
-    "filetype",
-    "flags",
-)
+    "machine", "serial no", "date", "by", "axis", "location", "title", "owner", "version no", "filetype", "flags",
+)  # fmt: skip
 
 
 def import_renishaw(path: Path, options: ImportOptions) -> Imported:
@@ -84,20 +73,20 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     found = read_renishaw(path)
     angular = found.letter == "a"
     doubts: list[str] = []
-    found, zero = _without_zero_runs(found, options, doubts)
-    around = surroundings_of(found.beside.get("ENVIRONMENT", {}), found.keys.get("date", ""), options.dates)
-    notes = [
-        *found.notes,
-        *zero,
-        *around.notes,
-        _SIGN_NOTE,
-    ]
+    notes = list(found.notes)
+    if found.zero_runs and options.zero_runs != "keep":  # some programs fill a test in one direction up with such runs
+        named = f"run{'s' if len(found.zero_runs) > 1 else ''} {', '.join(map(str, found.zero_runs[:8]))}"
+        if found.one_way_test or options.zero_runs == "drop":
+            found = without_runs(found, found.zero_runs)
+            notes.append(f"{named}: zero at every target, left out as not made")
+        else:
+            doubts.append(f"{named}: zero at every target; say --zero-runs drop if not made, keep if measured")
+    temperatures, measured_at, about = surroundings_of(
+        found.beside.get("ENVIRONMENT", {}), found.keys.get("date", ""), options.dates
+    )
+    notes += [*about, _SIGN_NOTE]
     axis = options.axis or axis_in(found.keys.get("axis", "")) or _axis_of_name(path, notes)
-    runs, unit = _scaled(found, options, doubts, notes)
-    runs = _with_directions(found, runs, options, doubts)
-    if options.sign == "correction":
-        runs = runs.negated()
-        notes.append("the values were said to be corrections: their sign was turned round")
+    runs, unit = _in_si(found, options, doubts, notes)
     notes += remarks(runs, axis or "", angular=angular)
     understood = {
         "axis": axis,
@@ -109,42 +98,37 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
         "encoding": found.encoding,
         **{key: found.keys[key] for key in _USER_TEXT if found.keys.get(key)},
         **{section.lower(): dict(values) for section, values in found.beside.items()},
-        "measured_at": around.measured_at,
-        "temperatures_c": dict(around.temperatures_c) or None,
+        "measured_at": measured_at,
+        "temperatures_c": temperatures or None,
     }
-    metadata = {"source": path.name}
-    if around.measured_at:
-        metadata |= {"measured_at": around.measured_at, "date": around.measured_at}
-    runs = replace(runs, covariates={k: np.full(len(runs.value), c) for k, c in around.temperatures_c.items()})
+    runs = replace(runs, covariates={k: np.full(len(runs.value), c) for k, c in temperatures.items()})
     error = None
     if found.letter != "l" or options.error is not None:
         error = _error_named(path, axis, options, doubts, angular=angular)
     elif axis is None:
         named = f" ('{found.keys['axis']}')" if found.keys.get("axis") else ""
         doubts.append(f"the file does not say X, Y or Z{named}; give --axis")
-    data, reversal = _of_runs(path, runs, axis, error, metadata)
-    kind: Kind = "axis" if error is None else "errors"
-    return Imported(path, "renishaw", kind, data, understood, tuple(doubts), tuple(notes), reversal)
+    return _imported(path, "renishaw", runs, error, understood, doubts, notes)
 
 
-def _of_runs(
-    path: Path, runs: OneAxis, axis: str | None, error: str | None, metadata: dict[str, str]
-) -> tuple[AxisRuns | ErrorTable, ReversalCurves | None]:
+def _imported(
+    path: Path,
+    form: str,
+    runs: OneAxis,
+    error: str | None,
+    understood: dict[str, object],
+    doubts: list[str],
+    notes: list[str],
+) -> Imported:
     """Readings along an axis as runs, or as the error that they are, with its reversal."""
+    at, metadata = understood.get("measured_at"), {"source": path.name}
+    if at:
+        metadata |= {"measured_at": str(at), "date": str(at)}
+    said = (understood, tuple(doubts), tuple(notes))
     if error is None:
-        return runs_of({axis or "": runs}, str(path), metadata), None
-    return errors_of(runs, error, metadata)
-
-
-def _without_zero_runs(found: Renishaw, options: ImportOptions, doubts: list[str]) -> tuple[Renishaw, list[str]]:
-    """Leave out runs of zeros that stand for runs never made; some programs fill a test in one direction up with them."""
-    if not found.zero_runs or options.zero_runs == "keep":
-        return found, []
-    named = f"run{'s' if len(found.zero_runs) > 1 else ''} {', '.join(map(str, found.zero_runs[:8]))}"
-    if found.one_way_test or options.zero_runs == "drop":
-        return without_runs(found, found.zero_runs), [f"{named}: zero at every target, left out as not made"]
-    doubts.append(f"{named}: zero at every target; say --zero-runs drop if not made, keep if measured")
-    return found, []
+        return Imported(path, form, "axis", runs_of({str(understood["axis"] or ""): runs}, str(path), metadata), *said)
+    data, reversal = errors_of(runs, error, metadata)
+    return Imported(path, form, "errors", data, *said, reversal)
 
 
 def _axis_of_name(path: Path, notes: list[str]) -> str | None:
@@ -168,8 +152,8 @@ def _error_named(path: Path, axis: str | None, options: ImportOptions, doubts: l
         raise InputError(error.message, file=path, field="--error") from error
 
 
-def _scaled(found: Renishaw, options: ImportOptions, doubts: list[str], notes: list[str]) -> tuple[OneAxis, str]:
-    """Readings in mm or rad; the unit of the type is compared with the size of the numbers."""
+def _in_si(found: Renishaw, options: ImportOptions, doubts: list[str], notes: list[str]) -> tuple[OneAxis, str]:
+    """Errors in mm or rad with their directions, and the unit; that of the type is compared with the size of the numbers."""
     angular = found.letter == "a"
     units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
     usual = 1e-5 if angular else usual_deviation_mm(float(np.ptp(found.runs.position_mm)))
@@ -187,22 +171,23 @@ def _scaled(found: Renishaw, options: ImportOptions, doubts: list[str], notes: l
         )
     elif not given:
         notes.append(f"by the size of the numbers {judged.text()}")
-    return replace(found.runs, value=found.runs.value * units[unit]), unit
-
-
-def _with_directions(found: Renishaw, runs: OneAxis, options: ImportOptions, doubts: list[str]) -> OneAxis:
+    runs = replace(found.runs, value=found.runs.value * units[unit])
     if options.directions == "alternate":
         _, order = np.unique(found.one_way, return_inverse=True)
         direction = np.where(order % 2 == 0, 1, -1).astype(np.int64)
-        return replace(runs, direction=direction, run=cycles(direction, found.one_way), in_time=False)
-    if found.sorted_rows and options.directions is None:
-        doubts.append(
-            "its flags say runs in both directions, but every run lists the targets in the same order; give --directions "
-            "alternate (odd runs up, even runs down) or motion"
-        )
-    if not runs.direction.all():
-        doubts.append("a run has a single target: its direction is not known")
-    return runs
+        runs = replace(runs, direction=direction, run=cycles(direction, found.one_way), in_time=False)
+    else:
+        if found.sorted_rows and options.directions is None:
+            doubts.append(
+                "its flags say runs in both directions, but every run lists the targets in the same order; give --directions "
+                "alternate (odd runs up, even runs down) or motion"
+            )
+        if not runs.direction.all():
+            doubts.append("a run has a single target: its direction is not known")
+    if options.sign == "correction":
+        runs = runs.negated()
+        notes.append("the values were said to be corrections: their sign was turned round")
+    return runs, unit
 
 
 def _facts(runs: OneAxis, *, angular: bool) -> dict[str, object]:
@@ -242,56 +227,48 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
         "offset_mm": found.offset_mm,
         "instrument": found.keys.get("REF_PV"),
     }
-    metadata = {"source": path.name}
     error = None if options.error is None else _error_named(path, axis, options, doubts, angular=False)
-    data, reversal = _of_runs(path, runs, axis, error, metadata)
-    kind: Kind = "axis" if error is None else "errors"
-    return Imported(path, "ecmc-iso230", kind, data, understood, tuple(doubts), tuple(notes), reversal)
+    return _imported(path, "ecmc-iso230", runs, error, understood, doubts, notes)
 
 
 def import_exchange(path: Path, options: ImportOptions) -> Imported:
     """Import an Etalon exchange file, variant Vendor: errors in mm and rad, as they stand."""
     source = read_source(path, most=MOST_EXCHANGE_BYTES)
-    table, units = _in_units(errors_from_etalon(source.text, path), options)
-    notes = [
-        f"lengths are {units['linear']} and angles {units['angle']}; squareness in the convention of ISO 230-1 (reference X)"
-    ]
-    if options.sign == "correction":
-        curves = {name: replace(curve, value=-curve.value) for name, curve in table.curves.items()}
-        table = table.replace(curves=curves, squareness={k: (-v, u) for k, (v, u) in table.squareness.items()})
-        notes.append("the values were said to be corrections: their sign was turned round")
-    understood = {
-        "errors": list(table.names),
-        "ranges_mm": {name: [float(c.position_mm[0]), float(c.position_mm[-1])] for name, c in table.curves.items()},
-        "points": {name: len(curve.position_mm) for name, curve in table.curves.items()},
-        "largest_um_urad": {
-            **{n: float(np.max(np.abs(c.value))) * (1e3 if n[1] in "XYZ" else 1e6) for n, c in table.curves.items()},
-            **{name: abs(value) * 1e6 for name, (value, _) in table.squareness.items()},
-        },
-        "unit": f"{units['linear']}, {units['angle']}",
-        "sign": "errors" if options.sign != "correction" else "corrections, turned round",
-        "instrument": "laser tracer software (Etalon exchange)",
-    }
-    kind: Kind = "errors"
-    return Imported(path, "etalon-exchange", kind, table, understood, tuple(_absurd(table, options)), tuple(notes))
-
-
-def _in_units(table: ErrorTable, options: ImportOptions) -> tuple[ErrorTable, dict[str, str]]:
-    """Return the errors in the units that the user says, and those units; the format has mm and rad."""
-    units = {"linear": "mm", "angle": "rad"}
-    scales = {}
+    table, units, scales = errors_from_etalon(source.text, path), {"linear": "mm", "angle": "rad"}, {}
     for kind, known in (("linear", MM_PER_LENGTH), ("angle", RAD_PER_ANGLE)):
         given = options.units.get(kind)
         unit = known_unit(given) if given else units[kind]
         if unit not in known:
             raise InputError(f"{given!r} is not a unit of it; use {', '.join(known)}", field=f"--unit {kind}")
         units[kind], scales[kind] = str(unit), known[str(unit)]
+    sign = -1.0 if options.sign == "correction" else 1.0
     curves = {
-        name: replace(curve, value=curve.value * scales["linear" if error_named(name).kind == "linear" else "angle"])
+        name: replace(
+            curve, value=sign * curve.value * scales["linear" if error_named(name).kind == "linear" else "angle"]
+        )
         for name, curve in table.curves.items()
     }
-    squareness = {name: (value * scales["angle"], u) for name, (value, u) in table.squareness.items()}
-    return table.replace(curves=curves, squareness=squareness), units
+    squareness = {name: (sign * value * scales["angle"], u) for name, (value, u) in table.squareness.items()}
+    table = table.replace(curves=curves, squareness=squareness)
+    notes = [
+        f"lengths are {units['linear']} and angles {units['angle']}; squareness in the convention of ISO 230-1 (reference X)"
+    ]
+    if options.sign == "correction":
+        notes.append("the values were said to be corrections: their sign was turned round")
+    understood = {
+        "errors": list(table.names),
+        "ranges_mm": {name: [float(c.position_mm[0]), float(c.position_mm[-1])] for name, c in curves.items()},
+        "points": {name: len(curve.position_mm) for name, curve in curves.items()},
+        "largest_um_urad": {
+            **{n: float(np.max(np.abs(c.value))) * (1e3 if n[1] in "XYZ" else 1e6) for n, c in curves.items()},
+            **{name: abs(value) * 1e6 for name, (value, _) in table.squareness.items()},
+        },
+        "unit": f"{units['linear']}, {units['angle']}",
+        "sign": "errors" if options.sign != "correction" else "corrections, turned round",
+        "instrument": "laser tracer software (Etalon exchange)",
+    }
+    doubts = tuple(_absurd(table, options))
+    return Imported(path, "etalon-exchange", "errors", table, understood, doubts, tuple(notes))
 
 
 def _absurd(table: ErrorTable, options: ImportOptions) -> list[str]:
@@ -321,9 +298,8 @@ def import_capture(path: Path, options: ImportOptions) -> Imported:
     understood |= {key: found.keys[key] for key in ("machine", "serial no", "date", "velocity") if found.keys.get(key)}
     at, against = header_date(found.keys.get("date", ""), options.dates)
     understood["measured_at"] = at
-    keys = {key: value for key, value in found.keys.items() if key != "date"} | (
-        {"measured_at": at, "date": at} if at else {}
-    )
+    keys = {key: value for key, value in found.keys.items() if key != "date"}
+    keys |= {"measured_at": at, "date": at} if at else {}
     notes = ("a capture over time has no targets: no other command computes from it", *([against] if against else []))
     return Imported(path, "renishaw-capture", "capture", replace(found, keys=keys), understood, (), notes)
 
@@ -397,8 +373,19 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
     """
     source, chosen = Path(path), options or ImportOptions()
     form = form_of(source)
-    _check_options(source, form, chosen)
-    item = READERS[form](source, chosen)
+    # an option that is silently ignored would mislead
+    for name, flag in _FLAGS.items():
+        if getattr(chosen, name) and name not in _TAKES[form]:
+            taken = ", ".join(_FLAGS[key] for key in _TAKES[form]) or "none"
+            raise InputError(f"does not apply to a file of the format {form}; {taken} do", file=source, field=flag)
+    for key in chosen.units:
+        if form == "renishaw" and key not in ("value", "deviation"):
+            raise InputError("of this format only the unit of the values is open", file=source, field=f"--unit {key}")
+        if form == "etalon-exchange" and key not in ("linear", "angle"):
+            raise InputError("say linear= or angle= for this format", file=source, field=f"--unit {key}")
+        if key not in ("value", "linear", "angle"):
+            check_field(key, "--unit")
+    item = import_table(grid_of_text(read_source(source)), chosen) if form == "table" else READERS[form](source, chosen)
     if not item.doubts and isinstance(item.data, AxisRuns | Deviations):
         check_largest(item.data.deviation_mm, item.data.origin)
     # refuse a name after --ignore that is neither a column nor a sheet: it would hide what the user meant
@@ -409,25 +396,6 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
     if chosen.kind is not None and item.kind != chosen.kind:
         raise InputError(f"holds {item.kind}, not {chosen.kind}", file=source, field="--kind")
     return item
-
-
-def _check_options(path: Path, form: str, options: ImportOptions) -> None:
-    """Refuse what a format cannot take, and names that are none: an option that is silently ignored misleads."""
-    for name, flag in _FLAGS.items():
-        if getattr(options, name) and name not in _TAKES[form]:
-            taken = ", ".join(_FLAGS[key] for key in _TAKES[form]) or "none"
-            raise InputError(f"does not apply to a file of the format {form}; {taken} do", file=path, field=flag)
-    for key in options.units:
-        if form == "renishaw" and key not in ("value", "deviation"):
-            raise InputError("of this format only the unit of the values is open", file=path, field=f"--unit {key}")
-        if form == "etalon-exchange" and key not in ("linear", "angle"):
-            raise InputError("say linear= or angle= for this format", file=path, field=f"--unit {key}")
-        if key not in ("value", "linear", "angle"):
-            check_field(key, "--unit")
-
-
-def _import_text(path: Path, options: ImportOptions) -> Imported:
-    return import_table(grid_of_text(read_source(path)), options)
 
 
 def _import_workbook(path: Path, options: ImportOptions) -> Imported:
@@ -474,5 +442,4 @@ READERS: dict[str, Callable[[Path, ImportOptions], Imported]] = {
     "ecmc-iso230": import_ecmc,
     "etalon-exchange": import_exchange,
     "xlsx": _import_workbook,
-    "table": _import_text,
 }

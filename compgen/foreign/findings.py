@@ -293,7 +293,6 @@ class LengthGeometry:
 
     mm_per_unit: float
     sign: int
-    rms_mm: float
 
 
 def judge_lengths(position_mm: FloatArray, length: FloatArray) -> LengthGeometry | None:
@@ -323,8 +322,7 @@ def judge_lengths(position_mm: FloatArray, length: FloatArray) -> LengthGeometry
     distance = k * read + linear / (2.0 * k)
     if not (np.all(distance > 0) or np.all(distance < 0)):
         return None
-    rms = float(np.sqrt(np.mean((design @ found - np.sum(p**2, axis=1)) ** 2)))
-    return LengthGeometry(k * size / scale, 1 if distance[0] > 0 else -1, rms * size)
+    return LengthGeometry(k * size / scale, 1 if distance[0] > 0 else -1)
 
 
 # What is found out about one table while it is read: the units that count, what was understood, what is in doubt.
@@ -381,21 +379,20 @@ class TableFindings:
         unit = self.given_unit(key) or self.given_unit("position") or self.fields[key].unit
         if unit is None:
             judged = unit_of_positions(float(np.ptp(values)))
-            inches = self._inches()
+            # positions are probably in inches too where another field is
+            said = {key: known_unit(unit) for key, unit in self.options.units.items()}
+            said |= {shown(column.name): column.unit for column in self.fields.values() if column.unit}
+            inches = next((key for key, unit in said.items() if unit in ("in", "mil")), None)
             if inches and judged.best != "in":
                 self.doubts.append(
                     f"{inches} is in inches, and the file gives no unit of {key}; give --unit {key}=in or mm"
                 )
             unit = judged.best if inches else self._weighed(f"unit of {key}", judged)
-        self._length(unit, key)
+        if unit not in MM_PER_LENGTH:
+            message = f"{unit} is not a unit of length; expected positions of a linear axis"
+            raise self.table.grid.fail(message, None, self.fields[key].name)
         self.understood.setdefault("position_unit", unit)
         return values * MM_PER_LENGTH[unit]
-
-    def _inches(self) -> str | None:
-        """Return the first field that is said to be in inches; positions are then probably so too."""
-        said = {key: known_unit(unit) for key, unit in self.options.units.items()}
-        said |= {shown(column.name): column.unit for column in self.fields.values() if column.unit}
-        return next((key for key, unit in said.items() if unit in ("in", "mil")), None)
 
     def values_si(self, key: str, name: str, values: FloatArray, usual_si: float, *, angular: bool) -> FloatArray:
         """Return deviations in mm or rad: by the user's word, the column's name, else by their size.
@@ -405,7 +402,14 @@ class TableFindings:
         units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
         column = self.fields.get(key)
         given = self.given_unit(key, value=True)
-        unit = given or (column.unit if column else None) or self._unit_in(name)
+        unit = given or (column.unit if column else None)
+        if unit is None:  # above the table: ``Unit: um``, or the only unit in the lines that speak of deviations
+            above = self.table.metadata
+            said = next((text for key, text in above.items() if key in ("unit", "units", "einheit")), None)
+            lines = [line for key, text in above.items() if is_deviation(line := f"{key} {text}")]
+            parts = [said] if said else ["".join(part) for line in lines for part in _UNIT_IN_TEXT.findall(line)]
+            found = {known_unit(part) for part in parts}
+            unit = found.pop() if len(found) == 1 else None
         judged = unit_of_deviations(values, _ANGLES if angular else _LENGTHS, usual_si)
         if unit is None:
             unit = self._weighed(f"unit of {key}", judged)
@@ -418,18 +422,6 @@ class TableFindings:
         self.understood["unit"] = unit
         return values * units[unit]
 
-    def _unit_in(self, name: str) -> str | None:
-        """Return the unit above the table: ``Unit: um``, or the one in a line that speaks of deviations, if it is one."""
-        metadata = self.table.metadata
-        from_metadata = next((v for k, v in metadata.items() if k in ("unit", "units", "einheit")), None)
-        if from_metadata:
-            return known_unit(from_metadata)
-        lines = [f"{key} {text}" for key, text in metadata.items()]
-        found = {
-            known_unit("".join(part)) for line in lines if is_deviation(line) for part in _UNIT_IN_TEXT.findall(line)
-        }
-        return found.pop() if len(found - {None}) == 1 and len(found) == 1 else None
-
     def _weighed(self, what: str, judged: UnitVerdict) -> str:
         key = what.rpartition(" ")[2]
         if judged.sure:
@@ -437,9 +429,3 @@ class TableFindings:
         else:
             self.doubts.append(f"the file gives no {what} ({judged.text()}); give --unit {key}=...")
         return judged.best
-
-    def _length(self, unit: str, key: str) -> None:
-        if unit not in MM_PER_LENGTH:
-            raise self.table.grid.fail(
-                f"{unit} is not a unit of length; expected positions of a linear axis", None, self.fields[key].name
-            )

@@ -29,11 +29,7 @@ from compgen.foreign.source import ENCODINGS_EAST, HEAD_BYTES, Text, check_size,
 #: What the deviations are by the letter of the file type; the unit does not stand in the file.
 UNITS = {"l": "um", "a": "mrad", "s": "um"}
 SUFFIXES = {".rtl": "l", ".rta": "a", ".rts": "s"}
-REFUSED = {
-    ".rtf": "flatness",
-    ".rtp": "squareness",
-    ".rtr": "a rotary axis",
-}
+REFUSED = {".rtf": "flatness", ".rtp": "squareness", ".rtr": "a rotary axis"}
 #: Fifty runs of 10000 targets.
 MOST_RENISHAW_BYTES = 16_000_000
 MOST_TARGETS, MOST_RUNS = 100_000, 1_000
@@ -98,7 +94,30 @@ def read_renishaw(path: Path) -> Renishaw:
     for number, line in enumerate(source.text.split("\n"), start=1):
         _take_line(source, found, number, line)
     _check_end(source, found)
-    return _renishaw_of_file(source, found)
+    letter = _letter(source, found)
+    targets = np.array(found.targets)
+    numbers, run, target = (np.array([row[k] for row in found.rows], dtype=np.int64) for k in range(3))
+    position = targets[target - 1]
+    direction = motion(position, run)
+    alternating = bool(len(np.unique(run)) > 1 and len(np.unique(direction)) == 1)
+    value = np.array([row[3] for row in found.rows])
+    notes = []
+    if found.commas:
+        notes.append("decimal commas were read as decimal points")
+    if not found.complete:
+        notes.append("there is no end mark EOF::; all declared readings are there")
+    if source.encoding not in ("utf-8", "utf-8-sig"):
+        notes.append(f"is not UTF-8; user text was read as {source.encoding}")
+    if found.unread:
+        notes.append(f"{len(found.unread)} lines in {' and '.join(BESIDE)} without a key were not used")
+    flags = found.keys.get("flags", "").split()
+    runs = OneAxis(position, direction, cycles(direction, run), value, numbers, in_time=bool(np.all(np.diff(run) >= 0)))
+    two_ways = flags[:2] == ["0", "0"] and alternating
+    numbered = np.unique(run).tolist()
+    zero = tuple(number for number in numbered if not value[run == number].any()) if value.any() else ()
+    return Renishaw(
+        letter, runs, found.keys, source.encoding, tuple(notes), run, two_ways, found.beside, zero, flags[1:2] == ["1"]
+    )
 
 
 def _take_line(source: Text, found: _File, number: int, line: str) -> None:
@@ -123,20 +142,16 @@ def _take_line(source: Text, found: _File, number: int, line: str) -> None:
         found.keys.setdefault(key.group(1).lower(), key.group(2).strip())
         return
     if found.reading == "targets":
-        _take_targets(source, found, number, line)
+        for word in line.split():
+            value = parse_number(word)
+            if value is None:
+                raise source.fail(f"expected a target position, found {shown(word)}", number, "TARGET DATA")
+            found.commas = found.commas or "," in word
+            found.targets.append(value)
+        if len(found.targets) > MOST_TARGETS:
+            raise source.fail(f"has more than {MOST_TARGETS} targets", number, "TARGET DATA")
     elif found.reading == "run target data" and line.split():
         found.rows.append(_row(source, found, number, line))
-
-
-def _take_targets(source: Text, found: _File, number: int, line: str) -> None:
-    for word in line.split():
-        value = parse_number(word)
-        if value is None:
-            raise source.fail(f"expected a target position, found {shown(word)}", number, "TARGET DATA")
-        found.commas = found.commas or "," in word
-        found.targets.append(value)
-    if len(found.targets) > MOST_TARGETS:
-        raise source.fail(f"has more than {MOST_TARGETS} targets", number, "TARGET DATA")
 
 
 def _row(source: Text, found: _File, number: int, line: str) -> tuple[int, int, int, float]:
@@ -191,42 +206,11 @@ def _check_end(source: Text, found: _File) -> None:
         raise source.fail("ends in the middle of a line, without an end mark: it was cut", found.rows[-1][0])
 
 
-def _renishaw_of_file(source: Text, found: _File) -> Renishaw:
-    letter = _letter(source, found)
-    targets = np.array(found.targets)
-    numbers, run, target = (np.array([row[k] for row in found.rows], dtype=np.int64) for k in range(3))
-    position = targets[target - 1]
-    direction = motion(position, run)
-    alternating = bool(len(np.unique(run)) > 1 and len(np.unique(direction)) == 1)
-    value = np.array([row[3] for row in found.rows])
-    notes = []
-    if found.commas:
-        notes.append("decimal commas were read as decimal points")
-    if not found.complete:
-        notes.append("there is no end mark EOF::; all declared readings are there")
-    if source.encoding not in ("utf-8", "utf-8-sig"):
-        notes.append(f"is not UTF-8; user text was read as {source.encoding}")
-    if found.unread:
-        notes.append(f"{len(found.unread)} lines in {' and '.join(BESIDE)} without a key were not used")
-    flags = found.keys.get("flags", "").split()
-    runs = OneAxis(position, direction, cycles(direction, run), value, numbers, in_time=bool(np.all(np.diff(run) >= 0)))
-    two_ways = flags[:2] == ["0", "0"] and alternating
-    numbered = np.unique(run).tolist()
-    zero = tuple(number for number in numbered if not value[run == number].any()) if value.any() else ()
-    return Renishaw(
-        letter, runs, found.keys, source.encoding, tuple(notes), run, two_ways, found.beside, zero, flags[1:2] == ["1"]
-    )
-
-
 def without_runs(found: Renishaw, numbers: tuple[int, ...]) -> Renishaw:
     """Return a file without some of its one-way runs."""
     keep = ~np.isin(found.one_way, numbers)
-    one_way, old = found.one_way[keep], found.runs
-    direction = old.direction[keep]
-    runs = OneAxis(
-        old.position_mm[keep], direction, cycles(direction, one_way), old.value[keep], old.line[keep], {}, old.in_time
-    )
-    return replace(found, runs=runs, one_way=one_way)
+    kept, one_way = found.runs.rows(np.flatnonzero(keep)), found.one_way[keep]
+    return replace(found, runs=replace(kept, run=cycles(kept.direction, one_way)), one_way=one_way)
 
 
 def _letter(source: Text, found: _File) -> str:
@@ -310,7 +294,25 @@ def read_ecmc(path: Path) -> Ecmc:
     if not source.ended and len(decimals) > 2 and decimals[-1] < min(decimals[len(keys) : -1], default=0):
         raise source.fail("the last line has no line end and fewer decimals than all others: it was cut")
     _check_complete(source, keys, targets, readings)
-    return _ecmc_of_assignments(source, keys, targets, list(readings.values()))
+    unit = keys.get("UNIT", "mm").lower().replace("\u00b5", "u").replace("\u03bc", "u")
+    if unit not in MM_PER:
+        raise source.fail(
+            f"UNIT={shown(unit)} is not a unit of length; use {', '.join(MM_PER)} (linear axes)", field="UNIT"
+        )
+    scale = MM_PER[unit]
+    order = [targets[k][0] for k in sorted(targets)]
+    steps = np.sign(np.diff(order))
+    if not (np.all(steps == steps[0]) and steps[0] != 0):
+        raise source.fail("the targets neither ascend nor descend; the directions cannot be told")
+    # a cycle goes through the targets in their order (FWD) and back (BWD); the file lists all FWD before all BWD
+    rows = sorted(readings.values(), key=lambda item: (item.cycle, -item.way, item.way * item.target))
+    position = np.array([targets[item.target][0] for item in rows]) * scale
+    actual = np.array([item.value for item in rows]) * scale
+    # the direction of FWD is that of the motion, whatever its name says
+    way, cycle, at = np.array([(item.way, item.cycle, item.line) for item in rows], dtype=np.int64).T
+    slope, offset = np.polyfit(position, actual, 1).tolist()
+    runs = OneAxis(position, way * int(steps[0]), cycle, actual - position, at, in_time=True)
+    return Ecmc(runs, keys, slope, offset)
 
 
 def _take(
@@ -370,31 +372,6 @@ def _check_complete(
         raise source.fail(f"a reading of target {strange.target}, which has no TGT_DATA", strange.line)
     if len(targets) < 2 or not readings:
         raise source.fail("holds fewer than two targets with readings")
-
-
-def _ecmc_of_assignments(
-    source: Text, keys: Mapping[str, str], targets: Mapping[int, tuple[float, int]], readings: list[_Reading]
-) -> Ecmc:
-    unit = keys.get("UNIT", "mm").lower().replace("\u00b5", "u").replace("\u03bc", "u")
-    if unit not in MM_PER:
-        raise source.fail(
-            f"UNIT={shown(unit)} is not a unit of length; use {', '.join(MM_PER)} (linear axes)", field="UNIT"
-        )
-    scale = MM_PER[unit]
-    order = [targets[k][0] for k in sorted(targets)]
-    steps = np.sign(np.diff(order))
-    if not (np.all(steps == steps[0]) and steps[0] != 0):
-        raise source.fail("the targets neither ascend nor descend; the directions cannot be told")
-    # a cycle goes through the targets in their order (FWD) and back (BWD); the file lists all FWD before all BWD
-    readings = sorted(readings, key=lambda item: (item.cycle, -item.way, item.way * item.target))
-    position = np.array([targets[item.target][0] for item in readings]) * scale
-    actual = np.array([item.value for item in readings]) * scale
-    # the direction of FWD is that of the motion, whatever its name says
-    way = np.array([item.way for item in readings], dtype=np.int64) * int(steps[0])
-    slope, offset = np.polyfit(position, actual, 1).tolist()
-    cycle = np.array([item.cycle for item in readings], dtype=np.int64)
-    line = np.array([item.line for item in readings], dtype=np.int64)
-    return Ecmc(OneAxis(position, way, cycle, actual - position, line, in_time=True), keys, slope, offset)
 
 
 # Dynamic captures of a laser interferometer (.rtx): displacement over time, no targets.
@@ -500,8 +477,5 @@ def format_capture(capture: Capture) -> str:
     return format_csv(
         {"time_s": time_s, f"value_{capture.unit}": np.asarray(capture.value)},
         dict(capture.keys),
-        {
-            "time_s": 9,
-            f"value_{capture.unit}": 9,
-        },
+        {"time_s": 9, f"value_{capture.unit}": 9},
     )

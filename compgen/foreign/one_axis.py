@@ -53,14 +53,15 @@ class OneAxis:
         """
         usual = np.lexsort((self.position_mm * self.direction, -self.direction, self.run))
         if "time_s" in self.covariates and np.isfinite(self.covariates["time_s"]).all():
-            return self._rows(np.argsort(self.covariates["time_s"], kind="stable"))
+            return self.rows(np.argsort(self.covariates["time_s"], kind="stable"))
         if not self.in_time or not self.direction.all():
-            return self._rows(usual) if self.direction.all() else self
+            return self.rows(usual) if self.direction.all() else self
         if np.array_equal(usual, np.arange(len(usual))):
             return self
         return replace(self, covariates={**self.covariates, "order": np.arange(1.0, len(usual) + 1)})
 
-    def _rows(self, rows: IntArray) -> OneAxis:
+    def rows(self, rows: IntArray) -> OneAxis:
+        """Return some of the readings, in the given order."""
         return replace(
             self,
             position_mm=self.position_mm[rows],
@@ -172,36 +173,32 @@ def remarks(runs: OneAxis, axis: str, *, angular: bool) -> list[str]:
     _, target = np.unique(keys, return_inverse=True)
     _, one_way = np.unique(2 * runs.run + (runs.direction < 0), return_inverse=True)
     table = np.full((one_way.max() + 1, target.max() + 1), np.nan)
-    table[one_way.ravel(), target.ravel()] = runs.value
+    table[one_way, target] = runs.value
     empty = int(np.isnan(table).sum())
     if empty and len(runs.value) > table.size // 2:
         row, column = np.argwhere(np.isnan(table))[0]
         at = runs.targets_mm[column]
         what = "reading is" if empty == 1 else "readings are"
         found.append(f"{name}: {empty} of {table.size} {what} missing, the first in one-way run {row + 1} at {at:g} mm")
-    return found + _outlier(runs, name, angular=angular) + _copies(runs, name, table, one_way.ravel())
-
-
-def _outlier(runs: OneAxis, name: str, *, angular: bool) -> list[str]:
-    """Name the reading that is furthest from the median, if it is far beyond what the others spread over (0.1 mm, mrad)."""
     away = np.abs(runs.value - np.median(runs.value))
     worst = int(np.argmax(away))
-    if len(away) < 3 or away[worst] < max(_NOTABLE, _FAR * float(np.quantile(np.delete(away, worst), 0.9))):
-        return []
-    at, value = runs.position_mm[worst], runs.value[worst]
-    size = f"{value / RAD_PER_URAD:.5g} urad" if angular else f"{value / MM_PER_UM:.5g} um"
-    return [f"{name}: {size} at {at:g} mm, line {runs.line[worst]}, is far from all others; a slip?"]
-
-
-def _copies(runs: OneAxis, name: str, table: FloatArray, one_way: IntArray) -> list[str]:
-    """Name runs in the same direction whose values at three targets or more are equal to the last digit, but not all alike."""
+    # a reading that is far beyond what the others spread over
+    if len(away) >= 3 and away[worst] >= max(_NOTABLE, _FAR * float(np.quantile(np.delete(away, worst), 0.9))):
+        at, value = runs.position_mm[worst], runs.value[worst]
+        size = f"{value / RAD_PER_URAD:.5g} urad" if angular else f"{value / MM_PER_UM:.5g} um"
+        found.append(f"{name}: {size} at {at:g} mm, line {runs.line[worst]}, is far from all others; a slip?")
     first: dict[bytes, int] = {}
-    for k, values in enumerate(table):
+    for k, values in enumerate(
+        table
+    ):  # copies: equal at three targets or more in the same direction, but not all alike
         if np.isnan(values).any() or len(values) < 3 or np.ptp(values) == 0:
             continue
         row = int(np.flatnonzero(one_way == k)[0])
         earlier = first.setdefault(values.tobytes() + bytes([int(runs.direction[row]) + 1]), row)
         if earlier != row:
             pair = f"{int(runs.run[earlier])} and {int(runs.run[row])}"
-            return [f"{name}: runs {pair} are equal to the last digit at every target; is one a copy of the other?"]
-    return []
+            found.append(
+                f"{name}: runs {pair} are equal to the last digit at every target; is one a copy of the other?"
+            )
+            break
+    return found

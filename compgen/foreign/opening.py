@@ -26,6 +26,7 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions, fit
 from compgen.foreign.detect import import_file, native_format
 from compgen.foreign.findings import Imported, ImportOptions
+from compgen.foreign.laser_files import Capture
 from compgen.identify import Identification
 from compgen.identify.adjust.unknowns import error_parameters
 from compgen.identify.any_measurement import Measurement, read_measurement
@@ -34,6 +35,7 @@ from compgen.identify.single_axes import positioning_errors
 from compgen.instruments.sixdof_readings import read_sixdof
 
 Plain = Lengths | Deviations | AxisRuns
+_NATIVE_SUFFIXES = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv", ".part.csv")
 #: So many labels of a column are shown.
 _SHOWN_LABELS = 8
 _NATIVE_READERS: dict[str | None, Callable[[Path], Plain]] = {
@@ -70,15 +72,25 @@ def open_measurement(
         )
     if not paths or all(kinds) or "sixdof" in kinds or instrument is not None:
         return read_measurement(paths, instrument)
-    if len(paths) == 1 and kinds == [None] and _is_unknown_csv(Path(paths[0])):
-        return read_measurement(paths, instrument)
     if len(paths) == 1:
-        return _measured_or_errors(Path(paths[0]), axis)
+        if Path(paths[0]).name.lower().endswith(_NATIVE_SUFFIXES):  # the native reader says best what is missing
+            return read_measurement(paths, instrument)
+        data = _settled(Path(paths[0]), axis).data
+        if isinstance(data, Capture):
+            raise InputError("holds a capture over time, from which no errors are identified", file=Path(paths[0]))
+        return data
     parts: list[Plain] = [_measured(Path(path), kind, axis) for path, kind in zip(paths, kinds, strict=True)]
     if len({type(part) for part in parts}) > 1:
         raise InputError("holds another kind of measurement than the first file; identify them one after the other",
                          file=paths[-1])  # fmt: skip
-    return _joined(parts if any(kinds) else _on_one_clock(parts))
+    # where all imported files say when they were measured, their times count from the earliest of them
+    dated = all(part.metadata.get("measured_at") and "time_s" in part.covariates for part in parts)
+    begun = [datetime.fromisoformat(part.metadata["measured_at"]) for part in parts if dated and not any(kinds)]
+    if len({time.tzinfo is None for time in begun}) == 1:
+        for k, part in enumerate(parts):
+            later = part.covariates["time_s"] + (begun[k] - min(begun)).total_seconds()
+            parts[k] = replace(part, covariates={**part.covariates, "time_s": later})
+    return _joined(parts)
 
 
 def describe_native(path: Path, kind: str) -> tuple[dict[str, Any], object]:
@@ -108,34 +120,6 @@ def _described(table: CsvTable, name: str) -> str:
         return ", ".join(labels[:_SHOWN_LABELS]) + (f" ... ({len(labels)})" if len(labels) > _SHOWN_LABELS else "")
     known = values[np.isfinite(values)]
     return f"{known.min():.6g} to {known.max():.6g}" if known.size else "empty"
-
-
-def _on_one_clock(parts: Sequence[Plain]) -> list[Plain]:
-    """Let the times of several imported files count from the earliest of them, where all say when they were measured."""
-    begun = [part.metadata.get("measured_at", "") for part in parts]
-    if not all(begun) or not all("time_s" in part.covariates for part in parts):
-        return list(parts)
-    times = [datetime.fromisoformat(text) for text in begun]
-    if len({time.tzinfo is None for time in times}) > 1:
-        return list(parts)
-    ahead = [(time - min(times)).total_seconds() for time in times]
-    return [
-        replace(part, covariates={**part.covariates, "time_s": part.covariates["time_s"] + later})
-        for part, later in zip(parts, ahead, strict=True)
-    ]
-
-
-def _measured_or_errors(path: Path, axis: str | None) -> Plain | ErrorTable:
-    data = _settled(path, axis).data
-    if isinstance(data, Lengths | Deviations | AxisRuns | ErrorTable):
-        return data
-    raise InputError("holds a capture over time, from which no errors are identified", file=path)
-
-
-def _is_unknown_csv(path: Path) -> bool:
-    """Whether a file is meant to be a native one, whose reader says best what is missing."""
-    own = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv", ".part.csv")
-    return path.name.lower().endswith(own)
 
 
 def _measured(path: Path, kind: str | None, axis: str | None) -> Plain:

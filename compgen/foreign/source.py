@@ -124,8 +124,10 @@ def _decode(path: Path, content: bytes, encodings: Sequence[str]) -> tuple[str, 
     chosen = [marked] if marked else [_without_mark(content[:HEAD_BYTES]) or "", *encodings]
     for encoding in filter(None, chosen):
         try:
-            if encoding == "cp1252" and _is_chinese(content[:HEAD_BYTES]):
-                return "gb18030", content.decode("gb18030")
+            if encoding == "cp1252":  # words of a measurement in the code page of China
+                head = content[:HEAD_BYTES].decode("gb18030", errors="ignore")
+                if any(word in head for word in _CHINESE):
+                    return "gb18030", content.decode("gb18030")
             return encoding, content.decode(encoding).lstrip("\ufeff")
         except UnicodeDecodeError as error:
             if encoding.startswith("utf-16"):
@@ -134,12 +136,6 @@ def _decode(path: Path, content: bytes, encodings: Sequence[str]) -> tuple[str, 
                 line = content[: error.start].count(b"\n") + 1
                 raise InputError("is not UTF-8 text though its mark says so", file=path, line=line) from error
     raise InputError("is text in no known encoding; save it as UTF-8", file=path)
-
-
-def _is_chinese(head: bytes) -> bool:
-    """Whether text that is not UTF-8 shows words of a measurement in the code page of China."""
-    text = head.decode("gb18030", errors="ignore")
-    return sum(text.count(word) for word in _CHINESE) >= 1
 
 
 def _without_mark(head: bytes) -> str | None:
@@ -200,8 +196,11 @@ _CLOCK = re.compile(
 _ZONE = re.compile(r"\s?(Z|[+-]\d{2}:?\d{2})$")
 _NUMBERS = re.compile(r"(?<!\d)(\d{4}|\d{1,2})\s?([./-])\s?(\d{1,2})\s?\2\s?(\d{4}|\d{1,2})(?!\d)")
 _WORD = re.compile(r"[A-Za-z\u00e4\u00c4]{3,9}")
-_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-_GERMAN = {"m\u00e4r": 3, "mrz": 3, "mae": 3, "mai": 5, "okt": 10, "dez": 12}
+#: Month by the first three letters of its name, English or German.
+_MONTHS = {
+    "jan": 1, "feb": 2, "mar": 3, "apr": 4, "may": 5, "jun": 6, "jul": 7, "aug": 8, "sep": 9, "oct": 10, "nov": 11, "dec": 12,
+    "m\u00e4r": 3, "mrz": 3, "mae": 3, "mai": 5, "okt": 10, "dez": 12,
+}  # fmt: skip
 _MONTH_NAMES = frozenset([
     "january", "february", "march", "april", "may", "june", "july", "august", "september", "october",
     "november", "december", "januar", "februar", "märz", "maerz", "mai", "juni", "juli", "oktober", "dezember",
@@ -252,7 +251,29 @@ def read_date(text: str) -> Written | None:
 
 @lru_cache(maxsize=4096)
 def _days(text: str) -> Mapping[Order, datetime]:
-    return _numeric_days(text) or _named_day(text)
+    """Return what each order makes of a date in numbers, or of one whose month is a word (12 Dec 2016, 2016-Dec-12)."""
+    found = _NUMBERS.search(text)
+    if found:
+        first, mark, second, third = found.group(1), found.group(2), found.group(3), found.group(4)
+        if len(first) == 4:
+            orders: tuple[Order, ...] = ("ymd",)
+        elif mark == ".":
+            orders = ("dmy",)
+        else:
+            orders = ("dmy", "mdy") if len(third) == 4 else ORDERS
+        made = {order: _day(dict(zip(order, (first, second, third), strict=True))) for order in orders}
+        if any(made.values()):
+            return {order: day for order, day in made.items() if day is not None}
+    words = [word.lower() for word in _WORD.findall(text)]
+    named = [word[:3] for word in words if len(word) == 3 or word in _MONTH_NAMES]
+    months = [_MONTHS.get(name) for name in named if name in _MONTHS]
+    numbers = re.findall(r"\d+", text)
+    years = [number for number in numbers if len(number) == 4]
+    days = [number for number in numbers if len(number) <= 2]
+    if not len(months) == len(years) == len(days) == 1 or len(numbers) != 2:
+        return {}
+    day = _day({"y": years[0], "m": str(months[0]), "d": days[0]})
+    return {} if day is None else dict.fromkeys(ORDERS, day)
 
 
 def _seconds(found: re.Match[str]) -> float | None:
@@ -264,45 +285,12 @@ def _seconds(found: re.Match[str]) -> float | None:
     return 3600.0 * hour + 60.0 * minute + second + float(f"0.{found.group(4) or 0}")
 
 
-def _numeric_days(text: str) -> dict[Order, datetime]:
-    found = _NUMBERS.search(text)
-    if not found:
-        return {}
-    first, mark, second, third = found.group(1), found.group(2), found.group(3), found.group(4)
-    if len(first) == 4:
-        orders: tuple[Order, ...] = ("ymd",)
-    elif mark == ".":
-        orders = ("dmy",)
-    else:
-        orders = ("dmy", "mdy") if len(third) == 4 else ORDERS
-    made = {order: _day(dict(zip(order, (first, second, third), strict=True))) for order in orders}
-    return {order: day for order, day in made.items() if day is not None}
-
-
 def _day(parts: Mapping[str, str]) -> datetime | None:
     year = int(parts["y"]) + (2000 if len(parts["y"]) <= 2 else 0)
     try:
         return datetime(year, int(parts["m"]), int(parts["d"]))
     except ValueError:
         return None
-
-
-def _named_day(text: str) -> dict[Order, datetime]:
-    """Return a date whose month is a word: 12 Dec 2016, Dec 12 2016, 2016-Dec-12, 12. Dezember 2016."""
-    months = [number for word in _WORD.findall(text) if (number := _month(word.lower())) is not None]
-    numbers = re.findall(r"\d+", text)
-    years = [number for number in numbers if len(number) == 4]
-    days = [number for number in numbers if len(number) <= 2]
-    if len(months) != 1 or len(years) != 1 or len(days) != 1 or len(numbers) != 2:
-        return {}
-    day = _day({"y": years[0], "m": str(months[0]), "d": days[0]})
-    return {} if day is None else dict.fromkeys(ORDERS, day)
-
-
-def _month(word: str) -> int | None:
-    if len(word) > 3 and word not in _MONTH_NAMES:
-        return None
-    return _GERMAN.get(word[:3]) or (_MONTHS.index(word[:3]) + 1 if word[:3] in _MONTHS else None)
 
 
 def serial_date(days: float) -> Written | None:

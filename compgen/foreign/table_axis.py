@@ -223,7 +223,21 @@ def _last_digit(findings: TableFindings, name: str) -> float:
 def _wide(findings: TableFindings, columns: Sequence[RunColumn]) -> _Rows:
     """Columns of runs, one after the other; an empty cell is a reading that was not taken."""
     labels = _labels(findings)
-    _check_wide(findings, columns)
+    seen: dict[tuple[int, int], str] = {}
+    for column in columns:
+        earlier = seen.setdefault((column.number, column.direction), column.name)
+        if earlier != column.name:
+            message = f"{shown(earlier)} and {shown(column.name)} are the same run and direction; say which is which: "
+            raise findings.table.grid.fail(message + "--map run1+=COLUMN, run1-=COLUMN ...", findings.table.header_line)
+    units = {column.name: split_name(column.name).unit for column in columns}
+    if len(set(units.values())) > 1 and findings.given_unit("deviation", value=True) is None:
+        text = ", ".join(f"{shown(name)} {unit or 'none'}" for name, unit in units.items())
+        message = f"the runs have different units ({text}); if all have one, say it with --unit deviation=UNIT"
+        raise findings.table.grid.fail(message, findings.table.header_line)
+    numbers = {way: {column.number for column in columns if column.direction == way} for way in (1, -1)}
+    if numbers[1] and numbers[-1] and numbers[1] != numbers[-1]:
+        lonely = ", ".join(str(number) for number in sorted(numbers[1] ^ numbers[-1])[:8])
+        findings.notes.append(f"run {lonely} has one direction only")
     findings.used |= {column.name for column in columns}
     findings.runs = [column.name for column in columns]
     parts = []
@@ -240,25 +254,6 @@ def _wide(findings: TableFindings, columns: Sequence[RunColumn]) -> _Rows:
     row, run, label, value = (np.concatenate([part[k] for part in parts]) for k in range(4))
     first = columns[0]
     return _Rows(row, run.astype(np.int64), label.astype(np.int64), value, "deviation", first.name)
-
-
-def _check_wide(findings: TableFindings, columns: Sequence[RunColumn]) -> None:
-    """Refuse two columns for one run in one direction, and runs in different units."""
-    seen: dict[tuple[int, int], str] = {}
-    for column in columns:
-        earlier = seen.setdefault((column.number, column.direction), column.name)
-        if earlier != column.name:
-            message = f"{shown(earlier)} and {shown(column.name)} are the same run and direction; say which is which: "
-            raise findings.table.grid.fail(message + "--map run1+=COLUMN, run1-=COLUMN ...", findings.table.header_line)
-    units = {column.name: split_name(column.name).unit for column in columns}
-    if len(set(units.values())) > 1 and findings.given_unit("deviation", value=True) is None:
-        text = ", ".join(f"{shown(name)} {unit or 'none'}" for name, unit in units.items())
-        message = f"the runs have different units ({text}); if all have one, say it with --unit deviation=UNIT"
-        raise findings.table.grid.fail(message, findings.table.header_line)
-    numbers = {way: {column.number for column in columns if column.direction == way} for way in (1, -1)}
-    if numbers[1] and numbers[-1] and numbers[1] != numbers[-1]:
-        lonely = ", ".join(str(number) for number in sorted(numbers[1] ^ numbers[-1])[:8])
-        findings.notes.append(f"run {lonely} has one direction only")
 
 
 def _statistics(findings: TableFindings, columns: Sequence[RunColumn]) -> None:
@@ -303,18 +298,13 @@ def _deviations(findings: TableFindings, rows: _Rows, target: FloatArray, *, ang
         findings.fields = {**findings.fields, key: split_name(rows.name)}
     usual = USUAL_URAD * 1e-6 if angular else usual_deviation_mm(float(np.ptp(target)))
     si = findings.values_si(key, rows.name, value, usual, angular=angular)
-    return _signed(findings, key, si)
-
-
-def _signed(findings: TableFindings, key: str, values: FloatArray) -> FloatArray:
     chosen = findings.options.sign
     if chosen is None and key == "correction":
         chosen = "correction"
         findings.notes.append("the column is called a correction: its sign is turned round")
     if chosen is None:
-        words = unaccented(
-            " ".join([*findings.table.header, *findings.table.metadata, *findings.table.metadata.values()])
-        )
+        above = findings.table.metadata
+        words = unaccented(" ".join([*findings.table.header, *above, *above.values()]))
         told = any(word in words for word in (*_TELLING, *FIELDS["deviation"][:1]))
         told = told or any(is_deviation(name) for name in findings.table.header)
         if not told and len(findings.runs) > 1 and not any(word in words for word in _COUNTER):
@@ -328,7 +318,7 @@ def _signed(findings: TableFindings, key: str, values: FloatArray) -> FloatArray
     findings.understood["sign"] = (
         "measured minus target" if chosen == "error" else "target minus measured, turned round"
     )
-    return -values if chosen == "correction" else values
+    return -si if chosen == "correction" else si
 
 
 def _from_readings(findings: TableFindings, rows: _Rows, target: FloatArray) -> FloatArray:
@@ -372,7 +362,14 @@ def _axes(findings: TableFindings, row: IntArray) -> list[str]:
         return [letters[k] for k in row]
     if findings.letter is not None:
         return [findings.letter] * len(row)
-    said = {letter for key, text in findings.table.metadata.items() if (letter := _axis_said(key, text))}
+    said: set[str] = set()  # by a line above the table, such as ``Achse: X`` or a title ``Positionierung Y-Achse``
+    for key, text in findings.table.metadata.items():
+        word = split_name(key).word
+        if word in FIELDS["axis"] or word in _AXIS_KEYS:
+            said |= {axis_in(text) or ""} - {""}
+            continue
+        letters = [first or second for first, second in _NAMED_AXIS.findall(f"{key} {text}".upper())]
+        said |= set(letters) if len(set(letters)) == 1 else set()
     names = [*findings.table.grid.notes[:1], findings.table.grid.path.stem.replace("_", " ").replace("-", " ")]
     named = next((letter for name in names if (letter := axis_in(name))), None)
     if len(said) == 1 and named in (None, *said):
@@ -386,15 +383,6 @@ def _axes(findings: TableFindings, row: IntArray) -> list[str]:
         return [named] * len(row)
     findings.doubts.append(f"nothing says which axis it is; give --axis {', '.join(AXES)}")
     return [""] * len(row)
-
-
-def _axis_said(key: str, text: str) -> str | None:
-    """Return the axis that a line above the table names, such as ``Achse: X`` or a title ``Positionierung Y-Achse``."""
-    column = split_name(key).word
-    if column in FIELDS["axis"] or column in _AXIS_KEYS:
-        return axis_in(text)
-    found = {first or second for first, second in _NAMED_AXIS.findall(f"{key} {text}".upper())}
-    return found.pop() if len(found) == 1 else None
 
 
 def _directions(

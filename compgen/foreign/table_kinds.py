@@ -39,7 +39,6 @@ from compgen.foreign.findings import (
     Imported,
     ImportOptions,
     Kind,
-    LengthGeometry,
     TableFindings,
     judge_lengths,
     slope_of,
@@ -96,10 +95,20 @@ def long_errors(findings: TableFindings) -> ErrorTable:
     if span.size:
         position[np.isfinite(raw)] = findings.positions_mm("position", span)
     curves, squareness = {}, {}
+    u_column = findings.fields.get("u_value")
     for name in dict.fromkeys(names):
         rows = np.flatnonzero(np.array(names) == name)
         si = _si(findings, name, findings.fields["value"], values[rows], float(np.ptp(span)) if span.size else 0.0)
-        u_si = _u_si(findings, name, rows, values[rows], si)
+        u_si = np.full(len(rows), np.nan)
+        if u_column is not None:  # in its own unit, else in that of the values
+            u = np.array(table.numbers(u_column.name, empty=True))[rows]
+            if np.any(u < 0):
+                line = table.lines[int(rows[np.flatnonzero(u < 0)[0]])]
+                raise table.grid.fail("a standard uncertainty is not negative", line, u_column.name)
+            largest = values[rows][np.argmax(np.abs(values[rows]))]
+            common = si[np.argmax(np.abs(values[rows]))] / largest if largest else float("nan")
+            units = RAD_PER_ANGLE if error_named(name).kind != "linear" else MM_PER_LENGTH
+            u_si = np.asarray(u * units.get(findings.given_unit("u_value") or u_column.unit or "", common))
         if name in SQUARENESS_NAMES:
             if len(rows) > 1:
                 raise table.grid.fail(f"{name} is a single number, but it appears again", table.lines[int(rows[1])])
@@ -111,22 +120,6 @@ def long_errors(findings: TableFindings) -> ErrorTable:
             raise table.grid.fail(f"{name} has a position that is empty or appears twice", table.lines[int(rows[0])])
         curves[name] = Curve(at, si[order], u_si[order])
     return _finished(findings, curves, squareness)
-
-
-def _u_si(findings: TableFindings, name: str, rows: np.ndarray, values: np.ndarray, si: np.ndarray) -> FloatArray:
-    """Standard uncertainties of rows in mm or rad, nan where none stands; in their own unit, else in that of the values."""
-    if "u_value" not in findings.fields:
-        return np.full(len(rows), np.nan)
-    column = findings.fields["u_value"]
-    u = np.array(findings.table.numbers(column.name, empty=True))[rows]
-    if np.any(u < 0):
-        line = findings.table.lines[int(rows[np.flatnonzero(u < 0)[0]])]
-        raise findings.table.grid.fail("a standard uncertainty is not negative", line, column.name)
-    units = RAD_PER_ANGLE if error_named(name).kind != "linear" else MM_PER_LENGTH
-    unit = findings.given_unit("u_value") or column.unit
-    largest = int(np.argmax(np.abs(values)))
-    common = si[largest] / values[largest] if values[largest] else float("nan")
-    return np.asarray(u * units.get(unit or "", common), dtype=np.float64)
 
 
 def _si(findings: TableFindings, name: str, column: NamedColumn, values: np.ndarray, span_mm: float) -> np.ndarray:
@@ -275,14 +268,11 @@ def _positions(findings: TableFindings, keys: str) -> FloatArray:
     longest = int(np.argmax([np.ptp(values) for values in raw]))
     first = findings.positions_mm(keys[longest], raw[longest])
     factor = MM_PER_LENGTH[str(findings.understood["position_unit"])]
-    columns = [first if k == longest else _like(findings, keys[k], raw[k], factor) for k in range(3)]
+    columns = []
+    for k, key in enumerate(keys):  # the other two in their own unit if they have one, else in that of the longest axis
+        own = findings.given_unit(key) or findings.given_unit("position") or findings.fields[key].unit
+        columns.append(first if k == longest else raw[k] * MM_PER_LENGTH.get(own or "", factor))
     return np.column_stack(columns)
-
-
-def _like(findings: TableFindings, key: str, values: FloatArray, factor: float) -> FloatArray:
-    """Return the other two coordinates in their own unit if they have one, else in that of the longest axis."""
-    own = findings.given_unit(key) or findings.given_unit("position") or findings.fields[key].unit
-    return values * (MM_PER_LENGTH.get(own, factor) if own else factor)
 
 
 def _length_scale(
@@ -292,7 +282,9 @@ def _length_scale(
     found = [judge_lengths(position[station == k], reading[station == k]) for k in np.unique(station)]
     geometry = [item for item in found if item is not None]
     declared = findings.given_unit("length", value=True) or findings.fields["length"].unit
-    unit = _unit_by_geometry(geometry)
+    ratio = float(np.median([item.mm_per_unit for item in geometry])) if geometry else None
+    fitting = [name for name, mm in MM_PER_LENGTH.items() if ratio and abs(ratio / mm - 1.0) < UNIT_TOLERANCE]
+    unit = fitting[0] if fitting else None
     signs = {item.sign for item in geometry}
     sign = signs.pop() if len(signs) == 1 else 0
     if declared is not None and declared not in MM_PER_LENGTH:
@@ -312,17 +304,9 @@ def _length_scale(
             "the points do not tell the sign of the lengths; they are taken to grow with the distance"
         )
     chosen = declared or unit or "mm"
-    ratio = float(np.median([item.mm_per_unit for item in geometry])) if geometry else None
     findings.understood |= {"unit": chosen, "sign": "grows with the distance" if sign >= 0 else "turned round"}
     findings.understood["mm_per_unit_by_geometry"] = ratio
     return MM_PER_LENGTH[chosen] * (-1.0 if sign < 0 else 1.0)
-
-
-def _unit_by_geometry(geometry: list[LengthGeometry]) -> str | None:
-    if not geometry:
-        return None
-    ratio = float(np.median([item.mm_per_unit for item in geometry]))
-    return next((unit for unit, mm in MM_PER_LENGTH.items() if abs(ratio / mm - 1.0) < UNIT_TOLERANCE), None)
 
 
 def _numbered(
@@ -596,9 +580,22 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
     errors = [item.data for _, item in parts if isinstance(item.data, ErrorTable)]
     beside = None
     if kinds == {"axis"} or kinds == {"axis", "errors"}:
-        data: Data = _joined_runs([item.data for _, item in parts if isinstance(item.data, AxisRuns)])
+        read = [item.data for _, item in parts if isinstance(item.data, AxisRuns)]
+        # with the numbers beside the readings that all sheets have
+        common = set.intersection(*(set(part.covariates) for part in read))
+        kept = [replace(r, covariates={k: v for k, v in r.covariates.items() if k in common}) for r in read]
+        runs = replace(join_axis_runs(kept), metadata=read[0].metadata)
+        data: Data = runs
         beside = _joined_errors(first, errors) if errors else None
-        doubts += _measured_twice(data, beside) if isinstance(data, AxisRuns) and beside else []
+        for axis in runs.axes:
+            name, rows = POSITIONING[axis], runs.axis == axis
+            if beside is not None and name in beside.curves:
+                mean, _, _ = two_way_mean(runs.position_mm[rows], runs.direction[rows], runs.deviation_mm[rows])
+                away = float(np.abs(mean.value - beside.curves[name].at(mean.position_mm)).max()) / MM_PER_UM
+                doubts.append(
+                    f"a sheet holds {name}, and the runs of {AXES[axis]} give it as well (their means differ by up to "
+                    f"{away:.3g} um); leave out one sheet with --ignore SHEET"
+                )
     elif kinds == {"errors"}:
         data = _joined_errors(first, errors)
     else:
@@ -609,37 +606,10 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
     return replace(first, kind=kind, data=data, understood=understood, doubts=tuple(doubts), notes=notes, beside=beside)
 
 
-def _measured_twice(runs: AxisRuns, beside: ErrorTable) -> list[str]:
-    """Ask about errors of another sheet that the runs give as well, with the largest difference."""
-    doubts = []
-    for axis in runs.axes:
-        name = POSITIONING[axis]
-        if name not in beside.curves:
-            continue
-        own = runs.axis == axis
-        mean, _, _ = two_way_mean(runs.position_mm[own], runs.direction[own], runs.deviation_mm[own])
-        away = mean.value - beside.curves[name].at(mean.position_mm)
-        doubts.append(
-            f"a sheet holds {name}, and the runs of {AXES[axis]} give it as well (their means differ by up to "
-            f"{np.abs(away).max() / MM_PER_UM:.3g} um); leave out one sheet with --ignore SHEET"
-        )
-    return doubts
-
-
 def _together(parts: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
     """Return the numbers beside the readings that every part has, one after the other."""
     common = [name for name in parts[0] if all(name in part for part in parts)]
     return {name: np.concatenate([part[name] for part in parts]) for name in common}
-
-
-def _joined_runs(parts: Sequence[AxisRuns]) -> AxisRuns:
-    """The runs of several sheets, with the numbers beside them that all sheets have and the comments of the first."""
-    common = {name for name in parts[0].covariates if all(name in part.covariates for part in parts)}
-    kept = [
-        replace(part, covariates={name: part.covariates[name] for name in part.covariates if name in common})
-        for part in parts
-    ]
-    return replace(join_axis_runs(kept), metadata=parts[0].metadata)
 
 
 def _joined_errors(first: Imported, parts: Sequence[ErrorTable]) -> ErrorTable:
