@@ -19,10 +19,10 @@ from scipy.interpolate import BSpline, make_interp_spline
 
 from compgen import load_machine, read_errors
 from compgen.data.names import ERROR_INDEX, error_named
-from compgen.kinematics.exact_chain import exact_error_at, tip_position
+from compgen.kinematics.exact_chain import exact_error, tip_position
 from compgen.kinematics.first_order import coefficients, factor
 from compgen.kinematics.kernel_switch import PLAIN, VARIABLE, load_kernels
-from compgen.kinematics.many_points import volumetric_error_at, volumetric_error_on_grid
+from compgen.kinematics.many_points import volumetric_error, volumetric_error_on_grid
 
 ROOT = Path(__file__).resolve().parents[1]
 MACHINE = load_machine(ROOT / "machines" / "zha-gantry.toml")
@@ -87,7 +87,7 @@ def own_points(position_mm: np.ndarray, out: np.ndarray, compiled: bool) -> dict
     """Ways of compgen for a list of points."""
 
     def job() -> object:
-        return volumetric_error_at(MACHINE, ERRORS, position_mm, out=out)
+        return volumetric_error(MACHINE, ERRORS, position_mm, out=out)
 
     return {"compgen, numpy": without_kernels(job), **({"compgen, numba": job} if compiled else {})}
 
@@ -137,7 +137,7 @@ def exact(count: int, runs: int, compiled: bool) -> None:
         out[:] = tip_position(MACHINE, ERRORS.at(position), position) - (position + TOOL_MM)
 
     def job() -> object:
-        return exact_error_at(MACHINE, ERRORS, position, out=out)
+        return exact_error(MACHINE, ERRORS, position, out=out)
 
     jobs: dict[str, Job] = {"compgen, numpy": without_kernels(job), **({"compgen, numba": job} if compiled else {})}
     comparison = timing.alternate({**jobs, "np.cross chain": whole_chain}, runs)

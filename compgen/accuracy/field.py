@@ -20,8 +20,9 @@ from compgen.errors import InputError
 from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.kinematics.curves import hat_matrix
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.first_order import c_matrix, tool_of, volumetric_error
+from compgen.kinematics.first_order import c_matrix, tool_of
 from compgen.kinematics.gauge import rigid_fields, without_rigid_motion
+from compgen.kinematics.many_points import volumetric_error
 
 # Fields of position errors: how they are aligned, and the figures of a volume with their uncertainty.
 #

@@ -21,7 +21,7 @@ from compgen.data.messages import doubled, nearest, one_line
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.data.toml_files import setting, whole
 from compgen.errors import InputError
-from compgen.kinematics.first_order import volumetric_error
+from compgen.kinematics.many_points import volumetric_error
 
 # The neutral formats as data: the correction field on a grid, and the 21 error curves that it comes from.
 

@@ -21,7 +21,8 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, reversal_name
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.kinematics.first_order import tool_of, volumetric_error
+from compgen.kinematics.first_order import tool_of
+from compgen.kinematics.many_points import volumetric_error
 from compgen.kinematics.volume_grid import volume_sample
 
 # SINUMERIK CEC tables: what a set of them adds up to, and angular errors as products of two tables.

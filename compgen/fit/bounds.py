@@ -349,9 +349,18 @@ class FitOptions:
             raise InputError(message, field="smoothness")
         for bound in ("max_abs", "max_slope", "max_curvature"):
             for key, limit in getattr(self, bound).items():
-                _check_limit(bound, key, limit)
+                _check_key(bound, key)
+                if not limit > 0:
+                    message = (
+                        f"{limit!r} for {key} leaves no curve; a bound is a positive number, leave it out for none"
+                    )
+                    raise InputError(message, field=bound)
         for key, direction in self.monotone.items():
-            _check_direction(key, direction)
+            if key not in CURVE_NAMES:
+                raise InputError(f"{key!r} is not one of the curves; {nearest(key, CURVE_NAMES)}", field="monotone")
+            if direction not in DIRECTIONS:
+                allowed = ", ".join(DIRECTIONS)
+                raise InputError(f"{direction!r} for {key} is not allowed; give one of {allowed}", field="monotone")
 
     @classmethod
     def from_file_units(
@@ -404,22 +413,6 @@ def _check_key(bound: str, key: str) -> None:
     if key not in CURVE_NAMES and key not in ERROR_KINDS:
         known = (*ERROR_KINDS, *CURVE_NAMES)
         raise InputError(f"{key!r} is neither a curve nor a kind of error; {nearest(key, known)}", field=bound)
-
-
-def _check_limit(bound: str, key: str, limit: float) -> None:
-    _check_key(bound, key)
-    if not limit > 0:
-        message = f"{limit!r} for {key} leaves no curve; a bound is a positive number, leave it out for none"
-        raise InputError(message, field=bound)
-
-
-def _check_direction(key: str, direction: str) -> None:
-    if key not in CURVE_NAMES:
-        raise InputError(f"{key!r} is not one of the curves; {nearest(key, CURVE_NAMES)}", field="monotone")
-    if direction not in DIRECTIONS:
-        raise InputError(
-            f"{direction!r} for {key} is not allowed; give one of {', '.join(DIRECTIONS)}", field="monotone"
-        )
 
 
 # One curve at a given smoothness within its bounds.

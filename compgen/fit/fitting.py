@@ -145,7 +145,28 @@ def finish(prepared: Prepared, weighted: Weighted, solution: CurveSolution) -> t
     else:
         u = propagate(smoother, weighted.mu, fixed, prepared.trust)
     curve = Curve(fixed.position_mm, solution.curve * prepared.unit + 0.0, u)
-    return curve, _report(prepared, weighted, solution, bias)
+    residual, left = prepared.y - solution.curve, smoother.residual_degrees(weighted.mu)
+    noise2 = smoother.misfit(residual) / left if left >= _LEAST_LEFT else math.nan
+    report = CurveReport(
+        error=prepared.name,
+        unit=error_named(prepared.name).unit,
+        smoothness=weighted.mu,
+        method=weighted.method,
+        half_gain_mm=half_gain_mm(weighted.mu, fixed.position_mm),
+        degrees_of_freedom=smoother.degrees_of_freedom(weighted.mu),
+        free_nodes=smoother.unknowns,
+        rms_residual=float(np.sqrt(np.mean(residual**2))),
+        reduced_chi_square=noise2 / prepared.u0**2 if prepared.u0 is not None else math.nan,
+        noise=math.sqrt(noise2),
+        smoothing_bias_max=float(np.abs(bias).max()),
+        smoothing_bias_rms=float(np.sqrt(np.mean(bias**2))),
+        smoothing_bias=bias,
+        active_bounds=active_bounds(fixed.position_mm, solution.touched, prepared.bounds),
+        solver=solution.solver,
+        correlated=prepared.covariance is not None,
+        distrusted_mm=tuple(float(fixed.position_mm[k]) for k in np.flatnonzero(prepared.trust < 1)),
+    )
+    return curve, report
 
 
 def propagate(smoother: Smoother, mu: float, fixed: FixedCurve, trust: FloatArray) -> FloatArray:
@@ -163,32 +184,6 @@ def propagate(smoother: Smoother, mu: float, fixed: FixedCurve, trust: FloatArra
         gain = columns - smooth_shapes @ functional[:, picked]
         total += np.where(gain != 0, gain**2 * variance[picked], 0.0).sum(axis=1)
     return np.asarray(np.sqrt(total))
-
-
-def _report(prepared: Prepared, weighted: Weighted, solution: CurveSolution, bias: FloatArray) -> CurveReport:
-    smoother, residual = prepared.smoother, prepared.y - solution.curve
-    left = smoother.residual_degrees(weighted.mu)
-    noise2 = smoother.misfit(residual) / left if left >= _LEAST_LEFT else math.nan
-    distrusted = np.flatnonzero(prepared.trust < 1)
-    return CurveReport(
-        error=prepared.name,
-        unit=error_named(prepared.name).unit,
-        smoothness=weighted.mu,
-        method=weighted.method,
-        half_gain_mm=half_gain_mm(weighted.mu, prepared.fixed.position_mm),
-        degrees_of_freedom=smoother.degrees_of_freedom(weighted.mu),
-        free_nodes=smoother.unknowns,
-        rms_residual=float(np.sqrt(np.mean(residual**2))),
-        reduced_chi_square=noise2 / prepared.u0**2 if prepared.u0 is not None else math.nan,
-        noise=math.sqrt(noise2),
-        smoothing_bias_max=float(np.abs(bias).max()),
-        smoothing_bias_rms=float(np.sqrt(np.mean(bias**2))),
-        smoothing_bias=bias,
-        active_bounds=active_bounds(prepared.fixed.position_mm, solution.touched, prepared.bounds),
-        solver=solution.solver,
-        correlated=prepared.covariance is not None,
-        distrusted_mm=tuple(float(prepared.fixed.position_mm[k]) for k in distrusted),
-    )
 
 
 def half_gain_mm(mu: float, position_mm: FloatArray) -> float:
@@ -320,7 +315,14 @@ def solve_constrained(
         broken = float(np.max(rule.violation(), initial=0.0))
         if not broken <= TOLERANCE:
             raise ConvergenceError(f"{name} is broken by {broken:.3g} in the solver's result; scale or loosen it")
-    return [_solution(item, np.asarray(inner[item.name].value)) for item in prepared]
+    found = []
+    for item in prepared:
+        curve = item.smoother.expand(np.asarray(inner[item.name].value)[:, None])[:, 0]
+        rows = constraint_rows(item.fixed.position_mm, item.smoother, *item.bounds.limits, item.bounds.direction)
+        values = np.asarray(rows.matrix @ curve)
+        near = np.where(values >= rows.upper - TOLERANCE, 1.0, np.where(values <= rows.lower + TOLERANCE, -1.0, 0.0))
+        found.append(CurveSolution(curve, near, "cvxpy"))
+    return found
 
 
 def _rules(item: Prepared, x: Any, shown: Any) -> list[Any]:
@@ -390,22 +392,13 @@ def _relaxation(cp: Any, rules: Sequence[Any], own: Mapping[str, Any]) -> str:
     if problem.status not in _STATES:
         return beginning + f"those that can be relaxed by an amount ({', '.join(slack)}) do not help; leave one out"
     amounts = {name: np.atleast_1d(np.asarray(amount.value)) for name, amount in slack.items()}
-    named = [f"{name} by {_amount(amount)}" for name, amount in amounts.items() if amount.max() > TOLERANCE]
+    named = []
+    for name, amount in amounts.items():
+        over = amount[amount > TOLERANCE]
+        if over.size:
+            entries = "" if amount.size == 1 else f" (largest of {over.size} of its {amount.size} entries)"
+            named.append(f"{name} by {math.ceil(over.max() * 1e6) / 1e6:.6g}{entries}")
     return beginning + "the least relaxation that helps: " + "; ".join(named)
-
-
-def _amount(amount: np.ndarray) -> str:
-    over = amount[amount > TOLERANCE]
-    entries = "" if amount.size == 1 else f" (largest of {over.size} of its {amount.size} entries)"
-    return f"{math.ceil(over.max() * 1e6) / 1e6:.6g}{entries}"
-
-
-def _solution(item: Prepared, x: np.ndarray) -> CurveSolution:
-    curve = item.smoother.expand(x[:, None])[:, 0]
-    rows = constraint_rows(item.fixed.position_mm, item.smoother, *item.bounds.limits, item.bounds.direction)
-    values = np.asarray(rows.matrix @ curve)
-    near = np.where(values >= rows.upper - TOLERANCE, 1.0, np.where(values <= rows.lower + TOLERANCE, -1.0, 0.0))
-    return CurveSolution(curve, near, "cvxpy")
 
 
 # The whole fit: identified errors in, smooth and endpoint-zeroed errors out.
@@ -477,7 +470,18 @@ def _fit(
         prepared = [prepare(name, fixed, options) for name, fixed in zeroed.curves.items()]
         weighted = [smoothness(item, options) for item in prepared]
     mu = [item.mu for item in weighted]
-    _check_monotone(prepared, mu)
+    for item, weight in zip(prepared, mu, strict=True):
+        # a curve that is zero at two points leaves a direction nothing but zero between them
+        if item.bounds.direction and len(item.fixed.rows) > 1:
+            free = item.smoother.solve(weight, item.y[:, None])[:, 0]
+            backward = item.bounds.excess(item.fixed.position_mm, free)[3]
+            unit = error_named(item.name).unit
+            raise InputError(
+                f"{item.name} is zero at both ends of the travel, so a monotone one would be zero everywhere; remove the "
+                f"direction of {item.name} (least relaxation: its fit has slopes of {1e3 * backward:.4g} {unit}/m "
+                "against it)",
+                field="monotone",
+            )
     solved = solve(prepared, mu) if constraints is None else solve_constrained(prepared, mu, constraints)
     fitted = {
         item.name: finish(item, how, solution) for item, how, solution in zip(prepared, weighted, solved, strict=True)
@@ -490,21 +494,6 @@ def _fit(
         metadata={**kept, "reference_point_mm": reference},
     )
     return FitResult(table, {name: report for name, (_, report) in fitted.items()}, zeroed.change)
-
-
-def _check_monotone(prepared: Sequence[Prepared], mu: Sequence[float]) -> None:
-    """Refuse a direction for a curve that is zero at two points: only zero between them would be left."""
-    for item, weight in zip(prepared, mu, strict=True):
-        if item.bounds.direction == 0 or len(item.fixed.rows) < 2:
-            continue
-        free = item.smoother.solve(weight, item.y[:, None])[:, 0]
-        backward = item.bounds.excess(item.fixed.position_mm, free)[3]
-        unit = error_named(item.name).unit
-        raise InputError(
-            f"{item.name} is zero at both ends of the travel, so a monotone one would be zero everywhere; remove the "
-            f"direction of {item.name} (least relaxation: its fit has slopes of {1e3 * backward:.4g} {unit}/m against it)",
-            field="monotone",
-        )
 
 
 def _as_independent(machine: Machine, errors: ErrorTable, known: Container[str]) -> ErrorTable:

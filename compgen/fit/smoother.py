@@ -66,33 +66,21 @@ def eliminate(rows: tuple[Row, ...]) -> tuple[Step, ...]:
     steps: list[Step] = []
     for row in rows:
         factors: dict[int, float] = {}
-        for node, factor in row:
-            _add_through(factors, node, factor, steps)
+        for given, given_factor in row:  # c[given], written in what earlier eliminations left
+            node, factor = given, given_factor
+            for pivot, other, share in steps:
+                if node == pivot:
+                    if other is None:
+                        break
+                    node, factor = other, factor * share
+            else:
+                factors[node] = factors.get(node, 0.0) + factor
         if not factors or max(map(abs, factors.values())) < 1e-12:
             continue
         pivot = max(factors, key=lambda node: abs(factors[node]))
         others = [node for node in factors if node != pivot and factors[node] != 0]
         steps.append((pivot, others[0], -factors[others[0]] / factors[pivot]) if others else (pivot, None, 0.0))
     return tuple(steps)
-
-
-def _add_through(factors: dict[int, float], node: int, factor: float, steps: list[Step]) -> None:
-    """Add ``factor`` times c[node], written in what earlier eliminations left."""
-    for pivot, other, share in steps:
-        if node == pivot:
-            if other is None:
-                return
-            node, factor = other, factor * share
-    factors[node] = factors.get(node, 0.0) + factor
-
-
-def _penalty_band(rows: FloatArray, n: int) -> FloatArray:
-    """D^T D as a lower band (5, n): entry [d, k] couples k and k + d."""
-    band = np.zeros((_BAND + 1, n))
-    for i in range(3):
-        for j in range(i, 3):
-            band[j - i, i : n - 2 + i] += rows[:, i] * rows[:, j]
-    return band
 
 
 def _eliminate_in_band(band: FloatArray, step: Step) -> None:
@@ -135,7 +123,11 @@ class Smoother:
     def build(cls, position_mm: FloatArray, weight: FloatArray, fixed: tuple[Row, ...]) -> Smoother:
         """Prepare the smoother for nodes (n,), weights (n,) and the functionals that must stay zero."""
         rows, steps = second_difference(position_mm), eliminate(fixed)
-        penalty = _penalty_band(rows, len(position_mm))
+        count = len(position_mm)
+        penalty = np.zeros((_BAND + 1, count))  # D^T D as a lower band: entry [d, k] couples k and k + d
+        for i in range(3):
+            for j in range(i, 3):
+                penalty[j - i, i : count - 2 + i] += rows[:, i] * rows[:, j]
         free_weight = weight.copy()
         for step in steps:
             _eliminate_in_band(penalty, step)

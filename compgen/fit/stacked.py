@@ -50,32 +50,22 @@ def solve_curves(problems: Sequence[CurveProblem]) -> list[CurveSolution]:
     ConvergenceError
         when no solver's result for a curve that breaks a bound passes the optimality conditions.
     """
-    chosen = [k for k, problem in enumerate(problems) if _can_be_laid(problem.smoother)]
-    found = dict(zip(chosen, _within_bounds([problems[k] for k in chosen]), strict=True)) if chosen else {}
-    curves = [found.get(k) for k in range(len(problems))]
-    return [
-        solve_curve(*problem) if curve is None else CurveSolution(curve)
-        for problem, curve in zip(problems, curves, strict=True)
+    # those whose nodes are independent (no subclass), and whose fixed functionals are values at nodes
+    chosen = [
+        k
+        for k, problem in enumerate(problems)
+        if type(problem.smoother) is Smoother and all([other is None for _, other, _ in problem.smoother.steps])
     ]
-
-
-def _can_be_laid(smoother: Smoother) -> bool:
-    """Whether nodes are independent (no subclass) and every fixed functional is the value at a node."""
-    return type(smoother) is Smoother and all([other is None for _, other, _ in smoother.steps])
-
-
-def _within_bounds(problems: Sequence[CurveProblem]) -> list[FloatArray | None]:
-    """Fitted curves without bounds; None where a curve breaks its bounds or the factorisation fails."""
-    stack = Stack.build(problems)
-    c = stack.solve(np.concatenate([problem.y for problem in problems]))
-    if c is None:
-        return [None] * len(problems)
-    broken = _breaks(stack, problems, c).tolist()
-    ends = stack.starts + stack.sizes
-    return [
-        None if wrong else c[start:end]
-        for wrong, start, end in zip(broken, stack.starts.tolist(), ends.tolist(), strict=True)
-    ]
+    found: dict[int, FloatArray] = {}
+    if chosen:
+        together = [problems[k] for k in chosen]
+        stack = Stack.build(together)
+        c = stack.solve(np.concatenate([problem.y for problem in together]))
+        if c is not None:
+            kept = (~_breaks(stack, together, c)).tolist()
+            bounds = zip(stack.starts.tolist(), (stack.starts + stack.sizes).tolist(), strict=True)
+            found = {k: c[start:end] for k, (start, end), own in zip(chosen, bounds, kept, strict=True) if own}
+    return [CurveSolution(found[k]) if k in found else solve_curve(*problem) for k, problem in enumerate(problems)]
 
 
 @dataclass(frozen=True)
@@ -129,19 +119,16 @@ class Stack:
         if info:
             return None
         rough = np.ones(len(self.sizes), dtype=bool)
+        weight, mu = self.laid.weight[:, None], self.mu[:, None]
         for _ in range(REFINEMENTS):
-            rest = load - self._apply(x)
-            step = dpbtrs(factor, rest, lower=1)[0]
+            # A x without forming the product of the second differences
+            applied = self._free(weight * x + mu * self.laid.bend_transposed(self.laid.bend(x)))
+            step = dpbtrs(factor, load - applied, lower=1)[0]
             x = x + (step if rough.all() else step * rough.repeat(self.sizes)[:, None])
             rough &= ~(self.largest(step[:, 0]) <= SETTLED * self.largest(x[:, 0]))
             if not rough.any():
                 break
         return np.ascontiguousarray(self._free(x)[:, 0])
-
-    def _apply(self, c: FloatArray) -> FloatArray:
-        """A c for curves (N, 1) that are zero at fixed nodes, without forming the product of the second differences."""
-        weight, mu = self.laid.weight[:, None], self.mu[:, None]
-        return self._free(weight * c + mu * self.laid.bend_transposed(self.laid.bend(c)))
 
     def _free(self, values: FloatArray) -> FloatArray:
         """Put zeros at the fixed nodes of (N, 1)."""

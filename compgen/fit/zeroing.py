@@ -87,24 +87,6 @@ def apply_row(row: Row, values: FloatArray) -> float:
     return float(sum(factor * values[node] for node, factor in row))
 
 
-def _extend(machine: Machine, name: str, curve: Curve) -> Curve:
-    """Return the curve with nodes at the travel ends that it does not reach, at its own end values."""
-    axis = error_named(name).axis
-    low, high = machine.axes[axis].range_mm
-    before, after = curve.position_mm[0] > low + SAME_POSITION_MM, curve.position_mm[-1] < high - SAME_POSITION_MM
-    if not (before or after):
-        return curve
-    warnings.warn(
-        f"{name} is known from {curve.position_mm[0]:g} to {curve.position_mm[-1]:g} mm, but {AXES[axis]} travels from "
-        f"{low:g} to {high:g} mm; its end values are used beyond",
-        CompgenWarning,
-        stacklevel=5,
-    )
-    pad = (int(before), int(after))
-    position = np.concatenate([[low] * pad[0], curve.position_mm, [high] * pad[1]])
-    return Curve(position, np.pad(curve.value, pad, "edge"), np.pad(curve.u, pad, "edge"))
-
-
 def fix_to_zero(machine: Machine, name: str, given: Curve, covariance: FloatArray | None = None) -> FixedCurve:
     """Bring one curve to zero at its fixed points, in mm or rad; InputError for values that are not finite.
 
@@ -114,7 +96,19 @@ def fix_to_zero(machine: Machine, name: str, given: Curve, covariance: FloatArra
         raise InputError("contains a value or position that is not finite; remove that node", field=name)
     if np.any(given.u < 0) or np.any(np.isinf(given.u)):
         raise InputError("has a negative or infinite uncertainty; give a number >= 0 or leave it empty", field=name)
-    curve = _extend(machine, name, given)
+    curve, axis = given, error_named(name).axis
+    low, high = machine.axes[axis].range_mm
+    before, after = given.position_mm[0] > low + SAME_POSITION_MM, given.position_mm[-1] < high - SAME_POSITION_MM
+    if before or after:  # nodes at the travel ends that it does not reach, at its end values
+        warnings.warn(
+            f"{name} is known from {given.position_mm[0]:g} to {given.position_mm[-1]:g} mm, but {AXES[axis]} travels "
+            f"from {low:g} to {high:g} mm; its end values are used beyond",
+            CompgenWarning,
+            stacklevel=4,
+        )
+        pad = (int(before), int(after))
+        nodes_mm = np.concatenate([[low] * pad[0], given.position_mm, [high] * pad[1]])
+        curve = Curve(nodes_mm, np.pad(given.value, pad, "edge"), np.pad(given.u, pad, "edge"))
     position = curve.position_mm
     rows = tuple(interpolation_row(position, at) for at in fixed_points_mm(machine, name))
     removed = np.array([apply_row(row, curve.value) for row in rows])
@@ -222,14 +216,6 @@ def target_basis(machine: Machine) -> FloatArray:
     return np.stack([column.ravel() for column in columns], axis=1)
 
 
-def _gained(fixed: FixedCurve, shares: FloatArray) -> FloatArray:
-    """Variance (9,) that shares (k, 9) of the fixed functionals pass on; an unknown u counts only where it has a share."""
-    gains = shares.T @ fixed.functional
-    if fixed.covariance is not None:
-        return np.asarray(np.einsum("ij,jk,ik->i", gains, fixed.covariance, gains))
-    return np.asarray(np.where(gains != 0, gains**2 * fixed.u**2, 0.0).sum(axis=1))
-
-
 def decompose(machine: Machine, curves: Mapping[str, FixedCurve]) -> tuple[FrameChange, dict[str, float]]:
     """Split the field that the curves lost into squareness and rigid motion; also the variance that squareness gains."""
     basis = target_basis(machine)
@@ -246,7 +232,11 @@ def decompose(machine: Machine, curves: Mapping[str, FixedCurve]) -> tuple[Frame
             parts[np.abs(parts) < 1e-13 * np.abs(parts).max()] = 0.0
             total += parts * removed
             shares.append(parts * (abs(removed) > NOTHING))
-        variance += _gained(fixed, np.array(shares))
+        gains = np.array(shares).T @ fixed.functional
+        if fixed.covariance is not None:
+            variance += np.einsum("ij,jk,ik->i", gains, fixed.covariance, gains)
+        else:  # an unknown u counts only where it has a share
+            variance += np.where(gains != 0, gains**2 * fixed.u**2, 0.0).sum(axis=1)
     change = FrameChange(
         translation_mm=(float(total[6]), float(total[7]), float(total[8])),
         rotation_rad=(float(total[3]), float(total[4]), float(total[5])),
@@ -299,7 +289,17 @@ def zero_ends(machine: Machine, errors: ErrorTable, covariance: Mapping[str, Flo
     for name, value in change.squareness.items():
         if name not in kept and abs(value) > NOTHING:
             raise _no_room(machine, name, value, curves)
-    _warn_tools(machine, curves, change)
+    # the table may tell tools of different offset apart, and what is taken out is not the same for them
+    one_tool = observable_errors(machine)
+    told_apart = [name for name in curves if name not in one_tool]
+    if told_apart and np.abs(np.subtract(change.tool_rotation_rad, change.rotation_rad)).max() > NOTHING:
+        warnings.warn(
+            f"a rotation is taken out of the curves; E stays the same for the machine's tool offset "
+            f"{machine.tool_offset_mm} mm and changes by a constant for the other tools that "
+            f"{', '.join(told_apart)} refer to",
+            CompgenWarning,
+            stacklevel=3,
+        )
     squareness = dict(errors.squareness)
     for name in SQUARENESS_NAMES:
         if name in squareness or abs(change.squareness[name]) > _ROUNDING:
@@ -326,18 +326,3 @@ def _no_room(machine: Machine, name: str, value: float, curves: Mapping[str, Fix
         file=machine.source,
         field="errors",
     )
-
-
-def _warn_tools(machine: Machine, curves: Mapping[str, FixedCurve], change: FrameChange) -> None:
-    """Warn when the table tells tools of different offset apart, and what is taken out is not the same for them."""
-    one_tool = observable_errors(machine)
-    told_apart = [name for name in curves if name not in one_tool]
-    turn = np.abs(np.subtract(change.tool_rotation_rad, change.rotation_rad))
-    if told_apart and turn.max() > NOTHING:
-        warnings.warn(
-            f"a rotation is taken out of the curves; E stays the same for the machine's tool offset "
-            f"{machine.tool_offset_mm} mm and changes by a constant for the other tools that "
-            f"{', '.join(told_apart)} refer to",
-            CompgenWarning,
-            stacklevel=4,
-        )

@@ -27,8 +27,8 @@ from compgen.identify.covariance import (
     values_at_nodes,
 )
 from compgen.kinematics.curves import hat_matrix
-from compgen.kinematics.first_order import volumetric_error
 from compgen.kinematics.gauge import LEVER_MM, gauge_directions, rigid_fields
+from compgen.kinematics.many_points import volumetric_error
 
 # Whether a machine has changed between two measurements, against the uncertainty of both.
 #

@@ -1,10 +1,10 @@
 """The machine model: E = C P to first order, and the exact product of finite rotations."""
 
-from compgen.kinematics.exact_chain import exact_columns, exact_error, exact_error_at, predict
-from compgen.kinematics.first_order import c_matrix, coefficients, modelled_errors, observable_errors, volumetric_error
+from compgen.kinematics.exact_chain import exact_columns, exact_error, predict
+from compgen.kinematics.first_order import c_matrix, coefficients, modelled_errors, observable_errors
 from compgen.kinematics.gauge import align, gauge_directions
 from compgen.kinematics.kernel_switch import load_kernels
-from compgen.kinematics.many_points import volumetric_error_at, volumetric_error_on_grid
+from compgen.kinematics.many_points import volumetric_error, volumetric_error_on_grid
 
 __all__ = [
     "align",
@@ -12,13 +12,11 @@ __all__ = [
     "coefficients",
     "exact_columns",
     "exact_error",
-    "exact_error_at",
-    "load_kernels",
     "gauge_directions",
+    "load_kernels",
     "modelled_errors",
     "observable_errors",
     "predict",
     "volumetric_error",
-    "volumetric_error_at",
     "volumetric_error_on_grid",
 ]

@@ -140,19 +140,6 @@ def field_kernel(
 
 
 @_inline
-def _row_along_z(x: Any, along_x: Any, y: Any, along_y: Any) -> Any:
-    """Constant (three components) and slope (three) of a row along z, from the tables (4, 3) at its x and y."""
-    return (
-        along_x[0, 0] + x * along_x[1, 0] + y * along_x[2, 0] + along_y[0, 0] + x * along_y[1, 0] + y * along_y[2, 0],
-        along_x[0, 1] + x * along_x[1, 1] + y * along_x[2, 1] + along_y[0, 1] + x * along_y[1, 1] + y * along_y[2, 1],
-        along_x[0, 2] + x * along_x[1, 2] + y * along_x[2, 2] + along_y[0, 2] + x * along_y[1, 2] + y * along_y[2, 2],
-        along_x[3, 0] + along_y[3, 0],
-        along_x[3, 1] + along_y[3, 1],
-        along_x[3, 2] + along_y[3, 2],
-    )
-
-
-@_inline
 def _four(values: Any, at: Any) -> Row:
     return values[at], values[at + np.uint64(1)], values[at + np.uint64(2)], values[at + np.uint64(3)]
 
@@ -190,10 +177,12 @@ def grid_kernel(tilted: bool) -> Callable[..., None]:
                 for o in range(3):
                     own[3 * k + o] = along_z[k, 0, o] + z[k] * along_z[k, 3, o] + x[i] * along_z[k, 1, o]
             for j in range(len(y)):
-                p0, p1, p2, q0, q1, q2 = _row_along_z(x[i], along_x[i], y[j], along_y[j])
-                for k in range(0, 12, 3):
-                    constant[k], constant[k + 1], constant[k + 2] = p0, p1, p2
-                    slope[k], slope[k + 1], slope[k + 2] = q0, q1, q2
+                for o in range(3):  # constant and slope along z, from the tables (4, 3) at x and y
+                    of_x = along_x[i, 0, o] + x[i] * along_x[i, 1, o] + y[j] * along_x[i, 2, o]
+                    p = of_x + along_y[j, 0, o] + x[i] * along_y[j, 1, o] + y[j] * along_y[j, 2, o]
+                    q = along_x[i, 3, o] + along_y[j, 3, o]
+                    for k in range(o, 12, 3):
+                        constant[k], slope[k] = p, q
                 at = zero
                 while at + twelve <= length:
                     for lane in (zero, four, eight):

@@ -97,23 +97,17 @@ def fitted_line(position_mm: FloatArray, value: FloatArray, kind: str = "ls") ->
     if kind == "ls":
         slope, constant = np.polyfit(position_mm, value, 1)
         return float(constant), float(slope)
-    return _minimum_zone(position_mm, value)
-
-
-def _minimum_zone(position_mm: FloatArray, value: FloatArray) -> tuple[float, float]:
-    """The minimum-zone line is parallel to an edge of the convex hull: the narrowest strip over all of its edges."""
-    order = np.lexsort((value, position_mm))
-    points = np.column_stack([position_mm, value])[order]
+    # the minimum-zone line is parallel to an edge of the convex hull: the narrowest strip over all of its edges
+    points = np.column_stack([position_mm, value])[np.lexsort((value, position_mm))]
     best = (np.inf, 0.0, 0.0)
     for sign in (1.0, -1.0):
         for (q1, y1), (q2, y2) in pairwise(_lower_hull(points * [1.0, sign])):
             if q2 <= q1:
                 continue
-            slope = sign * (y2 - y1) / (q2 - q1)
-            rest = value - slope * position_mm
-            width = float(np.ptp(rest))
-            if width < best[0]:
-                best = (width, 0.5 * float(rest.max() + rest.min()), float(slope))
+            edge = float(sign * (y2 - y1) / (q2 - q1))
+            rest = value - edge * position_mm
+            if (width := float(np.ptp(rest))) < best[0]:
+                best = (width, 0.5 * float(rest.max() + rest.min()), edge)
     return best[1], best[2]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,16 +11,16 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_INDEX, ERRORS
-from compgen.kinematics.first_order import tool_of, volumetric_error
+from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.kernel_switch import use_compiled
 from compgen.kinematics.many_points import (
     AxisTable,
-    AxisTables,
     blocks,
     checked_out,
     checked_points,
     exact_at,
     motion_tables,
+    volumetric_error,
 )
 
 # The small rotation: R(eps) of a rotation vector eps in rad, and its derivative. The one place of these formulas.
@@ -139,24 +138,6 @@ def tip_position(
     return tip
 
 
-def exact_error(
-    machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
-) -> FloatArray:
-    """Exact error of the tool tip at commanded positions (n, 3): tip minus (position + tool offset), (n, 3), mm.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import compgen
-    >>> machine = compgen.load_machine("zha-gantry")
-    >>> leaning = compgen.ErrorTable(squareness={"EC0Y": (2903e-6, 0.0)})
-    >>> position_mm = np.array([[0.0, -1000.0, 0.0]])
-    >>> compgen.exact_error(machine, leaning, position_mm).round(4).tolist()
-    [[2.903, 0.0042, 0.0]]
-    """
-    return exact_error_at(machine, errors, position_mm, tool_mm)
-
-
 def exact_columns(
     machine: Machine, values: FloatArray, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
@@ -178,24 +159,19 @@ def exact_columns(
         else:
             tip = tip + travel[axis] + delta
         columns[:, :, linear] += np.eye(3)
-        _add_squareness(machine, columns, turns[axis], travel[axis], axis)
+        # the travel vector turns with the squareness errors of its axis
+        if axis == 2 or machine.squareness_reference == "YX"[axis]:
+            by_turn = rotation_derivative(turns[axis], travel[axis])
+            if axis == 2:
+                columns[:, :, ERROR_INDEX["EA0Z"]] += by_turn[:, :, 0]
+                columns[:, :, ERROR_INDEX["EB0Z"]] += by_turn[:, :, 1]
+            else:
+                columns[:, :, ERROR_INDEX["EC0Y"]] += by_turn[:, :, 2] if axis == 1 else -by_turn[:, :, 2]
         if not tool_side:
             tip = turned = rotate(eps, tip)
             columns = rotate(eps, columns)
         columns[:, :, angular] += rotation_derivative(eps, turned)
     return tip, columns
-
-
-def _add_squareness(machine: Machine, columns: FloatArray, turn: FloatArray, travel: FloatArray, axis: int) -> None:
-    """Add the derivative of the travel vector of ``axis`` by the squareness errors that turn it."""
-    if axis == 0 and machine.squareness_reference == "Y":
-        columns[:, :, ERROR_INDEX["EC0Y"]] -= rotation_derivative(turn, travel)[:, :, 2]
-    elif axis == 1 and machine.squareness_reference == "X":
-        columns[:, :, ERROR_INDEX["EC0Y"]] += rotation_derivative(turn, travel)[:, :, 2]
-    elif axis == 2:
-        derivative = rotation_derivative(turn, travel)
-        columns[:, :, ERROR_INDEX["EA0Z"]] += derivative[:, :, 0]
-        columns[:, :, ERROR_INDEX["EB0Z"]] += derivative[:, :, 1]
 
 
 def travel_directions(machine: Machine, squareness_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -244,14 +220,27 @@ _SQUARENESS = ("EC0Y", "EB0Z", "EA0Z")
 Vector = list[FloatArray]
 
 
-def exact_error_at(
+def exact_error(
     machine: Machine,
     errors: ErrorTable,
     position_mm: FloatArray,
     tool_mm: FloatArray | None = None,
     out: FloatArray | None = None,
 ) -> FloatArray:
-    """Exact error of the tool tip at commanded positions; arguments and result as ``volumetric_error_at``."""
+    """Exact error of the tool tip at commanded positions (n, 3): tip minus (position + tool offset), (n, 3), mm.
+
+    Parameters and result are those of :func:`volumetric_error`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> leaning = compgen.ErrorTable(squareness={"EC0Y": (2903e-6, 0.0)})
+    >>> position_mm = np.array([[0.0, -1000.0, 0.0]])
+    >>> compgen.exact_error(machine, leaning, position_mm).round(4).tolist()
+    [[2.903, 0.0042, 0.0]]
+    """
     position = checked_points(position_mm)
     result = checked_out(out, position.shape)
     tool = np.atleast_2d(tool_of(machine, tool_mm))
@@ -262,43 +251,26 @@ def exact_error_at(
         exact_at(tables, order, tilt, position, tool, result)
         return result
     for part in blocks(len(position)):
-        _exact_block(tables, order, tilt, position[part], tool if len(tool) == 1 else tool[part], result[part])
+        coordinates = np.ascontiguousarray(position[part].T)
+        nominal = list(np.array(np.broadcast_to(tool if len(tool) == 1 else tool[part], position[part].shape).T))
+        error = list(np.zeros_like(coordinates))
+        for axis, tool_side in order:
+            q, motion = coordinates[axis], _motion(tables[axis], coordinates[axis])
+            moved = [own + q * turned if turned else own for own, turned in zip(motion[:3], tilt[axis], strict=True)]
+            if not tool_side:
+                nominal[axis] += q
+                error = _sum(error, moved)
+            error = _sum(error, _turned(motion[3:], nominal, error))
+            if tool_side:
+                nominal[axis] += q
+                error = _sum(error, moved)
+        for k in range(3):
+            result[part, k] = error[k]
     return result
 
 
-def _exact_block(
-    tables: AxisTables,
-    order: Sequence[tuple[int, bool]],
-    tilt: FloatArray,
-    position_mm: FloatArray,
-    tool_mm: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Write the exact error at a few points (m, 3) with tool offsets (1, 3) or (m, 3) to ``out`` (m, 3)."""
-    coordinates = np.ascontiguousarray(position_mm.T)
-    nominal = list(np.array(np.broadcast_to(tool_mm, position_mm.shape).T))
-    error = list(np.zeros_like(coordinates))
-    for axis, tool_side in order:
-        q, (delta, eps) = coordinates[axis], _motion(tables[axis], coordinates[axis])
-        moved = [own + q * turned if turned else own for own, turned in zip(delta, tilt[axis], strict=True)]
-        if not tool_side:
-            nominal[axis] += q
-            _add(error, moved)
-        _add(error, _turned(eps, nominal, error))
-        if tool_side:
-            nominal[axis] += q
-            _add(error, moved)
-    for k in range(3):
-        out[:, k] = error[k]
-
-
-def _add(total: Vector, part: Vector) -> None:
-    for k in range(3):
-        total[k] += part[k]
-
-
-def _motion(table: AxisTable, coordinate: FloatArray) -> tuple[Vector, Vector]:
-    """Translation and rotation vector of one axis, component by component, each (m,)."""
+def _motion(table: AxisTable, coordinate: FloatArray) -> Vector:
+    """Translation and rotation vector of one axis: six components, each (m,)."""
     motion = list(np.zeros((6, len(coordinate))))
     cell, share = table.index.locate(coordinate)
     left = np.empty_like(coordinate)
@@ -308,13 +280,17 @@ def _motion(table: AxisTable, coordinate: FloatArray) -> tuple[Vector, Vector]:
         value *= share
         channel.left.take(cell, mode="clip", out=left)
         value += left
-    return motion[:3], motion[3:]
+    return motion
+
+
+def _sum(first: Vector, second: Vector) -> Vector:
+    return [a + b for a, b in zip(first, second, strict=True)]
 
 
 def _turned(eps: Vector, nominal: Vector, error: Vector) -> Vector:
     """R(eps) x - x for x = nominal + error, by Rodrigues' formula; components (m,)."""
     first, second = rotation_factors(eps[0] * eps[0] + eps[1] * eps[1] + eps[2] * eps[2])
-    once = _cross(eps, [n + e for n, e in zip(nominal, error, strict=True)])
+    once = _cross(eps, _sum(nominal, error))
     return [first * a + second * b for a, b in zip(once, _cross(eps, once), strict=True)]
 
 

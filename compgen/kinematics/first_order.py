@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Chain, Machine, Reference
 from compgen.data.names import ERROR_INDEX, ERROR_NAMES, ERRORS
 
@@ -103,28 +102,6 @@ def c_matrix(machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | No
     for term in coefficients(machine.chain, machine.squareness_reference):
         matrix[:, term.output, ERROR_INDEX[term.error]] += term.sign * factor(term.lever, position_mm, tool)
     return matrix
-
-
-def volumetric_error(
-    machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
-) -> FloatArray:
-    """Error E = C P of the tool tip against the workpiece at commanded positions (n, 3): shape (n, 3), mm.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import compgen
-    >>> machine = compgen.load_machine("zha-gantry")
-    >>> leaning = compgen.ErrorTable(squareness={"EC0Y": (2903e-6, 0.0)})
-    >>> position_mm = np.array([[0.0, -1000.0, 0.0]])
-    >>> compgen.volumetric_error(machine, leaning, position_mm).round(4).tolist()
-    [[2.903, 0.0, 0.0]]
-    """
-    from compgen.kinematics.many_points import (
-        volumetric_error_at,  # imported here: it builds on the list of terms above
-    )
-
-    return volumetric_error_at(machine, errors, position_mm, tool_mm)
 
 
 # Which of the 21 errors a machine's own motion can show (``docs/conventions.md``, "Names").

@@ -131,7 +131,11 @@ def align(
     full = _completed(errors, reference)
     names = [name for name in full.names if name in full.squareness or len(full.curves[name].value) > 1]
     directions = gauge_directions(machine, names, tools_mm)
-    changes: list[Change] = [_affine_change(full, direction) for direction in directions]
+    changes: list[Change] = []
+    for direction in directions:  # constants and slopes (21, 2) as changes of node values
+        parts = {name: direction[ERROR_INDEX[name]] for name in full.names}
+        along = {name: full.curves[name].position_mm if name in full.curves else np.zeros(1) for name in full.names}
+        changes.append({name: part[0] + part[1] * along[name] for name, part in parts.items() if part.any()})
     changes += _free_changes(machine, full, tools_mm)
     if not changes:
         return errors
@@ -150,16 +154,6 @@ def _completed(errors: ErrorTable, reference: ErrorTable) -> ErrorTable:
         curves.setdefault(name, Curve(curve.position_mm, zero, np.full(len(zero), np.nan)))
     squareness = {**dict.fromkeys(reference.squareness, (0.0, float("nan"))), **errors.squareness}
     return ErrorTable(curves, squareness, errors.metadata)
-
-
-def _affine_change(full: ErrorTable, direction: FloatArray) -> Change:
-    """Constants and slopes (21, 2) as changes of node values."""
-    change = {}
-    for name in full.names:
-        constant, slope = direction[ERROR_INDEX[name]]
-        if constant or slope:
-            change[name] = constant + slope * (full.curves[name].position_mm if name in full.curves else np.zeros(1))
-    return change
 
 
 def _free_changes(machine: Machine, full: ErrorTable, tools_mm: FloatArray | None) -> list[Change]:

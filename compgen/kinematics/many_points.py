@@ -347,14 +347,14 @@ def blocks(count: int, size: int = BLOCK) -> Iterator[slice]:
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
-def volumetric_error_at(
+def volumetric_error(
     machine: Machine,
     errors: ErrorTable,
     position_mm: FloatArray,
     tool_mm: FloatArray | None = None,
     out: FloatArray | None = None,
 ) -> FloatArray:
-    """Error E = C P of the tool tip at commanded positions.
+    """Error E = C P of the tool tip against the workpiece at commanded positions.
 
     Parameters
     ----------
@@ -366,6 +366,16 @@ def volumetric_error_at(
     Returns
     -------
     array of shape (n, 3), mm.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> machine = compgen.load_machine("zha-gantry")
+    >>> leaning = compgen.ErrorTable(squareness={"EC0Y": (2903e-6, 0.0)})
+    >>> position_mm = np.array([[0.0, -1000.0, 0.0]])
+    >>> compgen.volumetric_error(machine, leaning, position_mm).round(4).tolist()
+    [[2.903, 0.0, 0.0]]
     """
     position = checked_points(position_mm)
     result = checked_out(out, position.shape)
@@ -376,24 +386,19 @@ def volumetric_error_at(
         field_at(tables, position, each, result)
         return result
     for part in blocks(len(position)):
-        _field_block(tables, position[part], None if each is None else each[part], result[part])
+        factors = list(np.ascontiguousarray(position[part].T))
+        if each is not None:
+            factors.extend(np.ascontiguousarray(each[part].T))
+        sums = _group_sums(tables, factors)
+        for output in range(3):
+            total = sums.pop((ONE, output), None)
+            for group, factor in enumerate(factors, start=1):
+                term = sums.pop((group, output), None)
+                if term is not None:
+                    term *= factor
+                    total = term if total is None else np.add(total, term, out=total)
+            result[part, output] = 0.0 if total is None else total
     return result
-
-
-def _field_block(tables: AxisTables, position_mm: FloatArray, tool_mm: FloatArray | None, out: FloatArray) -> None:
-    """Write the field at a few points (m, 3) to ``out`` (m, 3)."""
-    factors = list(np.ascontiguousarray(position_mm.T))
-    if tool_mm is not None:
-        factors.extend(np.ascontiguousarray(tool_mm.T))
-    sums = _group_sums(tables, factors)
-    for output in range(3):
-        total = sums.pop((ONE, output), None)
-        for group, factor in enumerate(factors, start=1):
-            term = sums.pop((group, output), None)
-            if term is not None:
-                term *= factor
-                total = term if total is None else np.add(total, term, out=total)
-        out[:, output] = 0.0 if total is None else total
 
 
 def _group_sums(tables: AxisTables, coordinates: Sequence[FloatArray]) -> dict[tuple[int, int], FloatArray]:
@@ -461,38 +466,28 @@ def _grid_by_rank(at_levels: Sequence[FloatArray], levels: Sequence[FloatArray],
     E_o = 1 * [P_o(x, y)] + z * [Q_o(x, y)] + Z_1,o(z) * [1] + Z_x,o(z) * [x] + Z_y,o(z) * [y], where Z_1 takes z Z_z.
     """
     count_x, count_y, count_z, _ = out.shape
-    columns = _functions_of_z(at_levels[2], levels[2])
+    z, values = levels[2], at_levels[2]
+    components = np.tile(np.eye(3), count_z)
+    own = values[:, 0] + z[:, None] * values[:, 3]
+    functions = [own.reshape(1, -1), values[:, 1].reshape(1, -1), values[:, 2].reshape(1, -1)]
+    columns = np.vstack([components, components * np.repeat(z, 3), *functions])  # (9, 3 nz)
     needed = np.any(columns != 0.0, axis=1)
     needed[3:6] &= np.any(at_levels[0][:, 3], axis=0) | np.any(at_levels[1][:, 3], axis=0)
     rows = out.reshape(count_x * count_y, 3 * count_z)
     plane = max(1, BLOCK // count_y)
     for part in blocks(count_x, plane):
         for inner in blocks(count_y, BLOCK):
-            left = _functions_of_xy(at_levels, levels, part, inner)[:, needed]
+            # the nine factors (P, Q, 1, x, y) of those functions, (nx, ny, 9)
+            x, y = levels[0][part, None, None], levels[1][None, inner, None]
+            along_x, along_y = at_levels[0][part, None], at_levels[1][None, inner]
+            factors = np.empty((x.shape[0], y.shape[1], 9))
+            factors[:, :, 0:3] = along_x[:, :, 0] + x * along_x[:, :, 1] + along_y[:, :, 0] + y * along_y[:, :, 2]
+            factors[:, :, 0:3] += y * along_x[:, :, 2] + x * along_y[:, :, 1]
+            factors[:, :, 3:6] = along_x[:, :, 3] + along_y[:, :, 3]
+            factors[:, :, 6], factors[:, :, 7], factors[:, :, 8] = 1.0, x[:, :, 0], y[:, :, 0]
+            left = factors.reshape(-1, 9)[:, needed]
             first = part.start * count_y + inner.start
             product, right = rows[first : first + len(left)], columns[needed]
             with one_thread():
                 for some in blocks(len(left), max(1, 3 * _GRID_BLOCK // right.shape[1])):
                     np.matmul(left[some], right, out=product[some])
-
-
-def _functions_of_z(values: FloatArray, z_mm: FloatArray) -> FloatArray:
-    """Nine functions of (z, component), shape (9, 3 nz)."""
-    components = np.tile(np.eye(3), len(z_mm))
-    own = values[:, 0] + z_mm[:, None] * values[:, 3]
-    functions = np.vstack([components, components * np.repeat(z_mm, 3), own.reshape(1, -1)])
-    return np.vstack([functions, values[:, 1].reshape(1, -1), values[:, 2].reshape(1, -1)])
-
-
-def _functions_of_xy(
-    at_levels: Sequence[FloatArray], levels: Sequence[FloatArray], part_x: slice, part_y: slice
-) -> FloatArray:
-    """The nine factors (P, Q, 1, x, y) of those functions at levels (x, y), shape (nx * ny, 9)."""
-    x, y = levels[0][part_x, None, None], levels[1][None, part_y, None]
-    along_x, along_y = at_levels[0][part_x, None], at_levels[1][None, part_y]
-    factors = np.empty((x.shape[0], y.shape[1], 9))
-    factors[:, :, 0:3] = along_x[:, :, 0] + x * along_x[:, :, 1] + along_y[:, :, 0] + y * along_y[:, :, 2]
-    factors[:, :, 0:3] += y * along_x[:, :, 2] + x * along_y[:, :, 1]
-    factors[:, :, 3:6] = along_x[:, :, 3] + along_y[:, :, 3]
-    factors[:, :, 6], factors[:, :, 7], factors[:, :, 8] = 1.0, x[:, :, 0], y[:, :, 0]
-    return factors.reshape(-1, 9)

@@ -119,9 +119,8 @@ _STOP: list[Any] = []
 _TOLD: list[Any] = []
 
 
-@lru_cache(maxsize=4)
-def _unpacked(content: bytes) -> Any:
-    return pickle.loads(content)
+#: The function of a packed one: the same few are asked for again and again.
+_unpacked = lru_cache(maxsize=4)(pickle.loads)
 
 
 def perform(function: Packed, item: Packed) -> Answer:
@@ -132,21 +131,16 @@ def perform(function: Packed, item: Packed) -> Answer:
         try:
             content, failed = pickle.dumps(_unpacked(function.content)(item.value())), False
         except Exception as error:
-            content, failed = _pickled_error(error), True
+            failed = True
+            try:
+                content = pickle.dumps(error)
+                pickle.loads(content)
+            except Exception:  # it cannot be sent: its text and exit code can
+                known = isinstance(error, CompgenError)
+                other = RemoteError(str(error) if known else f"{type(error).__name__}: {error}")
+                other.exit_code = error.exit_code if isinstance(error, CompgenError) else 3
+                content = pickle.dumps(other)
     return Answer(content, failed, tuple(str(w.message) for w in caught if issubclass(w.category, CompgenWarning)))
-
-
-def _pickled_error(error: Exception) -> bytes:
-    """Return the error, or one of its text and exit code where it cannot be sent."""
-    try:
-        content = pickle.dumps(error)
-        pickle.loads(content)
-        return content
-    except Exception:
-        known = isinstance(error, CompgenError)
-        other = RemoteError(str(error) if known else f"{type(error).__name__}: {error}")
-        other.exit_code = error.exit_code if isinstance(error, CompgenError) else 3
-        return pickle.dumps(other)
 
 
 def stopping() -> bool:
@@ -318,28 +312,18 @@ def spread(
             return lost(item, error)
 
     pool = ThreadPoolExecutor(workers.size, thread_name_prefix="compgen")
-    try:
-        yield from _in_order(pool, work, iter(items), AHEAD * workers.size)
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _in_order(
-    pool: ThreadPoolExecutor, work: Callable[[Item], Result], items: Iterator[Item], most: int
-) -> Iterator[Result]:
     waiting: deque[Future[Result]] = deque()
     try:
         for item in items:
             waiting.append(pool.submit(work, item))
-            if len(waiting) >= most:
+            if len(waiting) >= AHEAD * workers.size:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
     except CancelledError as error:
         raise StoppedError("stopped") from error
     finally:
-        for future in waiting:
-            future.cancel()
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def opened_workers(workers: int, cluster: str | None) -> Workers | None:
@@ -381,23 +365,17 @@ class Facts:
     host: str = ""
 
 
+@cache
 def facts(*, host: bool) -> Facts:
-    """Return the facts of this process."""
-    return Facts(_versions(), _host() if host else "")
-
-
-@cache
-def _versions() -> tuple[tuple[str, str], ...]:
-    return tuple((name, next((item.version for item in distributions(name=name)), "none")) for name in PACKAGES)
-
-
-@cache
-def _host() -> str:
-    """Name this start of this computer."""
+    """Return the facts of this process; ``host`` names this start of this computer."""
+    versions = tuple((name, next((item.version for item in distributions(name=name)), "none")) for name in PACKAGES)
+    if not host:
+        return Facts(versions)
     try:
-        return f"{gethostname()} {Path('/proc/sys/kernel/random/boot_id').read_text(encoding='ascii').strip()}"
+        start = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
-        return gethostname()
+        return Facts(versions, gethostname())
+    return Facts(versions, f"{gethostname()} {start}")
 
 
 def objection(required: Facts, found: Facts, who: str) -> str:
@@ -435,10 +413,22 @@ class Cluster:
     def __init__(self, address: str, *, same_host: str = "") -> None:
         if importlib.util.find_spec("distributed") is None:
             raise InputError("--cluster needs Dask; install compgen[cluster]")
+        from distributed import Client  # imported here: an optional extra
+
         self.address, self._same_host = address, same_host
         self._required = facts(host=bool(same_host))
         self._empty_since: float | None = None
-        self._client = _connected(address)
+        for name in ("distributed", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is raised
+        make: Any = Client
+        try:
+            self._client = make(address, timeout=CONNECT_S, set_as_default=False, name="compgen")
+        except (OSError, TimeoutError, ValueError, KeyError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ClusterError(
+                f"no Dask scheduler answers at {address} within {CONNECT_S:.0f} s ({reason}); start one with "
+                "`dask scheduler`, or give its address, for example tcp://10.0.0.5:8786"
+            ) from error
         try:
             self._check()
             threads = sum(self._client.nthreads().values())
@@ -523,19 +513,3 @@ class Cluster:
     def close(self) -> None:
         """Leave the cluster; tasks that were not begun are forgotten by it."""
         self._client.close()
-
-
-def _connected(address: str) -> Any:
-    from distributed import Client
-
-    make: Any = Client
-    for name in ("distributed", "tornado"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is raised
-    try:
-        return make(address, timeout=CONNECT_S, set_as_default=False, name="compgen")
-    except (OSError, TimeoutError, ValueError, KeyError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ClusterError(
-            f"no Dask scheduler answers at {address} within {CONNECT_S:.0f} s ({reason}); start one with "
-            "`dask scheduler`, or give its address, for example tcp://10.0.0.5:8786"
-        ) from error

@@ -132,8 +132,13 @@ def _three_grids(
     positions, weights = [], []
     for axis in range(3):
         count = int(np.clip(np.sqrt(most / len(sides[axis][0])), LEAST_ACROSS, MOST_ACROSS))
-        parts = [_gauss_legendre(machine, k, emphasis, count) for k in range(3)]
-        parts[axis] = sides[axis]
+        parts = list(sides)
+        for k in {0, 1, 2} - {axis}:  # about ``count`` points over the axis, within and outside of the work zone
+            ends = np.unique([*machine.axes[k].range_mm, *emphasis.ends_mm(k)])
+            points, weight = np.polynomial.legendre.leggauss(max(LEAST_ACROSS, count // (len(ends) - 1)))
+            middle, half = 0.5 * (ends[1:] + ends[:-1])[:, None], 0.5 * np.diff(ends)[:, None]
+            weighted = emphasis.factor(k, middle) * half * weight
+            parts[k] = (middle + half * points).ravel(), weighted.ravel() / np.sum(weighted)
         grid = VolumeGrid((parts[0][0], parts[1][0], parts[2][0]))
         positions.append(grid.position_mm)
         weights.append(np.einsum("i,j,k->ijk", parts[0][1], parts[1][1], parts[2][1]).ravel())
@@ -156,12 +161,3 @@ def _between_nodes(
     middle, half = 0.5 * (ends[1:] + ends[:-1])[:, None], 0.5 * np.diff(ends)[:, None]
     weighted = emphasis.factor(axis, middle) * half * np.ones(2)
     return (middle + half * np.array([-1.0, 1.0]) / np.sqrt(3.0)).ravel(), weighted.ravel() / np.sum(weighted)
-
-
-def _gauss_legendre(machine: Machine, axis: int, emphasis: Emphasis, count: int) -> tuple[FloatArray, FloatArray]:
-    """Points over an axis, about ``count`` in all, within and beside the work zone; their weights sum to 1."""
-    ends = np.unique([*machine.axes[axis].range_mm, *emphasis.ends_mm(axis)])
-    points, weights = np.polynomial.legendre.leggauss(max(LEAST_ACROSS, count // (len(ends) - 1)))
-    middle, half = 0.5 * (ends[1:] + ends[:-1])[:, None], 0.5 * np.diff(ends)[:, None]
-    weighted = emphasis.factor(axis, middle) * half * weights
-    return (middle + half * points).ravel(), weighted.ravel() / np.sum(weighted)

@@ -22,8 +22,9 @@ from compgen.data.machine import Emphasis, Interval, Machine
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.first_order import tool_of, volumetric_error
+from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.gauge import without_rigid_motion
+from compgen.kinematics.many_points import volumetric_error
 from compgen.kinematics.volume_grid import volume_grid
 from compgen.tables import Export, export
 from compgen.tables.judge import Residuals, in_both_directions, left_by_reversal, residuals

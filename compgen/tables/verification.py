@@ -25,8 +25,9 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.identify.covariance import Covariance, covariance_or_independent, error_design
 from compgen.identify.identification import Identification
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.first_order import observable_errors, tool_of, volumetric_error
+from compgen.kinematics.first_order import observable_errors, tool_of
 from compgen.kinematics.gauge import rigid_fields, without_rigid_motion
+from compgen.kinematics.many_points import volumetric_error
 from compgen.tables.entries import entry_check
 from compgen.tables.judge import (
     Judge,

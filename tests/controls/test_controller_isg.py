@@ -22,7 +22,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import CHAINS, Axis, Chain, Machine
 from compgen.data.names import CURVE_NAMES, ERROR_NAMES, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError
-from compgen.kinematics.first_order import volumetric_error
+from compgen.kinematics.many_points import volumetric_error
 from compgen.tables.render import load_format, render, render_files
 
 GOLDEN = Path(__file__).parents[1] / "golden"

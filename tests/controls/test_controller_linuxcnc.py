@@ -21,7 +21,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import CHAINS, Axis, Chain, Machine
 from compgen.data.names import CURVE_NAMES, error_named
 from compgen.errors import InputError
-from compgen.kinematics.first_order import volumetric_error
+from compgen.kinematics.many_points import volumetric_error
 from compgen.resources import data_folder
 from compgen.tables.render import load_format, render_files
 

@@ -21,7 +21,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import CHAINS, Machine, read_machine
 from compgen.data.names import CURVE_NAMES, error_named
 from compgen.errors import CompgenWarning, InputError
-from compgen.kinematics.first_order import volumetric_error
+from compgen.kinematics.many_points import volumetric_error
 from compgen.tables import export, read_tables, verify
 from compgen.tables.render import load_format, render, render_files
 

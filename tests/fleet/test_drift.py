@@ -14,8 +14,8 @@ from compgen.fleet.change import Calibration, aligned, changes, chi_square_p, ho
 from compgen.fleet.drift import DriftSettings, drift_report
 from compgen.fleet.trend import WALKS, TimeSeries, first_exit, fit_trend, forecast
 from compgen.identify.covariance import Covariance, covariance_or_independent
-from compgen.kinematics.first_order import volumetric_error
 from compgen.kinematics.gauge import gauge_directions
+from compgen.kinematics.many_points import volumetric_error
 
 DAY = datetime(2026, 1, 5, 8, tzinfo=UTC)
 URAD, UM = 1e-6, 1e-3

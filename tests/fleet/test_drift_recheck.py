@@ -8,7 +8,8 @@ from compgen.errors import InputError
 from compgen.fleet.recheck import RequestedChange, power_of, shortest_recheck
 from compgen.identify import IdentifyOptions
 from compgen.identify.covariance import Covariance
-from compgen.kinematics.first_order import modelled_errors, volumetric_error
+from compgen.kinematics.first_order import modelled_errors
+from compgen.kinematics.many_points import volumetric_error
 from compgen.plan import planned_stations
 
 UM, URAD = 1e-3, 1e-6

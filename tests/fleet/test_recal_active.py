@@ -21,7 +21,7 @@ from compgen.fleet.change import volume_points
 from compgen.fleet.job import read_job
 from compgen.fleet.runner import run_jobs
 from compgen.fleet.store import open_store
-from compgen.kinematics.first_order import volumetric_error
+from compgen.kinematics.many_points import volumetric_error
 
 HOUR = timedelta(hours=1)
 #: Without tables the machine is off by more, with the right ones by less than this, um.

@@ -424,8 +424,8 @@ def test_without_dask_the_extra_is_named(monkeypatch):
 
 
 def test_other_versions_are_refused_before_anything_is_sent(address, monkeypatch):
-    mine = cluster._versions()
-    monkeypatch.setattr(cluster, "_versions", lambda: (("compgen", "99.0"), *mine[1:]))
+    mine = cluster.facts(host=False).versions
+    monkeypatch.setattr(cluster, "facts", lambda *, host: cluster.Facts((("compgen", "99.0"), *mine[1:])))
     with pytest.raises(cluster.ClusterError, match=f"the scheduler has compgen {mine[0][1]} in place of 99.0"):
         cluster.Cluster(address)
 
@@ -439,9 +439,11 @@ def test_a_worker_of_another_version_that_comes_later_is_refused_too(there, monk
 def test_an_sqlite_store_needs_workers_on_this_machine(factory, address, monkeypatch):
     url = read_job(factory / "recal.toml").store
     fleet.open_fleet(url, 1, address).close()
-    monkeypatch.setattr(cluster, "_host", lambda: "elsewhere 1234")
+    monkeypatch.setattr(cluster, "gethostname", lambda: "elsewhere")
+    cluster.facts.cache_clear()
     with pytest.raises(cluster.ClusterError, match=r"this is elsewhere; the store is an SQLite file.*postgresql://"):
         fleet.open_fleet(url, 1, address)
+    cluster.facts.cache_clear()
     fleet.open_fleet("postgresql://u@db/n", 1, address).close()
 
 

@@ -19,9 +19,9 @@ from compgen.errors import InputError
 from compgen.kinematics import exact_chain as exact_points
 from compgen.kinematics import exact_error, volumetric_error
 from compgen.kinematics import many_points as evaluate
-from compgen.kinematics.exact_chain import exact_error_at, tip_position
+from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.kernel_switch import load_kernels
-from compgen.kinematics.many_points import NodeIndex, volumetric_error_at, volumetric_error_on_grid
+from compgen.kinematics.many_points import NodeIndex, volumetric_error_on_grid
 
 ROUNDING_MM = 1e-12
 RANGES_MM = ((-800.0, 0.0), (-300.0, 500.0), (0.0, 400.0))
@@ -248,7 +248,7 @@ def test_infinite_positions_have_end_values_and_unknown_ones_unknown_errors(node
 @pytest.mark.usefixtures("way")
 def test_the_result_goes_to_a_given_array_even_to_that_of_the_positions():
     machine, errors, points = machine_of(), errors_of(), points_of(50)
-    for at in (volumetric_error_at, exact_error_at):
+    for at in (volumetric_error, exact_error):
         due, out, same = at(machine, errors, points), np.empty((50, 3)), points.copy()
         assert at(machine, errors, points, out=out) is out
         assert at(machine, errors, same, out=same) is same
@@ -280,10 +280,10 @@ def test_positions_may_be_views_integers_or_read_only():
         (lambda m, e: volumetric_error(m, e, np.zeros(3)), r"shape \(3,\); expected \(n, 3\)"),
         (lambda m, e: exact_error(m, e, np.zeros((4, 2))), r"shape \(4, 2\)"),
         (
-            lambda m, e: volumetric_error_at(m, e, np.zeros((4, 3)), out=np.zeros((3, 3))),
+            lambda m, e: volumetric_error(m, e, np.zeros((4, 3)), out=np.zeros((3, 3))),
             r"shape \(3, 3\) and type float64; expected .* \(4, 3\)",
         ),
-        (lambda m, e: volumetric_error_at(m, e, np.zeros((4, 3)), out=np.zeros((4, 3), np.float32)), "float32"),
+        (lambda m, e: volumetric_error(m, e, np.zeros((4, 3)), out=np.zeros((4, 3), np.float32)), "float32"),
         (lambda m, e: volumetric_error_on_grid(m, e, [np.zeros(2)] * 2), "three lists of levels"),
         (lambda m, e: volumetric_error_on_grid(m, e, [np.zeros((2, 2))] * 3), "three lists of levels"),
         (lambda m, e: volumetric_error_on_grid(m, e, [np.zeros(2)] * 3, np.zeros((8, 3))), "a grid has one tool"),

@@ -172,7 +172,7 @@ def test_residuals_above_a_third_of_what_the_tables_take_away_are_not_accepted(t
     rng = np.random.default_rng(4)
     machine = load_machine("zha-gantry")
     lengths = read_lengths(EXAMPLE)
-    from compgen.kinematics.first_order import volumetric_error
+    from compgen.kinematics.many_points import volumetric_error
 
     stations = {item.station: np.array(item.position_mm) for item in identify(machine, lengths).stations}
 

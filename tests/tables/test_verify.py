@@ -11,7 +11,7 @@ from compgen.data import toml_files
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.first_order import volumetric_error
+from compgen.kinematics.many_points import volumetric_error
 from compgen.tables import Residuals, export, read_tables, residuals, verify, without_rigid_motion
 
 PICOMETRE = 1e-9
