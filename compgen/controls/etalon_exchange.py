@@ -17,17 +17,13 @@ from compgen.controls.isg_parameters import (
     ISO_NAMES,
     ErrorParameter,
     ParameterFile,
-    ParameterGrid,
-    check_complete,
     check_name,
     collect,
-    content_lines,
-    grid_order,
     is_rotary,
-    number,
-    uses_exponent,
 )
 from compgen.controls.shared.base import SourceFile
+from compgen.controls.shared.grids import ParameterGrid, grid_order
+from compgen.controls.shared.scanner import check_complete, content_lines, floating, uses_exponent
 from compgen.data.error_table import Curve, ErrorTable, read_errors
 from compgen.data.files import read_text
 from compgen.data.names import SQUARENESS_NAMES, error_named
@@ -105,7 +101,7 @@ def _take_entry(source: SourceFile, section: _Section, line: int, text: str) -> 
         raise source.fail(f"[{section.name}] has its value already; expected a new [NAME], got {text[:40]!r}", line)
     value = _VALUE.fullmatch(text)
     if value:
-        section.value = number(source, line, value.group(1), section.name)
+        section.value = floating(source, line, value.group(1), section.name)
     elif _GRID.fullmatch(text):
         section.grid = section.open = True
     else:
@@ -121,7 +117,7 @@ def _parameter(source: SourceFile, section: _Section) -> ErrorParameter:
         raise source.fail(f"[{name}] has no values; was the file cut?", line)
     if name in ISO_NAMES and ISO_NAMES[name] in SQUARENESS_NAMES:
         raise source.fail(f"[{name}] is a constant; expected 'VALUE = number'", line)
-    pairs = np.array([[number(source, at, word, name) for word in words] for at, words in section.rows])
+    pairs = np.array([[floating(source, at, word, name) for word in words] for at, words in section.rows])
     nodes, order = grid_order(source, [at for at, _ in section.rows], [pairs[:, 0]])
     axis = 0 if is_rotary(name) else ARGUMENTS.index(name[-1])
     return ErrorParameter(name, ParameterGrid((axis,), nodes, pairs[order, 1]), source, line)

@@ -19,16 +19,12 @@ from compgen.controls.isg_parameters import (
     CONTROL_NAMES,
     ErrorParameter,
     ParameterFile,
-    ParameterGrid,
-    check_complete,
     check_name,
-    content_lines,
-    grid_order,
     is_rotary,
-    number,
-    uses_exponent,
 )
 from compgen.controls.shared.base import SourceFile
+from compgen.controls.shared.grids import ParameterGrid, grid_order
+from compgen.controls.shared.scanner import check_complete, content_lines, floating, uses_exponent
 from compgen.data.messages import doubled
 from compgen.data.names import AXES, error_named
 from compgen.errors import CompgenWarning
@@ -75,7 +71,7 @@ def _block(source: SourceFile, block: list[_Row]) -> list[ErrorParameter]:
         if len(words) != len(names):
             raise source.fail(f"has {len(words)} columns, its header in line {header_line} has {len(names)}", line)
     matrix = np.array(
-        [[number(source, line, word, name) for word, name in zip(words, names, strict=True)] for line, words in rows]
+        [[floating(source, line, word, name) for word, name in zip(words, names, strict=True)] for line, words in rows]
     )
     columns = {name: matrix[:, k] for k, name in enumerate(names)}
     if any(name in "ABC" for name in names):

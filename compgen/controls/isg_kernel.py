@@ -12,12 +12,10 @@ import numpy as np
 from compgen.controls.isg_parameters import (
     CONTROL_NAMES,
     LOGICAL_NAMES,
-    MOST_LINES,
     TOOL_NAMES,
     Direction,
     ListFile,
     ParameterFile,
-    ParameterGrid,
     axis_letters,
     base_name,
     chain_of,
@@ -27,7 +25,8 @@ from compgen.controls.isg_parameters import (
     parse_list,
 )
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
-from compgen.controls.shared.grids import take_loss_mm, uneven_nodes_mm
+from compgen.controls.shared.grids import ParameterGrid, take_loss_mm, uneven_nodes_mm
+from compgen.controls.shared.scanner import MOST_LINES
 from compgen.controls.shared.terms import error_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controls.isg_parameters import ParameterGrid, grid_order
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
-from compgen.controls.shared.grids import loss_setting, uneven_nodes_mm
+from compgen.controls.shared.grids import ParameterGrid, grid_order, loss_setting, uneven_nodes_mm
 from compgen.controls.shared.terms import error_terms
 from compgen.data.csv_files import FloatArray, csv_table, fixed
 from compgen.data.error_table import ERROR_COLUMNS, Curve, ErrorTable, errors_of_table

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.controls.isg_parameters import content_lines
 from compgen.controls.shared.base import SourceFile
+from compgen.controls.shared.scanner import content_lines
 from compgen.data.csv_files import FloatArray
 from compgen.data.messages import one_line
 

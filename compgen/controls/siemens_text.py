@@ -12,6 +12,7 @@ from fractions import Fraction
 import numpy as np
 
 from compgen.controls.shared.base import SourceFile, coverage_violations
+from compgen.controls.shared.scanner import fixed_point, number_pattern, plain_lines
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest, one_line
@@ -47,13 +48,11 @@ MAKE_EFFECTIVE = "NEWCONF"
 #: A step that was rounded misses MAX by less than this share of itself: 39 steps of 19.7436 mm are 770.0004 mm.
 _ROUNDED = Decimal("0.01")
 _LONGEST_LINE = 1000
-_MOST_LINES = 200_000
 _MOST_CHARACTERS = 20_000_000
 _HEADER = re.compile(r"%_N_[A-Z0-9_]{1,80}_(?:INI|SPF|MPF)")
 _CHANNEL = re.compile(r"CHANDATA ?\( ?\d{1,3} ?\)")
 _ASSIGNMENT = re.compile(r"\$([A-Z0-9_]{1,60})\s*\[([^\[\]=]{1,100})\]\s*=\s*(\S.*)")
-_NUMBER = re.compile(r"[+-]?(?:\d{1,12}(?:\.\d{0,15})?|\.\d{1,15})")
-_EXPONENT = re.compile(r"[+-]?[\d.]{1,30} ?EX?[ +-]{0,2}\d{1,10}")
+_NUMBER = number_pattern(12, 15)
 
 
 @dataclass(frozen=True)
@@ -77,14 +76,7 @@ class Assignment:
 
     def number(self) -> Decimal:
         """Return the value as an exact decimal number."""
-        if _NUMBER.fullmatch(self.value):
-            return Decimal(self.value)
-        shown = one_line(self.value)[:40]
-        if _EXPONENT.fullmatch(self.value):
-            raise self.fail(f"{shown!r} has an exponent; the control reads fixed-point numbers, e.g. 0.000010")
-        if "," in self.value:
-            raise self.fail(f"{shown!r} has a comma; the decimal mark is '.'")
-        raise self.fail(f"{shown!r} is not a number; expected a fixed-point number such as -0.012000")
+        return fixed_point(self.source, self.line, self.value, self.label, _NUMBER)
 
     def whole(self, minimum: int, maximum: int) -> int:
         """Return the value as a whole number within limits."""
@@ -150,26 +142,10 @@ def _unprotected(items: Iterator[Assignment]) -> Iterator[Assignment]:
         yield item
 
 
-def _code_lines(source: SourceFile) -> Iterator[tuple[int, str]]:
-    """Lines without comments, upper-cased, with their numbers."""
-    text = source.text.replace("\r\n", "\n").replace("\r", "\n")
-    if len(text) > _MOST_CHARACTERS or text.count("\n") > _MOST_LINES:
-        raise source.fail(f"has more than {_MOST_LINES} lines or {_MOST_CHARACTERS} characters; no set of tables has")
-    strange = re.search(r"[^\t\n -~]", text)
-    if strange:
-        place = text.count("\n", 0, strange.start()) + 1
-        raise source.fail(f"holds the character {ascii(strange.group())}; the file is plain ASCII text", place)
-    for number, line in enumerate(text.split("\n"), start=1):
-        code = line.partition(";")[0].strip()
-        if len(code) > _LONGEST_LINE:
-            raise source.fail(f"the line has {len(code)} characters; expected one assignment", number)
-        if code:
-            yield number, code.upper()
-
-
 def _assignments(source: SourceFile, index_counts: Mapping[str, int]) -> Iterator[Assignment]:
     ended, started, number, dotted = False, False, 1, False
-    for number, code in _code_lines(source):
+    codes = (line.partition(";")[0].strip().upper() for line in plain_lines(source, _MOST_CHARACTERS, _LONGEST_LINE))
+    for number, code in ((number, code) for number, code in enumerate(codes, start=1) if code):
         if ended:
             raise source.fail(f"{code[:40]!r} stands after the end mark M17", number)
         if code == "M17":

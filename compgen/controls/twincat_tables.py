@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from compgen.controls.isg_parameters import check_complete, content_lines
 from compgen.controls.shared.base import SourceFile, Usage
+from compgen.controls.shared.scanner import check_complete, content_lines, fixed_point
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
-from compgen.data.messages import nearest, one_line
+from compgen.data.messages import nearest
 from compgen.data.names import AXES
 from compgen.errors import InputError
 
@@ -181,7 +181,6 @@ def units_outwards(machine: Machine, axis: int, positions_mm: FloatArray) -> Flo
 
 _SPACED_INDEX = re.compile(r"\[\s{0,9}([0-9]{1,6})\s{0,9}\]")
 _KEY = re.compile(r"([a-z0-9_]{1,20})\.([a-z0-9_.]{1,60})((?:\[[0-9]{1,6}\]){0,2})(?:\.([a-z0-9_]{1,30}))?")
-_NUMBER = re.compile(r"[+-]?(?:[0-9]{1,15}(?:\.[0-9]{0,15})?|\.[0-9]{1,15})")
 _SWITCHES = ("max_points", "manual_activation")
 #: Parameters of each structure, those of its table with the number of their indices.
 _KNOWN: dict[str, tuple[str, ...]] = {
@@ -199,7 +198,6 @@ _TABLES: dict[str, tuple[int, tuple[str, ...]]] = {
     "kw.crosscomp2": (2, ("correction",)),
 }
 _RESERVED = re.compile(r"res(?:erve)?[0-9]{0,2}")
-_LARGEST = 2.0**53
 _MOST_POINTS = 150_000
 
 
@@ -248,12 +246,10 @@ class _Body:
 
     def value(self, label: str, entry: _Entry) -> float:
         """Return the number of an entry, or the error that says why it is none."""
-        if not _NUMBER.fullmatch(entry.value) or abs(float(entry.value)) > _LARGEST:
-            hint = "; the decimal mark is '.'" if "," in entry.value else ""
-            hint = "; an exponent is not documented, write plain digits" if "e" in entry.value.lower() else hint
-            shown = one_line(entry.value)[:40]
-            raise self.source.fail(f"{label}: {shown!r} is not a number of the list{hint}", entry.line)
-        return float(entry.value)
+        number = float(fixed_point(self.source, entry.line, entry.value, label))
+        if abs(number) > 2.0**53:
+            raise self.source.fail(f"{label}: {number:g} is beyond the whole numbers of the control", entry.line)
+        return number
 
     def whole(self, structure: str, name: str, low: int, high: int, default: int | None = None) -> int:
         """Return a parameter as a whole number within limits."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from compgen.controls.shared.base import SourceFile
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
@@ -364,3 +365,70 @@ def trilinear(vertices: FloatArray, start_mm: FloatArray, step_mm: FloatArray, p
             index.append(np.minimum(cells[axis] + upper, grid.shape[axis] - 1).astype(np.intp))
         result += weight[:, None] * grid[index[0], index[1], index[2]]
     return result
+
+
+# Values over a grid of axis positions with uneven distances, and reading one from rows in any order.
+
+
+@dataclass(frozen=True)
+class ParameterGrid:
+    """One parameter over a grid of axis positions, linear between nodes, end values held outside.
+
+    Parameters
+    ----------
+    axes : the arguments, 0..2 for X, Y, Z; empty for a constant.
+    nodes_mm : ascending positions, one array per argument.
+    values : mm or rad, one dimension per argument.
+    """
+
+    axes: tuple[int, ...]
+    nodes_mm: tuple[FloatArray, ...]
+    values: FloatArray
+
+    def at(self, position_mm: FloatArray) -> FloatArray:
+        """Value at axis positions (n, 3), shape (n,): multilinear between the 2^k nodes around each position."""
+        result = np.zeros(len(position_mm))
+        cells = [_cell(nodes, position_mm[:, axis]) for axis, nodes in zip(self.axes, self.nodes_mm, strict=True)]
+        for corner in product((0, 1), repeat=len(cells)):
+            weight = np.ones(len(position_mm))
+            for side, (_, _, share) in zip(corner, cells, strict=True):
+                weight = weight * (share if side else 1.0 - share)
+            index = tuple(cell[side] for side, cell in zip(corner, cells, strict=True))
+            result += weight * self.values[index]
+        return result
+
+
+def _cell(nodes_mm: FloatArray, along_mm: FloatArray) -> tuple[np.ndarray, np.ndarray, FloatArray]:
+    """Index of the node before and after each position, and the share of the one after; clamped outside."""
+    if len(nodes_mm) == 1:
+        zero = np.zeros(len(along_mm), dtype=np.intp)
+        return zero, zero, np.zeros(len(along_mm))
+    before = np.clip(np.searchsorted(nodes_mm, along_mm, side="right") - 1, 0, len(nodes_mm) - 2)
+    share = (along_mm - nodes_mm[before]) / (nodes_mm[before + 1] - nodes_mm[before])
+    return before, before + 1, np.clip(share, 0.0, 1.0)
+
+
+def grid_order(
+    source: SourceFile, lines: list[int], arguments: list[FloatArray]
+) -> tuple[tuple[FloatArray, ...], np.ndarray]:
+    """Return the nodes (ascending) of each argument, and the order that sorts the rows into the grid's C order.
+
+    Raises InputError with the line for a position that stands twice, and if positions of the grid are missing.
+    """
+    if not arguments:
+        if len(lines) > 1:
+            raise source.fail("a second row without an argument column; expected one row of constants", lines[1])
+        return (), np.zeros(1, dtype=np.intp)
+    nodes = tuple(np.unique(column) for column in arguments)
+    shape = tuple(len(line) for line in nodes)
+    cells = np.ravel_multi_index([np.searchsorted(*pair) for pair in zip(nodes, arguments, strict=True)], shape)
+    order = np.argsort(cells, kind="stable")
+    repeated = np.flatnonzero(np.diff(cells[order]) == 0)
+    if repeated.size:
+        row = int(order[repeated[0] + 1])
+        raise source.fail(f"the position {[float(column[row]) for column in arguments]} is given again", lines[row])
+    if len(lines) != int(np.prod(shape)):
+        sizes = " x ".join(map(str, shape))
+        message = f"{len(lines)} rows do not fill the grid of {sizes} positions that their arguments name"
+        raise source.fail(f"{message}; interpolation GRID needs every combination once", lines[-1])
+    return nodes, order

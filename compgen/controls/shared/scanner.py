@@ -1,0 +1,126 @@
+"""Scanning the text files of controls: lines, numbers, and whether a file is complete.
+
+Text of any size and content must end in an :class:`InputError` with its line, never in a long wait: sizes are checked
+first, and every pattern has an upper bound for what it repeats.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from decimal import Decimal
+
+from compgen.controls.shared.base import SourceFile
+from compgen.data.messages import one_line
+
+MOST_LINES = 200_000
+#: What is quoted of a wrong word.
+SHOWN = 40
+
+
+def number_pattern(before: int = 40, behind: int = 40, exponent: int = 0) -> re.Pattern[str]:
+    """Return the pattern of a decimal number with at most so many digits before and behind its point.
+
+    ``exponent`` is how many digits an exponent may have; 0: there is none.
+    """
+    power = rf"(?:[eE][+-]?[0-9]{{1,{exponent}}})?" if exponent else ""
+    return re.compile(rf"[+-]?(?:[0-9]{{1,{before}}}(?:\.[0-9]{{0,{behind}}})?|\.[0-9]{{1,{behind}}}){power}")
+
+
+FLOATING, FIXED_POINT = number_pattern(exponent=3), number_pattern(15, 15)
+_WITH_EXPONENT = re.compile(r"[+-]?[0-9.]{1,30} ?EX?[ +-]{0,2}[0-9]{1,10}", re.IGNORECASE)
+_DECLARED = re.compile(r"(?://|#|;)\s{0,9}(?:records|entries|tables):\s{0,9}([0-9]{1,9})\s*$")
+
+
+def check_size(source: SourceFile, most: int) -> None:
+    """Refuse a text that is longer than any file of its kind."""
+    if len(source.text) > most:
+        raise source.fail(f"has {len(source.text)} characters; such a file has at most {most}", 1)
+
+
+def _check_lines(source: SourceFile) -> None:
+    count = source.text.count("\n")
+    if count > MOST_LINES:
+        raise source.fail(f"has {count} lines; at most {MOST_LINES} are read", MOST_LINES)
+
+
+def plain_lines(source: SourceFile, most: int, longest: int) -> list[str]:
+    """Return all lines without their ends (LF, CRLF or CR).
+
+    InputError for more than ``most`` characters or :data:`MOST_LINES`, a line of more than ``longest`` characters, and any
+    character, also in a comment, that is neither printable ASCII nor a tab.
+    """
+    check_size(source, most)
+    _check_lines(source)
+    text = source.text.replace("\r\n", "\n").replace("\r", "\n")
+    if strange := re.search(r"[^\t\n -~]", text):
+        message = f"holds the character {ascii(strange.group())}; the file is printable ASCII text"
+        raise source.fail(message, text.count("\n", 0, strange.start()) + 1)
+    lines = text.split("\n")
+    for number, line in enumerate(lines, start=1):
+        if len(line) > longest:
+            raise source.fail(f"the line has {len(line)} characters; at most {longest} are possible", number)
+    return lines
+
+
+def content_lines(source: SourceFile, comment: str = "//", longest: int = 4000) -> list[tuple[int, str]]:
+    """Return the lines of a file without comments and blank lines, with their numbers; InputError for garbage.
+
+    A comment may hold any character.
+    """
+    _check_lines(source)
+    found = []
+    for number, line in enumerate(source.text.split("\n"), start=1):
+        if len(line) > longest:
+            raise source.fail(f"the line has {len(line)} characters; at most {longest} are read", number)
+        text = line.partition(comment)[0].strip(" \t\r\f")
+        if not (text.isascii() and text.replace("\t", " ").isprintable()):
+            raise source.fail(f"{one_line(text)[:SHOWN]!r} holds characters that are not printable ASCII", number)
+        if text:
+            found.append((number, text))
+    if not found:
+        raise source.fail("holds no data; is it the right file, or was it cut?")
+    return found
+
+
+def floating(source: SourceFile, line: int, word: str, what: str, pattern: re.Pattern[str] = FLOATING) -> float:
+    """Return a word as a finite number, with or without an exponent; InputError says why it is none.
+
+    ``what`` names the number in the message.
+    """
+    if pattern.fullmatch(word) and math.isfinite(value := float(word)):
+        return value
+    hint = "; the decimal mark is '.', columns are separated by blanks" if "," in word or ";" in word else ""
+    raise source.fail(f"{what}: {one_line(word)[:SHOWN]!r} is not a finite number{hint}", line)
+
+
+def fixed_point(
+    source: SourceFile, line: int | None, word: str, what: str, pattern: re.Pattern[str] = FIXED_POINT
+) -> Decimal:
+    """Return a word as an exact decimal number; InputError for an exponent, a comma, or anything else."""
+    if pattern.fullmatch(word):
+        return Decimal(word)
+    if _WITH_EXPONENT.fullmatch(word):
+        fault = "has an exponent; expected plain decimals such as 0.000010"
+    elif "," in word:
+        fault = "has a comma; the decimal mark is '.'"
+    else:
+        fault = "is not a number; expected plain decimals such as -0.012"
+    raise source.fail(f"{what}: {one_line(word)[:SHOWN]!r} {fault}", line)
+
+
+def uses_exponent(words: Iterable[str]) -> bool:
+    """Whether one of the numbers is written with an exponent."""
+    return any("e" in word or "E" in word for word in words)
+
+
+def check_complete(source: SourceFile, count: int, what: str = "records") -> None:
+    """Refuse a cut file: one that declares its ``records`` in a comment must hold them and end with a line end."""
+    declared = next((found for line in source.text.split("\n") if (found := _DECLARED.match(line[:200].strip()))), None)
+    if declared is None:
+        return
+    if int(declared.group(1)) != count:
+        raise source.fail(f"declares {declared.group(1)} {what} but holds {count}: it was cut or edited by hand")
+    if not source.text.endswith("\n"):
+        raise source.fail("the last line has no line end: the file was cut", source.text.count("\n") + 1)
