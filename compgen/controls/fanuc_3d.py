@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from itertools import permutations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compgen.controls.fanuc_records import (
+    FanucSettings,
     FanucStyle,
     Punched,
     Record,
@@ -33,7 +34,7 @@ from compgen.controls.shared.base import (
     nodes_by_axis,
     plan_contradictions,
 )
-from compgen.controls.shared.grids import STEP_QUANTUM, EquidistantGrid, equidistant_grid, take_loss_mm, trilinear
+from compgen.controls.shared.grids import STEP_QUANTUM, EquidistantGrid, equidistant_grid, loss_setting, trilinear
 from compgen.controls.shared.terms import one_dimensional_terms, product_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
@@ -42,6 +43,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.messages import one_line
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import axis_setting, file_setting, multiple_of, setting, whole, word_for
 from compgen.errors import InputError
 from compgen.kinematics.first_order import tool_of
 
@@ -151,94 +153,39 @@ def form_of(record: Record) -> str:
 # Settings of ``[controllers.fanuc-3d]``: counts, the grid and its limits, the style of the user's own control.
 
 
-#: Smallest step of positions and intervals in the files.
-QUANTUM_MM = Decimal("0.0001")
+@dataclass(frozen=True, kw_only=True)
+class VolumeSettings(FanucSettings):
+    """Settings of three-dimensional error compensation; ``sample`` is None if no file of the user's control was given."""
 
-
-@dataclass(frozen=True)
-class VolumeSettings:
-    """Settings of three-dimensional error compensation.
-
-    Parameters
-    ----------
-    detection_unit_um, magnification : one count of the table of X, Y, Z is their product.
-    stores : whether the values are the correction (added to the command) or the error.
-    interval_mm : distance of the vertices of X, Y, Z, None: chosen.
-    loss_mm : loss by interpolation between vertices that is worth no further ones.
-    most_points, most_in_all : largest number of vertices of an axis, and altogether.
-    value_low, value_high : range of a value, counts.
-    order : axes in the order of the point numbers, the one that runs fastest first.
-    axis_numbers : controlled axis numbers of X, Y, Z.
-    sample : style of a file punched from the user's control, None: none was given.
-    """
-
-    detection_unit_um: float
-    magnification: tuple[int, int, int]
-    stores: Literal["correction", "error"]
-    interval_mm: tuple[float | None, float | None, float | None]
-    loss_mm: float
-    most_points: int
-    most_in_all: int
-    value_low: int
-    value_high: int
-    order: tuple[int, int, int]
-    axis_numbers: tuple[int, int, int]
-    sample: VolumeStyle | None
-
-    @property
-    def sign(self) -> int:
-        """+1 if the values are the correction, -1 if they are the error."""
-        return 1 if self.stores == "correction" else -1
+    sample: VolumeStyle | None = file_setting(
+        read_volume_style,
+        key="style_from",
+        meaning="a file of three-dimensional data punched from the user's own control, whose style is followed",
+    )
+    magnification: tuple[int, int, int] = axis_setting(
+        whole(1, 100),
+        (1, 1, 1),
+        meaning="magnification of the values of an axis, e.g. { X = 2 }; one count is magnification times detection unit",
+    )
+    interval_mm: tuple[float | None, float | None, float | None] = axis_setting(
+        multiple_of(STEP_QUANTUM), meaning="distance of the vertices, e.g. { X = 50.0 }; chosen if not stated"
+    )
+    loss_mm: float = loss_setting(
+        "loss by interpolation between vertices, um at the tool, that is worth no further one"
+    )
+    most_points: int = setting(whole(2, 1000), 25, meaning="largest number of vertices along an axis")
+    most_in_all: int = setting(whole(8, 50_000), 15625, meaning="largest number of vertices")
+    value_low: int = setting(whole(-32768, -1), -128, meaning="smallest value, counts")
+    value_high: int = setting(whole(1, 32767), 127, meaning="largest value, counts")
+    order: tuple[int, int, int] = setting(
+        word_for({"".join(AXES[axis] for axis in order): order for order in permutations(range(3))}),
+        stated="XYZ",
+        meaning="axes in the order of the point numbers, the one that runs fastest first",
+    )
 
     def count_mm(self, axis: int) -> float:
         """One count of the values of an axis, mm."""
         return self.magnification[axis] * self.detection_unit_um * MM_PER_UM
-
-
-def read_volume_settings(machine: Machine) -> VolumeSettings:
-    """Read and check ``[controllers.fanuc-3d]``; every key has a default."""
-    section = machine.controller_settings("fanuc-3d")
-    sample = section.file("style_from")
-    stores = section.take("stores", toml_files.choice("correction", "error"), "correction")
-    settings = VolumeSettings(
-        detection_unit_um=section.take("detection_unit_um", toml_files.positive, 1.0),
-        magnification=_per_axis(section.section("magnification", required=False), toml_files.whole(1, 100), (1, 1, 1)),
-        stores="correction" if stores == "correction" else "error",
-        interval_mm=_per_axis(section.section("interval_mm", required=False), _interval, (None, None, None)),
-        loss_mm=take_loss_mm(section),
-        most_points=section.take("most_points", toml_files.whole(2, 1000), 25),
-        most_in_all=section.take("most_in_all", toml_files.whole(8, 50_000), 15625),
-        value_low=section.take("value_low", toml_files.whole(-32768, -1), -128),
-        value_high=section.take("value_high", toml_files.whole(1, 32767), 127),
-        order=section.take("order", _order, (0, 1, 2)),
-        axis_numbers=_per_axis(section.section("axis_numbers", required=False), toml_files.whole(1, 99), (1, 2, 3)),
-        sample=None if sample is None else read_volume_style(sample),
-    )
-    if len(set(settings.axis_numbers)) < 3:
-        raise section.fail("axis_numbers", f"{settings.axis_numbers} gives two axes the same number")
-    section.finish()
-    return settings
-
-
-def _per_axis(section: toml_files.Section, check: Callable[[Any], Any], default: tuple[Any, Any, Any]) -> Any:
-    values = tuple(section.take(axis, check, value) for axis, value in zip(AXES, default, strict=True))
-    section.finish()
-    return values
-
-
-def _interval(value: Any) -> float:
-    """A positive length that can be written."""
-    length = toml_files.positive(value)
-    if Decimal(repr(length)) % QUANTUM_MM:
-        raise ValueError(f"a multiple of {QUANTUM_MM} mm is expected")
-    return length
-
-
-def _order(value: Any) -> tuple[int, int, int]:
-    """One of the six orders of X, Y, Z."""
-    word = toml_files.choice(*("".join(order) for order in permutations(AXES)))(value)
-    x, y, z = (AXES.index(letter) for letter in word)
-    return x, y, z
 
 
 # Numbers of three-dimensional error compensation: a regular grid of vertices with three values each, and its files.
@@ -374,13 +321,17 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
     """Corrections of X, Y and Z at the vertices of a grid, zero at the vertex of the reference point."""
 
     name = "fanuc-3d"
+    settings_class = VolumeSettings
     anchored = True
     sample_setting = "style_from"
 
     @classmethod
     def read_settings(cls, machine: Machine) -> VolumeSettings:
         """Check ``[controllers.fanuc-3d]``."""
-        return read_volume_settings(machine)
+        section = machine.controller_settings(cls.name)
+        settings = toml_files.take_settings(VolumeSettings, section)
+        settings.finish(section)
+        return settings
 
     def basis(self, errors: ErrorTable) -> list[Term]:
         """Return curves of one axis, alone and times the coordinate of another; a trilinear grid holds them exactly.

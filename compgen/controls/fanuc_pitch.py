@@ -293,6 +293,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
     """Tables X(x), Y(y), Z(z) as numbers of counts, zero at the reference point."""
 
     name = "fanuc-pitch"
+    settings_class = PitchSettings
     anchored = True
     bidirectional = True
     sample_setting = "style_from"
@@ -343,7 +344,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             "separate": settings.sample.points_style is not None,
             "overwrites": self._overwrites(present),
             "has_sample": settings.sample.shows_points,
-            "style_notes": list(settings.style_notes),
+            "style_notes": list(settings.sample.notes),
             "bidirectional": settings.bidirectional,
             "points": [{"number": settings.number_base + number, "value": value} for number, value in points.items()],
             "plan": {
@@ -531,7 +532,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         else:
             given = (
                 "the sample has no parameters 3620 to 3622"
-                if settings.style_notes
+                if settings.sample.notes
                 else "no file of this control was given"
             )
             found = [
@@ -664,8 +665,8 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
                     f"magnification {block.magnification} are those of the sample; interval_mm or first_numbers in the machine "
                     "file lay them out anew."
                 )
-        if settings.style_notes:
-            found.append("The style was taken from the sample: " + "; ".join(settings.style_notes) + ".")
+        if settings.sample.notes:
+            found.append("The style was taken from the sample: " + "; ".join(settings.sample.notes) + ".")
         if settings.bidirectional:
             found.append(
                 "Bi-directional: 3627 (value at the reference point reached against the reference return) and the numbers of "

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from itertools import combinations
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,24 +16,24 @@ from compgen.controls.fanuc_records import (
     MOST_NUMBER,
     TOTAL_PARAMETER,
     UNIT_PARAMETER,
-    FanucStyle,
     Parameters,
     PointGrid,
     PunchedRecords,
+    PunchedSettings,
     Record,
-    Sample,
     check_increments,
     length_of,
     read_records,
-    take_sample,
+    take_punched,
     type_word,
 )
 from compgen.controls.shared.base import SourceFile, Usage, coverage_violations
-from compgen.controls.shared.grids import take_loss_mm
+from compgen.controls.shared.grids import loss_setting
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import axis_setting, choice, setting, whole, word_for
 from compgen.errors import InputError
 
 # Settings of ``[controllers.fanuc-pitch]``: what the control counts in, how its files look, which numbers are free.
@@ -43,79 +43,96 @@ from compgen.errors import InputError
 INTERVAL_QUANTUM_MM = Decimal("0.001")
 
 
-@dataclass(frozen=True)
-class PitchSettings:
+def _spans(value: Any) -> tuple[tuple[int, int], ...]:
+    """A list of blocks of numbers."""
+    if not isinstance(value, list):
+        raise ValueError("a list of blocks of numbers [[first, last], ...] is expected")
+    number = whole(0, MOST_NUMBER)
+    for item in value:
+        if not isinstance(item, list) or len(item) != 2 or number(item[0]) > number(item[1]):
+            raise ValueError("blocks of numbers [first, last], the lower one first, are expected")
+    return tuple((first, last) for first, last in value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PitchSettings(PunchedSettings):
     """Settings of stored pitch error compensation.
 
-    Parameters
-    ----------
-    detection_unit_um, magnifications : one count of the table of X, Y, Z is their product (parameter 3623 is the second,
-        that of the sample if the machine file does not state it).
-    stores : whether the control's numbers are the correction (added to the command) or the error.
-    value_type : ``incremental`` (a value is the change over its section) or ``total`` (the sum up to its point).
-    interpolation : what the control does inside a section; ``staircase`` puts the whole value out at its beginning.
-    interval_mm : section length per axis, None: chosen.
-    max_feed_mm_min : fastest feed; the section must be at least feed / 7500 long. None: not checked.
-    loss_mm : loss by interpolation between section ends that is worth no shorter sections.
-    increment_limit : largest magnitude of the change over a section, in counts.
-    first_number, last_number : compensation point numbers that may be used. Number 0 is left out by default: axes
-        without a table have 3620 ... 3622 = 0 and would take part in its value.
-    first_numbers : first number of the block of each axis, None: assigned.
-    reserved : blocks (first, last) of other axes, which are left free.
-    bidirectional : a table for each direction of travel (3605#0 = 1).
-    negative_first_number, negative_last_number : point numbers of the tables for travel in negative direction.
-    reference_return : direction of the reference return of X, Y, Z, +1 or -1.
-    axis_numbers : controlled axis numbers of X, Y, Z.
-    kept : compensation points of X, Y, Z that the sample shows and that are kept; None: there are none, or the machine
-        file states others.
-    sample : what files of the user's control show.
+    Number 0 is left out by default: axes without a table have 3620 ... 3622 = 0 and would take part in its value. ``kept``
+    are the compensation points of X, Y, Z that the sample shows and that are kept; None: there are none, or the machine
+    file states others.
     """
 
-    detection_unit_um: float
-    magnifications: tuple[int, int, int]
-    stores: Literal["correction", "error"]
-    value_type: Literal["incremental", "total"]
-    interpolation: Literal["linear", "staircase"]
-    interval_mm: tuple[float | None, float | None, float | None]
-    max_feed_mm_min: float | None
-    loss_mm: float
-    increment_limit: int
-    first_number: int
-    last_number: int
-    first_numbers: tuple[int | None, int | None, int | None]
-    reserved: tuple[tuple[int, int], ...]
-    bidirectional: bool
-    negative_first_number: int
-    negative_last_number: int
-    reference_return: tuple[int, int, int]
-    axis_numbers: tuple[int, int, int]
-    kept: tuple[PointGrid | None, PointGrid | None, PointGrid | None] = (None, None, None)
-    sample: Sample = field(default_factory=Sample, compare=False)
+    interval_mm: tuple[float | None, float | None, float | None] = axis_setting(
+        toml_files.positive,
+        meaning="length of a section, e.g. { X = 50.0 }; that of the sample, else chosen, if not stated",
+    )
+    first_numbers: tuple[int | None, int | None, int | None] = axis_setting(
+        whole(0, MOST_NUMBER),
+        meaning="first point number of the block of an axis, e.g. { X = 100 }; those of the sample are kept, the others "
+        "assigned",
+    )
+    magnification: int | None = setting(
+        whole(1, 100),
+        None,
+        meaning="parameter 3623, 1 to 100; one count is magnification times detection unit. Default: that of the sample, "
+        "else 1",
+    )
+    value_type: str = setting(
+        choice("incremental", "total"),
+        "incremental",
+        meaning='change over a section, or "total" (sum up to the point)',
+    )
+    interpolation: str = setting(
+        choice("linear", "staircase"),
+        "linear",
+        meaning="how a value acts inside a section; a staircase puts the whole value out at the beginning",
+    )
+    max_feed_mm_min: float | None = setting(
+        toml_files.positive,
+        None,
+        meaning="fastest feed; stated, a section must be at least feed / 7500 mm long",
+    )
+    increment_limit: int = setting(whole(1, 127), 7, meaning="largest change over a section in counts, 1 to 127")
+    loss_mm: float = loss_setting()
+    first_number: int = setting(
+        whole(0, MOST_NUMBER), 1, meaning="first compensation point number that may be used; 0 is left out by default"
+    )
+    last_number: int = setting(
+        whole(0, MOST_NUMBER),
+        1023,
+        meaning="last compensation point number that may be used; default 1023, or the last one of a sample that has more",
+    )
+    reserved: tuple[tuple[int, int], ...] = setting(
+        _spans,
+        (),
+        key="reserved_numbers",
+        meaning="blocks of point numbers of other axes, which are left free, e.g. [[60, 68]]",
+    )
+    bidirectional: bool = setting(
+        toml_files.flag,
+        False,
+        meaning="a table for each direction of travel (3605#0 = 1, 3626, 3627); false: backlash parameters 1851, 1852",
+    )
+    negative_first_number: int = setting(
+        whole(0, MOST_NUMBER), 3000, meaning="first point number for travel in negative direction"
+    )
+    negative_last_number: int = setting(
+        whole(0, MOST_NUMBER), 4023, meaning="last point number for travel in negative direction"
+    )
+    reference_return: tuple[int, int, int] = axis_setting(
+        word_for({"positive": 1, "negative": -1}),
+        (1, 1, 1),
+        meaning='direction of the reference return, e.g. { X = "negative" }; "positive" where not stated. If it is wrong, '
+        "the reversal doubles",
+    )
+    kept: tuple[PointGrid | None, ...] = (None, None, None)
 
     @property
-    def style(self) -> FanucStyle:
-        """How the file is written."""
-        return self.sample.style
-
-    @property
-    def style_notes(self) -> tuple[str, ...]:
-        """What a sample of the user's control told of the style."""
-        return self.sample.notes
-
-    @property
-    def interval_unit_mm(self) -> float:
-        """Unit of 3624 without a decimal point."""
-        return self.sample.interval_unit_mm
-
-    @property
-    def number_base(self) -> int:
-        """Record number of compensation point 0."""
-        return self.style.number_base
-
-    @property
-    def sign(self) -> int:
-        """+1 if the numbers are the correction, -1 if they are the error."""
-        return 1 if self.stores == "correction" else -1
+    def magnifications(self) -> tuple[int, ...]:
+        """Magnification of X, Y, Z: that of the machine file, else that of the sample where it has one, else 1."""
+        shown = [self.sample.axes.get(number) for number in self.axis_numbers]
+        return tuple(self.magnification or (axis.magnification if axis else 0) or 1 for axis in shown)
 
     @property
     def total(self) -> bool:
@@ -142,61 +159,33 @@ class PitchSettings:
 def read_pitch_settings(machine: Machine) -> PitchSettings:
     """Read and check ``[controllers.fanuc-pitch]``; every key has a default but ``interval_unit_mm`` (see there)."""
     section = machine.controller_settings("fanuc-pitch")
-    sample = take_sample(section)
-    numbers = _per_axis(section.section("axis_numbers", required=False), toml_files.whole(1, 99), (1, 2, 3))
-    intervals = _per_axis(section.section("interval_mm", required=False), toml_files.positive, (None, None, None))
-    firsts = _per_axis(section.section("first_numbers", required=False), toml_files.whole(0, 9999), (None, None, None))
-    magnification = section.take("magnification", toml_files.whole(1, 100), None)
-    settings = PitchSettings(
-        detection_unit_um=section.take("detection_unit_um", toml_files.positive, 1.0),
-        magnifications=_magnifications(sample, numbers, magnification),
-        stores=_word(section, "stores", "correction", "error"),
-        value_type=_word(section, "value_type", "incremental", "total"),
-        interpolation=_word(section, "interpolation", "linear", "staircase"),
-        interval_mm=intervals,
-        max_feed_mm_min=section.take("max_feed_mm_min", toml_files.positive, None),
-        increment_limit=section.take("increment_limit", toml_files.whole(1, 127), 7),
-        loss_mm=take_loss_mm(section),
-        first_number=section.take("first_number", toml_files.whole(0, 9999), 1),
-        last_number=section.take("last_number", toml_files.whole(0, 9999), max(1023, _last_of(sample))),
-        first_numbers=firsts,
-        reserved=section.take("reserved_numbers", _spans, ()),
-        bidirectional=section.take("bidirectional", toml_files.flag, False),
-        negative_first_number=section.take("negative_first_number", toml_files.whole(0, 9999), 3000),
-        negative_last_number=section.take("negative_last_number", toml_files.whole(0, 9999), 4023),
-        reference_return=_per_axis(section.section("reference_return", required=False), _direction, (1, 1, 1)),
-        axis_numbers=numbers,
-        kept=_kept(sample, numbers, intervals, firsts),
-        sample=sample,
-    )
+    settings = take_punched(PitchSettings, section)
+    settings.finish(section)
+    shown = settings.sample.values
+    # a sample that holds all points, from 0 on without a gap, says how many the control has
+    last = len(shown) - 1 if sorted(shown) == list(range(len(shown))) else 0
+    settings = toml_files.unless_stated(settings, section, last_number=max(settings.last_number, last))
+    settings = replace(settings, kept=_kept(settings))
     _check_together(section, settings)
-    section.finish()
     return settings
 
 
-def _magnifications(sample: Sample, numbers: tuple[int, ...], stated: int | None) -> tuple[int, int, int]:
-    """Magnification of X, Y, Z: that of the machine file, else that of the sample where it has one, else 1."""
-    found = [sample.axes[n].magnification if n in sample.axes else 0 for n in numbers]
-    x, y, z = (stated or own or 1 for own in found)
-    return x, y, z
-
-
-def _last_of(sample: Sample) -> int:
-    """Last compensation point of a sample that holds all of them, from 0 on without a gap; else 0."""
-    return max(sample.values, default=0) if sorted(sample.values) == list(range(len(sample.values))) else 0
-
-
-def _kept(sample: Sample, numbers: tuple[int, ...], intervals: Any, firsts: Any) -> Any:
+def _kept(settings: PitchSettings) -> tuple[PointGrid | None, ...]:
     """Compensation points of X, Y, Z in the sample, where the machine file does not state another interval or number."""
     found: list[PointGrid | None] = []
-    for number, interval_mm, first in zip(numbers, intervals, firsts, strict=True):
-        axis = sample.axes.get(number)
-        grid = None if axis is None or not axis.grid.interval_mm or axis.grid.first == axis.grid.last else axis.grid
-        if grid is not None and interval_mm is not None and Decimal(repr(interval_mm)) != grid.interval_mm:
-            grid = None
-        if grid is not None and first not in (None, grid.first):
-            grid = None
-        if grid is not None and axis is not None and not grid.first - 1 <= grid.reference <= grid.last:
+    for k, number in enumerate(settings.axis_numbers):
+        axis, interval_mm, first = settings.sample.axes.get(number), settings.interval_mm[k], settings.first_numbers[k]
+        if (
+            axis is None
+            or not axis.grid.interval_mm
+            or axis.grid.first == axis.grid.last
+            or (interval_mm is not None and Decimal(repr(interval_mm)) != axis.grid.interval_mm)
+            or first not in (None, axis.grid.first)
+        ):
+            found.append(None)
+            continue
+        grid = axis.grid
+        if not grid.first - 1 <= grid.reference <= grid.last:
             raise axis.record.fail(
                 f"axis A{number} has the reference point {grid.reference} (3620) and the points {grid.first} to {grid.last}; "
                 "these points cannot be kept: state first_numbers and interval_mm in the machine file for new ones"
@@ -205,37 +194,27 @@ def _kept(sample: Sample, numbers: tuple[int, ...], intervals: Any, firsts: Any)
     return tuple(found)
 
 
-def _word(section: toml_files.Section, key: str, default: str, other: str) -> Any:
-    return section.take(key, toml_files.choice(default, other), default)
-
-
-def _per_axis(section: toml_files.Section, check: Callable[[Any], Any], default: tuple[Any, Any, Any]) -> Any:
-    values = tuple(section.take(axis, check, value) for axis, value in zip(AXES, default, strict=True))
-    section.finish()
-    return values
-
-
-def _direction(value: Any) -> int:
-    """Direction of a reference return."""
-    return {"positive": 1, "negative": -1}[toml_files.choice("positive", "negative")(value)]
-
-
-def _spans(value: Any) -> tuple[tuple[int, int], ...]:
-    """A list of blocks of numbers."""
-    if not isinstance(value, list):
-        raise ValueError("a list of blocks of numbers [[first, last], ...] is expected")
-    whole, found = toml_files.whole(0, 9999), []
-    for item in value:
-        if not isinstance(item, list) or len(item) != 2 or whole(item[0]) > whole(item[1]):
-            raise ValueError("blocks of numbers [first, last], the lower one first, are expected")
-        found.append((item[0], item[1]))
-    return tuple(found)
-
-
 def _check_together(section: toml_files.Section, settings: PitchSettings) -> None:
     if settings.last_number < settings.first_number:
         raise section.fail("last_number", f"lies below first_number = {settings.first_number}")
-    _check_bidirectional(section, settings)
+    if settings.bidirectional:
+        # no public document settles how 3627 counts with total values, and with a magnification
+        if settings.total:
+            raise section.fail("value_type", "how 3627 counts with total values is not documented; use 'incremental'")
+        if settings.magnifications != (1, 1, 1):
+            raise section.fail(
+                "magnification",
+                "whether 3627 is multiplied by it is not documented; with bidirectional = true it must be 1 (a larger "
+                "increment_limit or shorter sections hold steep curves)",
+            )
+        if settings.negative_last_number < settings.negative_first_number:
+            raise section.fail("negative_last_number", f"lies below {settings.negative_first_number}")
+    for letter, number in () if settings.bidirectional else zip(AXES, settings.axis_numbers, strict=True):
+        if (settings.sample.bits(3605, number) or "0").endswith("1"):
+            raise settings.sample.parameters[3605, number][1].fail(
+                f"bit 0 is 1 for {letter} (A{number}): this control has a table for each direction of travel. Set "
+                "bidirectional = true in [controllers.fanuc-pitch], or set the bit to 0 and punch the file again"
+            )
     if not settings.total:
         check_increments(settings.sample.common)
     if settings.number_base < 10000 and not settings.style.q_word:
@@ -243,36 +222,12 @@ def _check_together(section: toml_files.Section, settings: PitchSettings) -> Non
             "number_base",
             f"{settings.number_base} makes pitch data look like parameters; 10000 or more, or q_word = true, is needed",
         )
-    if len(set(settings.axis_numbers)) < 3:
-        raise section.fail("axis_numbers", f"{settings.axis_numbers} gives two axes the same number")
     for axis, interval_mm in zip(AXES, settings.interval_mm, strict=True):
         if interval_mm is not None and Decimal(repr(interval_mm)) % settings.interval_quantum_mm:
             message = (
                 f"{axis} = {interval_mm:g} mm cannot be written; multiples of {settings.interval_quantum_mm} mm can"
             )
             raise section.fail("interval_mm", message)
-
-
-def _check_bidirectional(section: toml_files.Section, settings: PitchSettings) -> None:
-    """Refuse what no public document settles: 3627 with total values, and with a magnification."""
-    if not settings.bidirectional:
-        for letter, number in zip(AXES, settings.axis_numbers, strict=True):
-            if (settings.sample.bits(3605, number) or "0").endswith("1"):
-                raise settings.sample.parameters[3605, number][1].fail(
-                    f"bit 0 is 1 for {letter} (A{number}): this control has a table for each direction of travel. Set "
-                    "bidirectional = true in [controllers.fanuc-pitch], or set the bit to 0 and punch the file again"
-                )
-        return
-    if settings.total:
-        raise section.fail("value_type", "how 3627 counts with total values is not documented; use 'incremental'")
-    if settings.magnifications != (1, 1, 1):
-        raise section.fail(
-            "magnification",
-            "whether 3627 is multiplied by it is not documented; with bidirectional = true it must be 1 (a larger "
-            "increment_limit or shorter sections hold steep curves)",
-        )
-    if settings.negative_last_number < settings.negative_first_number:
-        raise section.fail("negative_last_number", f"lies below {settings.negative_first_number}")
 
 
 # Numbers of stored pitch error compensation: reading them from text, the curve they mean, the limits they must keep.

@@ -7,13 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from compgen.controls.shared.base import SourceFile
 from compgen.data import toml_files
 from compgen.data.files import read_bytes
 from compgen.data.machine import Machine
 from compgen.data.messages import one_line
+from compgen.data.toml_files import axis_setting, choice, file_setting, setting, whole, word_for
 from compgen.errors import InputError
 
 # Records of FANUC parameter and pitch data files: ``%``, blocks ``N... A... P...``, ``%``.
@@ -313,7 +314,6 @@ class Sample:
     ----------
     style : how records are written; ``points_style`` is that of the file of the points if they have one of their own.
     notes : in words what was taken from the sample.
-    interval_unit_mm : unit of parameter 3624 without a decimal point.
     axes : compensation points by controlled axis number, of all axes that have some, also those that are switched off.
     parameters : (number, axis number) -> (value as text, record) of the parameters that compensation needs.
     values : compensation point number -> value.
@@ -323,7 +323,6 @@ class Sample:
     style: FanucStyle = FanucStyle()
     points_style: FanucStyle | None = None
     notes: tuple[str, ...] = ()
-    interval_unit_mm: float = 1.0
     axes: Mapping[int, AxisPoints] = field(default_factory=dict)
     parameters: Parameters = field(default_factory=dict)
     values: Mapping[int, int] = field(default_factory=dict)
@@ -357,31 +356,94 @@ class Sample:
         return found[0]
 
 
-def take_sample(section: toml_files.Section, *, path: int = 1) -> Sample:
-    """Take ``style_from`` from a control's settings, and the keys of the style, which go before what the sample shows.
+# Settings that the FANUC controls share.
 
-    ``path`` is the path of the control whose parameters count, where there are several (word L).
+
+@dataclass(frozen=True, kw_only=True)
+class FanucSettings:
+    """What the numbers of a FANUC control mean, and which of its axes are X, Y and Z."""
+
+    detection_unit_um: float = setting(
+        toml_files.positive, 1.0, meaning="detection unit: what the control counts in, um"
+    )
+    stores: str = setting(
+        choice("correction", "error"),
+        "correction",
+        meaning='what the numbers are: "correction" (the control adds them) or "error"',
+    )
+    axis_numbers: tuple[int, int, int] = axis_setting(whole(1, 99), (1, 2, 3), meaning="controlled axis numbers")
+
+    @property
+    def sign(self) -> int:
+        """+1 if the numbers are the correction, -1 if they are the error."""
+        return 1 if self.stores == "correction" else -1
+
+    def finish(self, section: toml_files.Section) -> None:
+        """Raise InputError if two axes have the same number, or for a key of the section that is not known."""
+        if len(set(self.axis_numbers)) < 3:
+            raise section.fail("axis_numbers", f"{self.axis_numbers} gives two axes the same number")
+        section.finish()
+
+
+@dataclass(frozen=True, kw_only=True)
+class PunchedSettings(FanucSettings):
+    """Settings of controls whose files follow what was punched from the user's own control.
+
+    The keys of the style take precedence over the style of the punched files; ``sample`` has both together. ``path`` is
+    the path of the control whose parameters count, where there are several (word L).
     """
-    files = [punched_file(name) for name in section.files("style_from")]
-    sample = sample_of(files, path)
-    ends = {"lf": "\n", "crlf": "\r\n"}
-    eol = section.take("eol", toml_files.choice(*ends), None)
-    digits = section.take("digits", toml_files.whole(1, 8), None)
+
+    style_from: tuple[Path, ...] = file_setting(
+        several=True,
+        meaning="a file punched from the user's own control, or a list of them (parameters, pitch data): its style, points "
+        "(3620 to 3624) and magnification are kept, points and entries of other axes never overwritten; the keys of the "
+        "style take precedence",
+    )
+    eol: str | None = setting(word_for({"lf": "\n", "crlf": "\r\n"}), None, meaning="line ends of the file")
+    digits: int | None = setting(whole(1, 8), None, meaning="digits of the N words, 1 to 8")
+    q_word: bool = setting(toml_files.flag, False, meaning="write the type words Q1 (parameters) and Q0 (points)")
+    real_point: bool = setting(toml_files.flag, True, meaning="parameter 3624 with a decimal point")
+    number_base: int = setting(whole(0, 90000), 10000, meaning="record number of compensation point 0")
+    interval_unit_mm: float = setting(
+        toml_files.positive, 1.0, meaning="unit of parameter 3624; required with real_point = false"
+    )
+    path: int = 1
+    sample: Sample = field(default_factory=Sample, compare=False)
+
+    @property
+    def style(self) -> FanucStyle:
+        """How the file is written."""
+        return self.sample.style
+
+
+P = TypeVar("P", bound=PunchedSettings)
+
+
+def take_punched(kind: type[P], section: toml_files.Section, **given: Any) -> P:
+    """Take the settings of a ``kind``, and what its punched files show; see :func:`sample_of` for errors."""
+    settings = toml_files.take_settings(kind, section, **given)
+    sample = sample_of([punched_file(path) for path in settings.style_from], settings.path)
+    shown = {key: getattr(sample.style, key) for key in ("q_word", "real_point", "number_base")}
+    settings = toml_files.unless_stated(settings, section, **shown)
+    if not settings.real_point and "interval_unit_mm" not in section:
+        raise section.fail(
+            "interval_unit_mm",
+            "is missing; with real_point = false parameter 3624 is a whole number whose unit depends on the control "
+            "(1.0 or 0.001 mm are common): read 3624 of a known axis and give the unit in mm",
+        )
     style = replace(
         sample.style,
-        q_word=section.take("q_word", toml_files.flag, sample.style.q_word),
-        real_point=section.take("real_point", toml_files.flag, sample.style.real_point),
-        number_base=section.take("number_base", toml_files.whole(0, 90000), sample.style.number_base),
-        digits=sample.style.digits if digits is None else digits,
-        point_digits=sample.style.point_digits if digits is None else digits,
-        eol=sample.style.eol if eol is None else ends[eol],
+        **{key: getattr(settings, key) for key in shown},
+        digits=settings.digits or sample.style.digits,
+        point_digits=settings.digits or sample.style.point_digits,
+        eol=settings.eol or sample.style.eol,
     )
-    if sample.points_style is not None:
-        own = {key: getattr(style, key) for key in ("q_word", "number_base", "point_digits", "eol")}
-        sample = replace(sample, points_style=replace(sample.points_style, **own))
-    unit_mm = take_length_unit_mm(section, style)
-    points = _axes_of(sample.parameters, unit_mm)
-    return replace(sample, style=style, interval_unit_mm=unit_mm, axes=points)
+    of_points = sample.points_style
+    if of_points is not None:
+        same = {key: getattr(style, key) for key in ("q_word", "number_base", "point_digits", "eol")}
+        of_points = replace(of_points, **same)
+    axes = _axes_of(sample.parameters, settings.interval_unit_mm)
+    return replace(settings, sample=replace(sample, style=style, points_style=of_points, axes=axes))
 
 
 def as_sample(machine: Machine, files: Sequence[Path], names: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -429,7 +491,7 @@ def sample_of(files: Sequence[SourceFile], path: int = 1) -> Sample:
         if record.number - base in values:
             raise record.fail("the compensation point is given a second time; give each file once")
         values[record.number - base] = record.whole(text, -MOST_VALUE, MOST_VALUE)
-    return Sample(style, points_style, notes, 1.0, {}, sorted_in.axes, values, sorted_in.common)
+    return Sample(style, points_style, notes, {}, sorted_in.axes, values, sorted_in.common)
 
 
 class PunchedRecords:
@@ -561,17 +623,6 @@ def path_value(record: Record, path: int) -> str | None:
     if 2 * len(values) != len(words):
         raise record.fail("a path is given twice")
     return values.get(path)
-
-
-def take_length_unit_mm(section: toml_files.Section, style: FanucStyle) -> float:
-    """Take ``interval_unit_mm``, the unit of lengths without a decimal point; it must be stated for these."""
-    if not style.real_point and "interval_unit_mm" not in section:
-        raise section.fail(
-            "interval_unit_mm",
-            "is missing; with real_point = false parameter 3624 is a whole number whose unit depends on the control "
-            "(1.0 or 0.001 mm are common): read 3624 of a known axis and give the unit in mm",
-        )
-    return section.take("interval_unit_mm", toml_files.positive, 1.0)
 
 
 def punched_file(path: Path) -> SourceFile:

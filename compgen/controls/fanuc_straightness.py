@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import ROUND_CEILING, Decimal
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from compgen.controls.fanuc_pitch import pitch_points
-from compgen.controls.fanuc_pitch_tables import PitchSettings, read_pitch_settings
+from compgen.controls.fanuc_pitch_tables import read_pitch_settings
 from compgen.controls.fanuc_records import (
-    FanucStyle,
     PointGrid,
     Punched,
     PunchedRecords,
-    Sample,
+    PunchedSettings,
     as_sample,
     length_of,
     read_records,
-    take_sample,
+    take_punched,
     type_word,
 )
 from compgen.controls.shared.base import (
@@ -37,13 +36,14 @@ from compgen.controls.shared.base import (
     plan_contradictions,
 )
 from compgen.controls.shared.grids import curve_nodes_mm
-from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
+from compgen.controls.shared.terms import ACROSS, one_dimensional_name, one_dimensional_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import setting, whole
 from compgen.errors import InputError
 from compgen.kinematics.curves import hat_matrix
 
@@ -54,54 +54,44 @@ from compgen.kinematics.curves import hat_matrix
 SECTIONS = 100
 
 
-@dataclass(frozen=True)
-class StraightnessSettings:
+def _pairs(value: Any) -> tuple[tuple[int, int], ...]:
+    """A list of at most three tables such as ``"Y(x)"``, each moving axis once."""
+    if not isinstance(value, list) or not value or any(item not in ACROSS for item in value):
+        raise ValueError(f"a list of {', '.join(map(repr, ACROSS))} is expected")
+    found = tuple(ACROSS[item] for item in value)
+    if len({moving for _, moving in found}) < len(found):
+        raise ValueError("each moving axis can be given once only: the control keeps four points for each moving axis")
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class StraightnessSettings(PunchedSettings):
     """Settings of straightness compensation.
 
-    Parameters
-    ----------
-    detection_unit_um : one count of the compensation amounts.
-    stores : whether the amounts are the correction (added to the command) or the error.
-    pairs : (compensated axis, moving axis), 0..2; None: the best ones are chosen.
-    grids : compensation points of X, Y, Z; None where the sample shows that the axis has none. ``stated`` tells which of
-        them the user or the sample gave, ``of_pitch`` which are those of ``[controllers.fanuc-pitch]``; the others are
-        assumed.
-    amount_limit : largest magnitude of an amount.
-    axis_numbers : controlled axis numbers of X, Y, Z.
-    path : path of the control, for parameters with a word L.
-    sample : what files of the user's control show.
+    ``grids`` are the compensation points of X, Y, Z; None where the sample shows that the axis has none. ``stated`` tells
+    which of them the user or the sample gave, ``of_pitch`` which are those of ``[controllers.fanuc-pitch]``; the others are
+    assumed. ``pairs`` are (compensated axis, moving axis), 0..2; None: the best ones are chosen.
     """
 
-    detection_unit_um: float
-    stores: Literal["correction", "error"]
-    pairs: tuple[tuple[int, int], ...] | None
-    grids: tuple[PointGrid | None, PointGrid | None, PointGrid | None]
-    stated: tuple[bool, bool, bool]
-    of_pitch: tuple[bool, bool, bool]
-    amount_limit: int
-    axis_numbers: tuple[int, int, int]
-    path: int
-    sample: Sample = field(default_factory=Sample, compare=False)
-
-    @property
-    def style(self) -> FanucStyle:
-        """How the file is written."""
-        return self.sample.style
+    path: int = setting(whole(1, 99), 1, meaning="path of the control whose parameters count, where they have a word L")
+    grids: tuple[PointGrid | None, ...] = setting(
+        toml_files.table,
+        (None, None, None),
+        key="points",
+        meaning="compensation points of an axis as pitch error compensation has them, { X = { reference = 40, first = 33, "
+        "last = 49, interval_mm = 50.0 } }; those of the sample, else of [controllers.fanuc-pitch], else assumed, if not stated",
+    )
+    pairs: tuple[tuple[int, int], ...] | None = setting(
+        _pairs, None, meaning='up to three tables, e.g. ["Y(x)", "X(y)"], each moving axis once; chosen if not stated'
+    )
+    amount_limit: int = setting(whole(1, 32767), 32767, meaning="largest magnitude of an amount, counts")
+    stated: tuple[bool, ...] = (False, False, False)
+    of_pitch: tuple[bool, ...] = (False, False, False)
 
     @property
     def assumed(self) -> tuple[bool, ...]:
         """Whether the points of X, Y, Z are assumed."""
         return tuple(not one and not other for one, other in zip(self.stated, self.of_pitch, strict=True))
-
-    @property
-    def interval_unit_mm(self) -> float:
-        """Unit of 3624 without a decimal point."""
-        return self.sample.interval_unit_mm
-
-    @property
-    def sign(self) -> int:
-        """+1 if the amounts are the correction, -1 if they are the error."""
-        return 1 if self.stores == "correction" else -1
 
     @property
     def count_mm(self) -> float:
@@ -110,93 +100,68 @@ class StraightnessSettings:
 
 
 def read_straightness_settings(machine: Machine) -> StraightnessSettings:
-    """Read and check ``[controllers.fanuc-straightness]``; every key has a default."""
+    """Read and check ``[controllers.fanuc-straightness]``; every key has a default, if need be that of fanuc-pitch."""
     section = machine.controller_settings("fanuc-straightness")
-    path = section.take("path", toml_files.whole(1, 99), 1)
-    sample = take_sample(section, path=path)
     points = section.section("points", required=False)
-    pitch = read_pitch_settings(machine) if "fanuc-pitch" in machine.controllers else None
-    axis_numbers = _axis_numbers(section.section("axis_numbers", required=False), pitch)
-    if len(set(axis_numbers)) < 3:
-        raise section.fail("axis_numbers", f"{axis_numbers} gives two axes the same number")
-    grids, stated, of_pitch = _point_grids(machine, sample, points, axis_numbers)
-    unit_um = 1.0 if pitch is None else pitch.detection_unit_um
-    settings = StraightnessSettings(
-        detection_unit_um=section.take("detection_unit_um", toml_files.positive, unit_um),
-        stores="correction"
-        if section.take("stores", toml_files.choice("correction", "error"), "correction") == "correction"
-        else "error",
-        pairs=section.take("pairs", _pairs, None),
-        grids=grids,
-        stated=stated,
-        of_pitch=of_pitch,
-        amount_limit=section.take("amount_limit", toml_files.whole(1, 32767), 32767),
-        axis_numbers=axis_numbers,
-        path=path,
-        sample=sample,
-    )
+    settings = take_punched(StraightnessSettings, section, grids=(None, None, None))
+    if "fanuc-pitch" in machine.controllers:
+        pitch = read_pitch_settings(machine)
+        same = {"detection_unit_um": pitch.detection_unit_um, "axis_numbers": pitch.axis_numbers}
+        settings = toml_files.unless_stated(settings, section, **same)
+        if settings.axis_numbers != pitch.axis_numbers:
+            own, stated = (", ".join(map(str, numbers)) for numbers in (settings.axis_numbers, pitch.axis_numbers))
+            part = section.section("axis_numbers")
+            raise part.fail("X", f"{own} are the axis numbers here, and {stated} in [controllers.fanuc-pitch]")
+    settings.finish(section)
+    settings = _with_points(machine, settings, points)
     for _, moving in settings.pairs or ():
         if settings.grids[moving] is None:
             raise section.fail(
                 "pairs",
-                f"{AXES[moving]} (A{axis_numbers[moving]}) has no compensation points in the sample (3620 to 3622 and 3624), "
-                f"and other axes must keep theirs; leave its table out, or state points.{AXES[moving]}",
+                f"{AXES[moving]} (A{settings.axis_numbers[moving]}) has no compensation points in the sample (3620 to 3622 "
+                f"and 3624), and other axes must keep theirs; leave its table out, or state points.{AXES[moving]}",
             )
-    section.finish()
     return settings
 
 
-def _point_grids(
-    machine: Machine, sample: Sample, points: toml_files.Section, axis_numbers: tuple[int, int, int]
-) -> Any:
+def _with_points(machine: Machine, settings: StraightnessSettings, points: toml_files.Section) -> StraightnessSettings:
     """Compensation points of X, Y, Z: stated ones, those of the sample, of ``[controllers.fanuc-pitch]``, else assumed ones.
 
-    Beside them, which are of the first two kinds and which of the third. The numbers belong to pitch error compensation
-    as well: with a sample no others than its own are written, and assumed ones are never written beside the tables.
+    The numbers belong to pitch error compensation as well: with a sample no others than its own are written, and assumed
+    ones are never written beside the tables.
     """
-    quantum = Decimal("0.001") if sample.style.real_point else Decimal(repr(sample.interval_unit_mm))
+    sample, pitch = settings.sample, pitch_points(machine)
     grids: list[PointGrid | None] = []
-    pitch = pitch_points(machine)
     of_pitch = [False, False, False]
     for axis, letter in enumerate(AXES):
-        shown = sample.axes.get(axis_numbers[axis])
+        number = settings.axis_numbers[axis]
+        shown, own = sample.axes.get(number), pitch[axis]
         known = None if shown is None or not shown.grid.interval_mm else shown.grid
         if letter in points:
             grid = _grid(points.section(letter))
             if known is not None and grid != known:
                 raise points.fail(
                     letter,
-                    f"differs from the sample: A{axis_numbers[axis]} has 3620 = {known.reference}, 3621 = {known.first}, 3622 = "
+                    f"differs from the sample: A{number} has 3620 = {known.reference}, 3621 = {known.first}, 3622 = "
                     f"{known.last}, 3624 = {known.interval_mm:f} there; other values would shift its pitch table",
                 )
-            sample.check_free(axis_numbers[axis], letter, grid.first, grid.last)
-            grids.append(grid)
         elif known is not None:
-            sample.check_free(axis_numbers[axis], letter, known.first, known.last)
-            grids.append(known if known.last >= known.first + 3 else None)
-        elif any((number, axis_numbers[axis]) in sample.parameters for number in (3620, 3621, 3622, 3624)):
+            grid = known
+        elif any((parameter, number) in sample.parameters for parameter in GRID_PARAMETERS):
             grids.append(None)
-        elif (own := pitch[axis]) is not None:
-            sample.check_free(axis_numbers[axis], letter, own.first, own.last)
-            grids.append(own if own.last >= own.first + 3 else None)
-            of_pitch[axis] = True
+            continue
+        elif own is not None:
+            grid, of_pitch[axis] = own, True
         else:
             used = [grid.last for grid in (*grids, *pitch) if grid is not None]
             used += [span[1] for _, span in sample.others(0)]
-            grids.append(default_grid(machine, axis, max(used, default=0) + 1, quantum=quantum))
-    stated = tuple(letter in points or axis_numbers[k] in sample.axes for k, letter in enumerate(AXES))
+            grids.append(default_grid(machine, settings, axis, max(used, default=0) + 1))
+            continue
+        sample.check_free(number, letter, grid.first, grid.last)
+        grids.append(grid if grid.last >= grid.first + 3 else None)
     points.finish()
-    return tuple(grids), stated, tuple(of_pitch)
-
-
-def _axis_numbers(section: toml_files.Section, pitch: PitchSettings | None) -> tuple[int, int, int]:
-    usual = (1, 2, 3) if pitch is None else pitch.axis_numbers
-    x, y, z = (section.take(axis, toml_files.whole(1, 99), usual[k]) for k, axis in enumerate(AXES))
-    if pitch is not None and (x, y, z) != usual:
-        stated = ", ".join(map(str, usual))
-        raise section.fail("X", f"{x}, {y}, {z} are the axis numbers here, and {stated} in [controllers.fanuc-pitch]")
-    section.finish()
-    return x, y, z
+    stated = tuple(letter in points or settings.axis_numbers[k] in sample.axes for k, letter in enumerate(AXES))
+    return replace(settings, grids=tuple(grids), stated=stated, of_pitch=tuple(of_pitch))
 
 
 def _grid(section: toml_files.Section) -> PointGrid:
@@ -213,25 +178,15 @@ def _grid(section: toml_files.Section) -> PointGrid:
     return grid
 
 
-def default_grid(machine: Machine, axis: int, free: int, *, quantum: Decimal) -> PointGrid:
+def default_grid(machine: Machine, settings: StraightnessSettings, axis: int, free: int) -> PointGrid:
     """Return points over the whole travel, about a hundredth of it apart, with numbers from ``free`` on."""
+    quantum = Decimal("0.001") if settings.style.real_point else Decimal(repr(settings.interval_unit_mm))
     low, high = machine.axes[axis].range_mm
     reference = machine.reference_point_mm[axis]
     step = (Decimal(repr(high - low)) / SECTIONS / quantum).to_integral_value(rounding=ROUND_CEILING) * quantum
     below = math.ceil((reference - low) / float(step) - 1e-9)
     above = math.ceil((high - reference) / float(step) - 1e-9)
     return PointGrid(free + below, free, free + below + above, step)
-
-
-def _pairs(value: Any) -> tuple[tuple[int, int], ...]:
-    """A list of at most three tables such as ``"Y(x)"``, each moving axis once."""
-    known = {f"{AXES[c]}({AXES[m].lower()})": (c, m) for c in range(3) for m in range(3) if c != m}
-    if not isinstance(value, list) or not value or any(item not in known for item in value):
-        raise ValueError(f"a list of {', '.join(map(repr, known))} is expected")
-    found = tuple(known[item] for item in value)
-    if len({moving for _, moving in found}) < len(found):
-        raise ValueError("each moving axis may stand once: the control keeps four points for each moving axis")
-    return found
 
 
 # Numbers of straightness compensation: reading them from text, the polyline that they mean, their limits.
@@ -270,7 +225,7 @@ class StraightTable:
     @property
     def name(self) -> str:
         """Name such as ``Y(x)``."""
-        return f"{AXES[self.compensated]}({AXES[self.moving].lower()})"
+        return one_dimensional_name(self.compensated, self.moving)
 
     @property
     def along_mm(self) -> FloatArray:
@@ -407,6 +362,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
     """Up to three tables such as Y(x), each moving axis once; zero at the reference point but for the rounding."""
 
     name = "fanuc-straightness"
+    settings_class = StraightnessSettings
     anchored = True
     sample_setting = "style_from"
 

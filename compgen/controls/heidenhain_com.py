@@ -36,7 +36,7 @@ from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
-from compgen.data.toml_files import axis_setting, choice, setting, whole, word_for
+from compgen.data.toml_files import axis_setting, choice, file_setting, setting, whole, word_for
 from compgen.errors import CompgenWarning, InputError
 
 # Settings of ``[controllers.heidenhain-com]``: generation, sign, node positions, limits, tables saved on the control.
@@ -85,6 +85,16 @@ class HeidenhainSettings:
     keep_name : whether the name in the first line of such a table stays, or becomes that of the written file.
     """
 
+    com: ComLayout | None = file_setting(
+        lambda path: template_layout(path, "COM"),
+        key="template_from",
+        meaning="an empty .COM table saved on the control, to be filled in",
+    )
+    cma: ComLayout | None = file_setting(
+        lambda path: template_layout(path, "CMA"),
+        key="cma_template_from",
+        meaning="an empty .CMA table saved on the control, to be filled in",
+    )
     older: bool = setting(
         word_for({"free": False, "power-of-two": True}),
         key="generation",
@@ -124,8 +134,6 @@ class HeidenhainSettings:
         key="spacing_exponent",
         meaning="older controls: n of the spacing 2^n x 0.0001 mm of each axis",
     )
-    com: ComLayout | None = None
-    cma: ComLayout | None = None
     keep_name: bool = setting(
         word_for({"keep": True, "file": False}),
         key="begin_name",
@@ -399,13 +407,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
     def read_settings(cls, machine: Machine) -> HeidenhainSettings:
         """Read ``[controllers.heidenhain-com]``; every key has a default."""
         section = machine.controller_settings(cls.name)
-        com, cma = section.file("template_from"), section.file("cma_template_from")
-        settings = toml_files.read_settings(
-            HeidenhainSettings,
-            section,
-            com=template_layout(com, "COM") if com else None,
-            cma=template_layout(cma, "CMA") if cma else None,
-        )
+        settings = toml_files.read_settings(HeidenhainSettings, section)
         check_names(section, settings.axis_names)
         _check_older(section, settings)
         _check_templates(section, settings)

@@ -79,6 +79,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
     """Tables of each axis over each axis in counts of half a setting unit, zero at the reference point."""
 
     name = "mitsubishi"
+    settings_class = MitsubishiSettings
     anchored = True
     sample_setting = "style_from"
 

@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.controls.shared.base import SourceFile, Usage, coverage_violations
-from compgen.controls.shared.grids import take_loss_mm
+from compgen.controls.shared.grids import loss_setting
+from compgen.controls.shared.terms import ACROSS
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.files import read_bytes
 from compgen.data.machine import Machine
 from compgen.data.messages import one_line
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import axis_setting, file_setting, multiple_of, setting, whole, word_for
 from compgen.errors import CompgenWarning, InputError
 
 # Rows of a set sheet and records of the control's own parameter file, and what that file shows of all axes.
@@ -256,37 +258,79 @@ INTERVAL_QUANTUM_MM = Decimal("0.001")
 LOWEST_VALUE, HIGHEST_VALUE = -128, 127
 
 
-@dataclass(frozen=True)
+def _across(value: Any) -> tuple[tuple[int, int], ...]:
+    """True for all tables of one axis as a function of another, false for none, or a list of names."""
+    if isinstance(value, bool):
+        return tuple(ACROSS.values()) if value else ()
+    if not isinstance(value, list) or any(item not in ACROSS for item in value) or len(set(value)) < len(value):
+        raise ValueError(f"true, false or a list of {', '.join(map(repr, ACROSS))} is expected")
+    return tuple(ACROSS[item] for item in value)
+
+
+def _name(value: Any) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,3}", value, re.ASCII):
+        raise ValueError("a name of at most four letters and digits is expected")
+    return value
+
+
+@dataclass(frozen=True, kw_only=True)
 class MitsubishiSettings:
     """Settings of machine error compensation.
 
-    Parameters
-    ----------
-    setting_unit_um : setting unit of the control; one count of the table is half of it, times ``scale``.
-    scale : compensation scale factor (parameter sc) of every set; None: that of the control's file, else 1.
-    absolute : whether values are sums up to their point (#4000 = 0) and not steps (1); None: not known.
-    adds : True if the control adds the numbers (corrections), False if it subtracts them.
-    across : tables of one axis as a function of another (straightness, squareness), as (output, base axis).
-    interval_mm : division interval per base axis, None: chosen.
-    loss_mm : loss by interpolation between division points that is worth no shorter interval.
-    first_number, last_number : numbers of values that may be used.
-    first_set : first set of parameters that may be used, 1 to 10.
-    axis_names : names of X, Y, Z on the control.
-    sample : the control's own parameter file.
+    ``sample`` is the control's own parameter file; ``absolute`` says whether values are sums up to their point (#4000 = 0)
+    and not steps (1), None: not known; ``adds`` is True if the control adds the numbers (corrections), False if it
+    subtracts them; ``across`` are (output, base axis) of the tables of one axis as a function of another.
     """
 
-    setting_unit_um: float
-    scale: int | None
-    absolute: bool | None
-    adds: bool
-    across: tuple[tuple[int, int], ...]
-    interval_mm: tuple[float | None, float | None, float | None]
-    loss_mm: float
-    first_number: int
-    last_number: int
-    first_set: int
-    axis_names: tuple[str, str, str]
-    sample: ControlFile = field(default_factory=ControlFile, compare=False)
+    sample: ControlFile = file_setting(
+        read_control_file,
+        several=True,
+        key="style_from",
+        meaning="the control's own parameter file (ALL.PRM): mode, unit, sets, numbers, intervals and scales are kept, "
+        "those of other axes never overwritten",
+    )
+    absolute: bool | None = setting(
+        word_for({"incremental": False, "absolute": True}),
+        None,
+        key="mode",
+        meaning="system of the values (#4000), which holds for all axes: increments or absolute. Needed for an export without "
+        "style_from",
+    )
+    setting_unit_um: float = setting(
+        toml_files.positive, 1.0, meaning="setting unit of the control; one count is half of it, times scale"
+    )
+    scale: int | None = setting(
+        whole(1, 99),
+        None,
+        meaning="compensation scale factor (sc) of every set; that of the control's file, else 1, if not stated",
+    )
+    adds: bool = setting(
+        word_for({"correction": True, "error": False}),
+        key="stores",
+        stated="correction",
+        meaning="what the numbers are: correction (added) or error",
+    )
+    across: tuple[tuple[int, int], ...] = setting(
+        _across,
+        key="relative_errors",
+        stated=True,
+        meaning="also correct axes as a function of another one (straightness, squareness): true, false, or a list, e.g. "
+        '["Y(x)"]',
+    )
+    interval_mm: tuple[float | None, float | None, float | None] = axis_setting(
+        multiple_of(INTERVAL_QUANTUM_MM), meaning="division interval of each base axis; chosen if it is not stated"
+    )
+    loss_mm: float = loss_setting("loss by interpolation, um at the tool, that is worth no shorter interval")
+    first_number: int = setting(
+        whole(FIRST_NUMBER, MOST_NUMBER), FIRST_NUMBER, meaning="first number of a value that is free"
+    )
+    last_number: int = setting(
+        whole(FIRST_NUMBER, MOST_NUMBER), LAST_NUMBER, meaning="last number of a value that is free"
+    )
+    first_set: int = setting(whole(1, SETS), 1, meaning="first set of parameters that is free, 1 to 10")
+    axis_names: tuple[str, str, str] = axis_setting(
+        _name, AXES, differ="{}: expected three different names", meaning="names of X, Y, Z on the control"
+    )
 
     @property
     def sign(self) -> int:
@@ -341,25 +385,15 @@ def read_mitsubishi_settings(machine: Machine) -> MitsubishiSettings:
     Every key has a default but ``mode``, which an export needs unless the control's own file is given.
     """
     section = machine.controller_settings("mitsubishi")
-    sample = read_control_file(section.files("style_from"))
-    mode = section.take("mode", toml_files.choice("incremental", "absolute"), None)
-    absolute = sample.absolute if mode is None else mode == "absolute"
-    if sample.file is not None and absolute != sample.absolute:
-        raise section.fail("mode", f"{mode!r} is stated, but {sample.file.path} has #4000 = {int(not sample.absolute)}")
-    settings = MitsubishiSettings(
-        setting_unit_um=section.take("setting_unit_um", toml_files.positive, sample.unit_um or 1.0),
-        scale=section.take("scale", toml_files.whole(1, 99), None),
-        absolute=absolute,
-        adds=section.take("stores", toml_files.choice("correction", "error"), "correction") == "correction",
-        across=section.take("relative_errors", _across, ACROSS),
-        interval_mm=_intervals(section),
-        loss_mm=take_loss_mm(section),
-        first_number=section.take("first_number", toml_files.whole(FIRST_NUMBER, MOST_NUMBER), FIRST_NUMBER),
-        last_number=section.take("last_number", toml_files.whole(FIRST_NUMBER, MOST_NUMBER), sample.last_number),
-        first_set=section.take("first_set", toml_files.whole(1, SETS), 1),
-        axis_names=_names(section),
-        sample=sample,
-    )
+    settings = toml_files.read_settings(MitsubishiSettings, section)
+    sample = settings.sample
+    shown = {"setting_unit_um": sample.unit_um or 1.0, "last_number": sample.last_number, "absolute": sample.absolute}
+    settings = toml_files.unless_stated(settings, section, **shown)
+    if sample.file is not None and settings.absolute != sample.absolute:
+        stated = "absolute" if settings.absolute else "incremental"
+        raise section.fail(
+            "mode", f"{stated!r} is stated, but {sample.file.path} has #4000 = {int(not sample.absolute)}"
+        )
     if settings.last_number - settings.first_number + 1 < 3 * len(settings.pairs):
         raise section.fail("last_number", f"leaves too few numbers from {settings.first_number} on")
     new = [pair for pair in settings.pairs if settings.own_set(pair) is None]
@@ -371,50 +405,7 @@ def read_mitsubishi_settings(machine: Machine) -> MitsubishiSettings:
             f"{len(new)} new sets are needed and {len(free)} of the {SETS} sets of the control are free{others}; state which "
             'tables are wanted, e.g. relative_errors = ["Y(x)", "X(y)"], or false for positioning alone',
         )
-    section.finish()
     return settings
-
-
-#: All tables of one axis as a function of another.
-ACROSS = tuple((output, base) for base in range(3) for output in range(3) if output != base)
-
-
-def _across(value: Any) -> tuple[tuple[int, int], ...]:
-    """True for all tables of one axis as a function of another, false for none, or a list of names."""
-    known = {f"{AXES[output]}({AXES[base].lower()})": (output, base) for output, base in ACROSS}
-    if isinstance(value, bool):
-        return ACROSS if value else ()
-    if not isinstance(value, list) or any(item not in known for item in value) or len(set(value)) < len(value):
-        raise ValueError(f"true, false or a list of {', '.join(map(repr, known))} is expected")
-    return tuple(known[item] for item in value)
-
-
-def _intervals(section: toml_files.Section) -> tuple[float | None, float | None, float | None]:
-    part = section.section("interval_mm", required=False)
-    x, y, z = (part.take(letter, _interval, None) for letter in AXES)
-    part.finish()
-    return x, y, z
-
-
-def _interval(value: Any) -> float:
-    if Decimal(repr(toml_files.positive(value))) % INTERVAL_QUANTUM_MM:
-        raise ValueError(f"a multiple of {INTERVAL_QUANTUM_MM} mm is expected")
-    return float(value)
-
-
-def _names(section: toml_files.Section) -> tuple[str, str, str]:
-    part = section.section("axis_names", required=False)
-    x, y, z = (part.take(letter, _name, letter) for letter in AXES)
-    part.finish()
-    if len({x, y, z}) < 3:
-        raise section.fail("axis_names", f"{x}, {y}, {z}: expected three different names")
-    return x, y, z
-
-
-def _name(value: Any) -> str:
-    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,3}", value, re.ASCII):
-        raise ValueError("a name of at most four letters and digits is expected")
-    return value
 
 
 # Numbers of machine error compensation: tables read from text, the curves they mean, the limits they must keep.

@@ -12,6 +12,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, TypeVar, cast, overload
 
@@ -235,6 +236,20 @@ def axis_setting(
     return field(default=defaults, metadata=metadata)
 
 
+def file_setting(
+    load: Callable[[Any], Any] | None = None, *, several: bool = False, key: str = "", meaning: str = ""
+) -> Any:
+    """Declare a field as a setting that names a file (``several``: one or more), relative to the folder of the TOML file.
+
+    The value is the path (a tuple of paths), or what ``load`` makes of it; without the key it is None (``load`` of no
+    path).
+    """
+    check = texts_of_paths if several else text_of_path
+    metadata: dict[str, Any] = {"check": check, "key": key, "load": load, "several": several}
+    metadata |= {"unit": 1.0, "required": False, "stated": None, "meaning": meaning}
+    return field(default=(load(()) if load else ()) if several else None, metadata=metadata, compare=False)
+
+
 def take_axes(section: Section, item: Field[Any]) -> tuple[Any, Any, Any]:
     """Return the values of X, Y and Z of a field that :func:`axis_setting` declares."""
     data, key = item.metadata, item.metadata["key"] or item.name
@@ -247,12 +262,17 @@ def take_axes(section: Section, item: Field[Any]) -> tuple[Any, Any, Any]:
     return x, y, z
 
 
-def meanings_of(kind: type) -> dict[str, str]:
-    """Return what the settings of a dataclass mean, by their keys in a file."""
-    if not is_dataclass(kind):
-        return {}
-    declared = [item for item in fields(kind) if item.metadata.get("meaning")]
-    return {item.metadata["key"] or item.name: item.metadata["meaning"] for item in declared}
+def declared_settings(kind: type) -> list[tuple[RequestedKey, str]]:
+    """Return the keys that a dataclass declares, as a file has them, each with its meaning, in the order of the fields."""
+    found = []
+    for item in fields(kind) if is_dataclass(kind) else ():
+        data, key = item.metadata, item.metadata.get("key") or item.name
+        if "axes" in data:
+            parts = [(f"{key}.{letter}", False, default) for letter, default in zip(AXES, data["axes"], strict=True)]
+        else:
+            parts = [(key, data["required"], None if data["required"] else data["stated"])] if "check" in data else []
+        found += [(RequestedKey(*part, data["check"]), data["meaning"]) for part in parts]
+    return found
 
 
 def take_settings(kind: type[T], section: Section, /, **given: Any) -> T:
@@ -265,6 +285,11 @@ def take_settings(kind: type[T], section: Section, /, **given: Any) -> T:
             continue
         key, check, unit = (item.metadata[name] for name in ("key", "check", "unit"))
         key, default = key or item.name, item.metadata["stated"]
+        if "load" in item.metadata:
+            paths = section.files(key) if item.metadata["several"] else section.file(key)
+            load = item.metadata["load"]
+            given[item.name] = load(paths) if load and paths is not None else paths
+            continue
         found = section.take(key, check, *(() if item.metadata["required"] else (default,)))
         if key in section:
             scaled = [unit * value for value in found] if isinstance(found, tuple) and unit != 1.0 else None
@@ -277,6 +302,20 @@ def read_settings(kind: type[T], section: Section, /, **given: Any) -> T:
     result = take_settings(kind, section, **given)
     section.finish()
     return result
+
+
+def unless_stated(settings: T, section: Section, **usual: Any) -> T:
+    """Return settings with the ``usual`` values, by field, wherever the section does not have the key (axis by axis)."""
+    found = {}
+    for item in fields(cast(Any, settings)):
+        key = item.metadata.get("key") or item.name
+        if item.name in usual and "axes" in item.metadata:
+            pairs = zip(AXES, getattr(settings, item.name), usual[item.name], strict=True)
+            stated = section.data.get(key, {})
+            found[item.name] = tuple(own if letter in stated else other for letter, own, other in pairs)
+        elif item.name in usual and key not in section:
+            found[item.name] = usual[item.name]
+    return cast(T, replace(cast(Any, settings), **found))
 
 
 # --- checks: each returns the clean value or raises ValueError with what is expected -----------------------------
@@ -297,6 +336,17 @@ def positive(value: Any) -> float:
     if result <= 0:
         raise ValueError("a number above zero is expected")
     return result
+
+
+def multiple_of(quantum: Decimal) -> Callable[[Any], float]:
+    """A positive length in whole multiples of ``quantum``, mm."""
+
+    def check(value: Any) -> float:
+        if Decimal(repr(positive(value))) % quantum:
+            raise ValueError(f"a multiple of {quantum} mm is expected")
+        return float(value)
+
+    return check
 
 
 def not_negative(value: Any) -> float:

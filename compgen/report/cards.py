@@ -85,7 +85,8 @@ class _Watching(Machine):
 def control_card(name: str, templates: Path | None = None) -> ControlCard:
     """Return the card of control ``name``; its settings are those that its reader asks for."""
     control, card = controller_named(name), load_format(name, templates)
-    meanings = {**toml_files.meanings_of(getattr(control, "settings_class", object)), **card.settings}
+    declared = toml_files.declared_settings(getattr(control, "settings_class", object))
+    meanings = {**{key.key: meaning for key, meaning in declared}, **card.settings}
     asked, problem = asked_settings(control, card.example_settings)
     settings = tuple(
         ControlSetting(

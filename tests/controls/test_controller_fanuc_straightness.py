@@ -400,8 +400,8 @@ def test_any_text_is_parsed_or_refused_but_never_crashes(lines):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"pairs": ["X(x)"]}, "a list of 'X(y)'"),
-        ({"pairs": ["Y(x)", "Z(x)"]}, "each moving axis may stand once"),
+        ({"pairs": ["X(x)"]}, "a list of 'Y(x)', 'Z(x)', 'X(y)', 'Z(y)', 'X(z)', 'Y(z)'"),
+        ({"pairs": ["Y(x)", "Z(x)"]}, "each moving axis can be given once only"),
         ({"points": {"X": {"reference": 4, "first": 1, "last": 3, "interval_mm": 5.0}}}, "at least four"),
         ({"points": {"X": {"reference": 4, "first": 1, "last": 9}}}, "interval_mm"),
         ({"stores": "minus"}, "'correction', 'error'"),

@@ -23,6 +23,12 @@ def one_dimensional_name(output: int, axis: int) -> str:
     return f"{AXES[output]}({AXES[axis].lower()})"
 
 
+#: (output, base axis) of the tables of one axis as a function of another, by their names.
+ACROSS = {
+    one_dimensional_name(output, base): (output, base) for base in range(3) for output in range(3) if output != base
+}
+
+
 def product_name(output: int, axis: int, lever: int) -> str:
     """Name of the table that corrects ``output`` by a function of ``axis`` times the lever, e.g. ``X(y)*z``."""
     return f"{one_dimensional_name(output, axis)}*{AXES[lever].lower()}"
