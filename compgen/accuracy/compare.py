@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from compgen.accuracy.diagonals import SAME_CORNER_MM, DiagonalRun, accuracy_of_
 from compgen.accuracy.evaluate import (
     LINES,
     MOST_IN_PAIRS,
+    Accuracy,
     accuracy_of_runs,
     groups_of_errors,
     narrowed,
@@ -133,24 +135,21 @@ def _joined(first: Curve, second: Curve, align: str) -> FloatArray:
 
 def resampled(source: ErrorSource, names: Sequence[str], nodes_mm: dict[str, FloatArray]) -> ErrorSource:
     """Return some errors of a source, linear between its positions, at new ones; the covariance follows."""
-    curves, squareness, rows = {}, {}, []
-    first = 0
-    for name in source.errors.names:
-        single = name in source.errors.squareness
-        count = 1 if single else len(source.errors.curves[name].value)
-        if name in names:
-            matrix = np.eye(1) if single else hat_matrix(source.errors.curves[name].position_mm, nodes_mm[name])
-            factor = None if source.factor is None else matrix @ source.factor[first : first + count]
-            if single:
-                squareness[name] = source.errors.squareness[name]
-            else:
-                old = source.errors.curves[name]
-                u = np.full(len(matrix), np.nan) if factor is None else np.linalg.norm(factor, axis=1)
-                curves[name] = Curve(nodes_mm[name], matrix @ old.value, u)
-            rows.append(factor)
-        first += count
-    known = [part for part in rows if part is not None]
-    factor = np.vstack(known) if len(known) == len(rows) else None
+    curves, squareness, factors = {}, {}, []
+    for name, rows in source.rows.items():
+        if name not in names:
+            continue
+        old = source.errors.curves.get(name)
+        matrix = np.eye(1) if old is None else hat_matrix(old.position_mm, nodes_mm[name])
+        factor = None if source.factor is None else matrix @ source.factor[rows]
+        if old is None:
+            squareness[name] = source.errors.squareness[name]
+        else:
+            u = np.full(len(matrix), np.nan) if factor is None else np.linalg.norm(factor, axis=1)
+            curves[name] = Curve(nodes_mm[name], matrix @ old.value, u)
+        factors.append(factor)
+    known = [part for part in factors if part is not None]
+    factor = np.vstack(known) if len(known) == len(factors) else None
     return replace(source, errors=ErrorTable(curves, squareness, source.errors.metadata), factor=factor)
 
 
@@ -193,7 +192,17 @@ def measured_field(machine: Machine, deviations: Deviations, u_um: float | None 
         _means(index, values, count)
         for values in (np.nan_to_num(deviations.deviation_mm), deviations.position_mm, deviations.position_mm + tools)
     )
-    spread = _measured_spread(deviations, index, error, count, u_um)
+    spread: Spread = unknown_spread
+    freedom = len(index) - len(count)
+    if u_um is not None:
+        spread = independent_spread(np.broadcast_to(u_um * MM_PER_UM / np.sqrt(count), error.shape))
+    elif deviations.u_mm is not None:
+        squares = _means(index, np.nan_to_num(deviations.u_mm) ** 2, count)
+        spread = independent_spread(np.sqrt(squares / count))
+    elif freedom > 0:
+        rest = np.nan_to_num(deviations.deviation_mm) - error[index]
+        pooled = np.sqrt(np.sum(rest**2, axis=0) / freedom)
+        spread = independent_spread(pooled / np.sqrt(count))
     x, y, z = (not np.isnan(deviations.deviation_mm[:, k]).all() for k in range(3))
     return MeasuredField(ErrorField(position, tip, error, spread), tuple(map(tuple, keys.tolist())), (x, y, z))
 
@@ -201,22 +210,6 @@ def measured_field(machine: Machine, deviations: Deviations, u_um: float | None 
 def _means(index: NDArray[np.int64], values: FloatArray, count: FloatArray) -> FloatArray:
     sums = np.column_stack([np.bincount(index, values[:, k], len(count)) for k in range(3)])
     return np.asarray(sums / count)
-
-
-def _measured_spread(
-    deviations: Deviations, index: NDArray[np.int64], mean_mm: FloatArray, count: FloatArray, u_um: float | None
-) -> Spread:
-    if u_um is not None:
-        return independent_spread(np.broadcast_to(u_um * MM_PER_UM / np.sqrt(count), mean_mm.shape))
-    if deviations.u_mm is not None:
-        squares = _means(index, np.nan_to_num(deviations.u_mm) ** 2, count)
-        return independent_spread(np.sqrt(squares / count))
-    freedom = len(index) - len(count)
-    if freedom < 1:
-        return unknown_spread
-    rest = np.nan_to_num(deviations.deviation_mm) - mean_mm[index]
-    pooled = np.sqrt(np.sum(rest**2, axis=0) / freedom)
-    return independent_spread(pooled / np.sqrt(count))
 
 
 def paired_fields(
@@ -304,9 +297,9 @@ def _picked(statistics: RunStatistics, rows: np.ndarray) -> RunStatistics:
 # One gauge for all tables that are compared: what no measurement shows must not count as a change.
 #
 # Constants and slopes of curves can be traded for squareness and a placement of the workpiece without any effect on the
-# machine (:mod:`compgen.kinematics.gauge`). Both sides of a comparison
-# are brought to the same choice, each by itself: straightness
-# zero at both ends of the travel, positioning and angular errors zero at the reference point, the rest in the squareness.
+# machine (:mod:`compgen.kinematics.gauge`). Both sides of a comparison are brought to the same choice, each by itself:
+# straightness zero at both ends of the travel, positioning and angular errors zero at the reference point, the rest in the
+# squareness.
 
 
 def in_common_gauge(source: ErrorSource) -> ErrorSource:
@@ -317,50 +310,31 @@ def in_common_gauge(source: ErrorSource) -> ErrorSource:
     machine, errors = source.machine, source.errors
     shown = observable_errors(machine)
     names = [n for n in errors.names if n in shown and (n in errors.squareness or len(errors.curves[n].value) > 1)]
-    directions = _as_values(errors, gauge_directions(machine, names))
-    if not directions.shape[1]:
+    directions = gauge_directions(machine, names)
+    if not len(directions):
         return source
-    conditions = _conditions(machine, errors, names)
-    effect = conditions @ directions
+    values, changes = errors.values(), []
+    for name in errors.names:  # constants and slopes as changes of the values of the table
+        constant, slope = directions[:, ERROR_INDEX[name]].T
+        nodes = np.zeros(1) if name in errors.squareness else errors.curves[name].position_mm
+        changes.append(constant + nodes[:, None] * slope)
+    # what takes from the values that which the common gauge makes zero; angles times a lever, mm
+    blocks = [np.zeros((0, len(values)))]
+    for name in (name for name in names if name in errors.curves):
+        error, axis = error_named(name), machine.axes[error_named(name).axis]
+        where = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
+        block = np.zeros((len(where), len(values)))
+        lever = 1.0 if error.kind == "linear" else LEVER_MM
+        block[:, source.rows[name]] = lever * hat_matrix(errors.curves[name].position_mm, np.array(where))
+        blocks.append(block)
+    change, conditions = np.vstack(changes), np.vstack(blocks)
+    effect = conditions @ change
     scale = np.linalg.norm(effect, axis=0)
     used = scale > 1e-12 * scale.max(initial=0.0)
     amounts = np.linalg.pinv(effect[:, used] / scale[used], rcond=1e-10) / scale[used][:, None]
-    change = -directions[:, used] @ amounts @ conditions
-    values = errors.values()
-    factor = None if source.factor is None else source.factor + change @ source.factor
-    return replace(source, errors=errors.with_values(values + change @ values), factor=factor)
-
-
-def _as_values(errors: ErrorTable, directions: FloatArray) -> FloatArray:
-    """Directions (d, 21, 2) of constants and slopes as changes of the table's values (k, d)."""
-    rows = []
-    for name in errors.names:
-        constant, slope = directions[:, ERROR_INDEX[name]].T
-        nodes = np.zeros(1) if name in errors.squareness else errors.curves[name].position_mm
-        rows.append(constant + nodes[:, None] * slope)
-    return np.vstack(rows)
-
-
-def _conditions(machine: Machine, errors: ErrorTable, names: Sequence[str]) -> FloatArray:
-    """Matrix (c, k) that takes from the values of a table what the common gauge makes zero; angles times a lever, mm."""
-    count = len(errors.values())
-    rows, first = [], 0
-    for name in errors.names:
-        if name in errors.squareness:
-            first += 1
-            continue
-        error, nodes = error_named(name), errors.curves[name].position_mm
-        if name not in names:
-            first += len(nodes)
-            continue
-        axis = machine.axes[error.axis]
-        where = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
-        block = np.zeros((len(where), count))
-        lever = 1.0 if error.kind == "linear" else LEVER_MM
-        block[:, first : first + len(nodes)] = lever * hat_matrix(nodes, np.array(where))
-        rows.append(block)
-        first += len(nodes)
-    return np.vstack(rows) if rows else np.zeros((0, count))
+    taken_out = -change[:, used] @ amounts @ conditions
+    factor = None if source.factor is None else source.factor + taken_out @ source.factor
+    return replace(source, errors=errors.with_values(values + taken_out @ values), factor=factor)
 
 
 # Before against after, and predicted against measured: improvement with its significance.
@@ -372,6 +346,8 @@ DECISIVE_VOLUME = ("rms", "max")
 #: Share of components beyond k = 2 by chance, points at which components are looked at one by one, and what counts as 0.
 CHANCE, MOST_SINGLE, EXACT_MM = 0.05, 300, 1e-9
 DECISIVE_RUNS = ("A", "E", "A_up", "A_down", "E_up", "E_down")
+#: A positioning test of an axis or of a diagonal.
+_Test = TypeVar("_Test")
 
 
 @dataclass(frozen=True)
@@ -531,7 +507,16 @@ def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOpti
     """
     chosen = options or CompareOptions()
     first, second, text = paired_errors(before, after, chosen.align)
-    machine, cut = _known_part(first.machine, first)
+    machine, cut = first.machine, []
+    lower, upper = machine.lower_mm, machine.upper_mm
+    for name, curve in first.errors.curves.items():
+        axis = error_named(name).axis
+        if len(curve.position_mm) > 1:
+            lower[axis] = max(lower[axis], curve.position_mm[0])
+            upper[axis] = min(upper[axis], curve.position_mm[-1])
+    if not (np.allclose(lower, machine.lower_mm) and np.allclose(upper, machine.upper_mm)):
+        machine = narrowed(machine, lower, upper)
+        cut.append("the curves end within the travel; the volume is the part that they know")
     first, second = replace(first, machine=machine), replace(second, machine=machine)
     fields = volume_fields(machine, (first, second), chosen.alignment or "axes")
     gauged = [in_common_gauge(source) for source in (first, second)]
@@ -545,19 +530,6 @@ def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOpti
     statements += uncertainty_statements(first.known, second.known)
     decisive = tuple(("volume", key) for key in DECISIVE_VOLUME)
     return Comparison("errors", paired_figures(groups[0], groups[1]), decisive, tuple(statements))
-
-
-def _known_part(machine: Machine, source: ErrorSource) -> tuple[Machine, list[str]]:
-    """Machine with its travel cut to what the curves know, where they end within it."""
-    lower, upper = machine.lower_mm, machine.upper_mm
-    for name, curve in source.errors.curves.items():
-        axis = error_named(name).axis
-        if len(curve.position_mm) > 1:
-            lower[axis] = max(lower[axis], curve.position_mm[0])
-            upper[axis] = min(upper[axis], curve.position_mm[-1])
-    if np.allclose(lower, machine.lower_mm) and np.allclose(upper, machine.upper_mm):
-        return machine, []
-    return narrowed(machine, lower, upper), ["the curves end within the travel; the volume is the part that they know"]
 
 
 def uncertainty_statements(*known: bool) -> list[str]:
@@ -576,75 +548,66 @@ def compare_fields(
     """Compare measured positions point by point; InputError for different points unless aligned."""
     chosen = options or CompareOptions()
     first, second, text = paired_fields(before, after, chosen.align)
-    sides = [_aligned(machine, side, chosen.alignment or "as-given") for side in (first, second)]
-    groups = [{"volume": _of_measured(side, first.measured)} for side in sides]
-    known = [not math.isnan(side.spread(np.ones_like(side.error_mm))) for side in sides]
-    statements = [
-        text,
-        f"alignment: {sides[0].alignment}",
-        *_components(first.measured),
-        *uncertainty_statements(*known),
-    ]
-    decisive = tuple(("volume", key) for key in DECISIVE_VOLUME)
-    return Comparison("positions", paired_figures(groups[0], groups[1]), decisive, tuple(statements))
-
-
-def _aligned(machine: Machine, side: MeasuredField, alignment: Alignment) -> ErrorField:
-    if alignment != "as-given" and not all(side.measured):
+    alignment, measured = chosen.alignment or "as-given", first.measured
+    if alignment != "as-given" and not all(measured):
         raise InputError(
             "a rigid motion can be taken out only where dx, dy and dz were measured; take --alignment as-given"
         )
-    return aligned(machine, side.field, alignment)
-
-
-def _of_measured(field: ErrorField, measured: tuple[bool, bool, bool]) -> dict[str, Figure]:
-    figures = volume_figures(field, field.thinned(MOST_IN_PAIRS))
-    gone = {f"V_{axis}" for axis, there in zip("XYZ", measured, strict=True) if not there}
-    return {key: item for key, item in figures.items() if key not in gone}
-
-
-def _components(measured: tuple[bool, bool, bool]) -> list[str]:
-    names = [axis for axis, there in zip("xyz", measured, strict=True) if there]
-    return [] if all(measured) else [f"only d{', d'.join(names)} were measured; the other components count as zero"]
+    sides = [aligned(machine, side.field, alignment) for side in (first, second)]
+    gone = [f"V_{axis}" for axis, there in zip("XYZ", measured, strict=True) if not there]
+    groups = []
+    for side in sides:
+        figures = volume_figures(side, side.thinned(MOST_IN_PAIRS))
+        groups.append({"volume": {key: item for key, item in figures.items() if key not in gone}})
+    known = [not math.isnan(side.spread(np.ones_like(side.error_mm))) for side in sides]
+    statements = [text, f"alignment: {sides[0].alignment}"]
+    if gone:
+        names = ", ".join(f"d{axis}" for axis, there in zip("xyz", measured, strict=True) if there)
+        statements.append(f"only {names} were measured; the other components count as zero")
+    statements += uncertainty_statements(*known)
+    decisive = tuple(("volume", key) for key in DECISIVE_VOLUME)
+    return Comparison("positions", paired_figures(groups[0], groups[1]), decisive, tuple(statements))
 
 
 def compare_runs(
     before: Mapping[str, RunStatistics], after: Mapping[str, RunStatistics], options: CompareOptions | None = None
 ) -> Comparison:
     """Compare positioning runs axis by axis (ISO 230-2, VDI/DGQ 3441); constants of a set-up drop out of all figures."""
-    chosen = options or CompareOptions()
-    axes = _shared("axis runs", "axes", before, after, chosen)
-    pairs = {axis: paired_runs(axis, before[axis], after[axis], chosen.align) for axis in axes}
-    first, second = (
-        accuracy_of_runs(runs, chosen.edition, chosen.budgets)
-        for runs in ({axis: pair[0] for axis, pair in pairs.items()}, {axis: pair[1] for axis, pair in pairs.items()})
+    return _compare_tests(
+        ("axis runs", "axes"), before, after, options or CompareOptions(), paired_runs, accuracy_of_runs
     )
-    groups = paired_figures(first.groups, second.groups)
-    decisive = tuple((axis, next(key for key in DECISIVE_RUNS if key in groups[axis])) for axis in axes)
-    statements = (*(pair[2] for pair in pairs.values()), *first.statements, *uncertainty_statements(_all_known(groups)))
-    return Comparison("axis runs", groups, decisive, statements)
 
 
-def _shared(
-    kind: str, what: str, before: Mapping[str, object], after: Mapping[str, object], options: CompareOptions
-) -> list[str]:
-    """Names of the axes or diagonals that both sides have; InputError if they differ and nothing says what to do."""
+def _compare_tests(
+    what: tuple[str, str],
+    before: Mapping[str, _Test],
+    after: Mapping[str, _Test],
+    options: CompareOptions,
+    pair: Callable[[str, _Test, _Test, str | None], tuple[_Test, _Test, str]],
+    evaluate: Callable[[Mapping[str, _Test], int, Mapping[str, SetupBudget] | None], Accuracy],
+) -> Comparison:
+    """Compare tests of the axes or diagonals that both sides have: pair the positions, evaluate both sides, decide."""
     if options.align == "model" or options.alignment is not None:
         raise InputError(
-            f"{kind} have no rigid motion and no model to align by; --align common or interpolate is possible"
+            f"{what[0]} have no rigid motion and no model to align by; --align common or interpolate is possible"
         )
     names = [name for name in before if name in after]
     if set(before) != set(after) and (options.align != "common" or not names):
         raise InputError(
-            f"BEFORE has {', '.join(before)}, AFTER {', '.join(after)}; --align common compares the {what} that both have",
+            f"BEFORE has {', '.join(before)}, AFTER {', '.join(after)}; --align common compares the {what[1]} that both have",
             field="--align",
         )
-    return names
-
-
-def _all_known(groups: Mapping[str, Mapping[str, ComparedFigure]]) -> bool:
-    """Whether every figure of both sides has an uncertainty."""
-    return not any(math.isnan(item.before.u + item.after.u) for group in groups.values() for item in group.values())
+    pairs = {name: pair(name, before[name], after[name], options.align) for name in names}
+    first = evaluate({name: item[0] for name, item in pairs.items()}, options.edition, options.budgets)
+    second = evaluate({name: item[1] for name, item in pairs.items()}, options.edition, options.budgets)
+    groups = paired_figures(first.groups, second.groups)
+    # Ed and Bd of the diagonals decide; without them the first figure that each axis or diagonal has
+    decisive = tuple(("diagonals", key) for key in groups.get("diagonals", {}))
+    if not decisive:
+        decisive = tuple((name, next(key for key in DECISIVE_RUNS if key in groups[name])) for name in names)
+    known = not any(math.isnan(item.before.u + item.after.u) for group in groups.values() for item in group.values())
+    statements = (*(item[2] for item in pairs.values()), *first.statements, *uncertainty_statements(known))
+    return Comparison(what[0], groups, decisive, statements)
 
 
 def agreement(predicted: ErrorField, measured: ErrorField) -> PredictionAgreement:
@@ -656,32 +619,24 @@ def agreement(predicted: ErrorField, measured: ErrorField) -> PredictionAgreemen
 
     rest = replace(measured, error_mm=measured.error_mm - predicted.error_mm, spread=spread)
     difference = volume_figures(rest, rest.thinned(MOST_IN_PAIRS))
-    beyond, count = _share_beyond(rest.thinned(MOST_SINGLE))
+    looked_at = rest.thinned(MOST_SINGLE)
+    weight, u = np.zeros_like(looked_at.error_mm), np.zeros_like(looked_at.error_mm)
+    for index in np.ndindex(weight.shape):
+        weight[index] = 1.0
+        u[index] = looked_at.spread(weight)
+        weight[index] = 0.0
+    beyond, count = math.nan, 0
+    if not np.isnan(u).any():
+        counted = (u > EXACT_MM) | (np.abs(looked_at.error_mm) > EXACT_MM)  # the alignment makes some exactly zero
+        count = int(counted.sum())
+        above = normalized_error(looked_at.error_mm, COVERAGE * u)[counted] > 1.0
+        beyond = int(above.sum()) / max(count, 1)
     allowed = CHANCE + 2.0 * math.sqrt(CHANCE * (1.0 - CHANCE) / max(count, 1))
     figures = {key: ComparedFigure(first[key], second[key]) for key in first}
     return PredictionAgreement(figures, {key: difference[key] for key in ("max", "rms", "p95")}, beyond, allowed, count)
 
 
-def _share_beyond(difference: ErrorField) -> tuple[float, int]:
-    """Share of the components of a difference with E_n above 1, and the number of components."""
-    weight, u = np.zeros_like(difference.error_mm), np.zeros_like(difference.error_mm)
-    for index in np.ndindex(weight.shape):
-        weight[index] = 1.0
-        u[index] = difference.spread(weight)
-        weight[index] = 0.0
-    if np.isnan(u).any():
-        return math.nan, 0
-    looked_at = (u > EXACT_MM) | (np.abs(difference.error_mm) > EXACT_MM)  # the alignment makes some exactly zero
-    count = int(looked_at.sum())
-    beyond = normalized_error(difference.error_mm, COVERAGE * u)[looked_at] > 1.0
-    return int(beyond.sum()) / max(count, 1), count
-
-
 # Measured diagonals before against after (ISO 230-6).
-
-
-#: Without an Ed the first of these that a diagonal has decides.
-_DECISIVE = ("E", "E_up", "E_down")
 
 
 def compare_diagonals(
@@ -697,35 +652,23 @@ def compare_diagonals(
     InputError
         for different diagonals or positions, unless the options say how to align them (``common``, ``interpolate``).
     """
-    chosen = options or CompareOptions()
-    names = _shared("diagonals", "diagonals", before, after, chosen)
-    pairs = {name: _paired(before[name], after[name], chosen.align) for name in names}
-    first, second = (
-        accuracy_of_diagonals(machine, runs, chosen.edition, chosen.budgets)
-        for runs in ({name: pair[0] for name, pair in pairs.items()}, {name: pair[1] for name, pair in pairs.items()})
-    )
-    groups = paired_figures(first.groups, second.groups)
-    together = groups.get("diagonals", {})
-    decisive = tuple(("diagonals", key) for key in together)
-    if not decisive:
-        decisive = tuple((name, next(key for key in _DECISIVE if key in groups[name])) for name in names)
-    statements = (*(pair[2] for pair in pairs.values()), *first.statements, *uncertainty_statements(_all_known(groups)))
-    return Comparison("diagonals", groups, decisive, statements)
+    chosen, evaluate = options or CompareOptions(), partial(accuracy_of_diagonals, machine)
+    return _compare_tests(("diagonals", "diagonals"), before, after, chosen, _paired, evaluate)
 
 
-def _paired(before: DiagonalRun, after: DiagonalRun, align: str | None) -> tuple[DiagonalRun, DiagonalRun, str]:
+def _paired(
+    name: str, before: DiagonalRun, after: DiagonalRun, align: str | None
+) -> tuple[DiagonalRun, DiagonalRun, str]:
     """Both at the same positions; distances of AFTER count from the start of BEFORE."""
     offset = after.start_mm - before.start_mm
     along = float(offset @ before.unit)
-    beside = [offset - along * before.unit, after.end_mm - before.end_mm]
-    beside[1] = beside[1] - (beside[1] @ before.unit) * before.unit
-    if max(float(np.linalg.norm(part)) for part in beside) > SAME_CORNER_MM:
-        raise InputError(
-            f"{before.name} is a different line in AFTER; measure it between the same ends",
-            field=f"diagonal {before.name}",
-        )
+    across = [offset - along * before.unit, after.end_mm - before.end_mm]
+    across[1] = across[1] - (across[1] @ before.unit) * before.unit
+    if max(float(np.linalg.norm(part)) for part in across) > SAME_CORNER_MM:
+        message = f"{name} is a different line in AFTER; measure it between the same ends"
+        raise InputError(message, field=f"diagonal {name}")
     moved = replace(after.statistics, position_mm=after.statistics.position_mm + along)
-    first, second, text = paired_runs(before.name, before.statistics, moved, align)
+    first, second, text = paired_runs(name, before.statistics, moved, align)
     ends = [before.start_mm + first.position_mm[k] * before.unit for k in (0, -1)]
     sides = [replace(run, start_mm=ends[0], end_mm=ends[1]) for run in (before, after)]
     return replace(sides[0], statistics=first), replace(sides[1], statistics=second), text

@@ -19,7 +19,6 @@ from compgen.accuracy.positioning import (
     LATEST,
     MEAN_UP,
     NO_BUDGET,
-    PositioningTest,
     RunStatistics,
     SetupBudget,
     combine,
@@ -69,7 +68,12 @@ def diagonal_runs(machine: Machine, diagonals: Diagonals) -> dict[str, DiagonalR
     InputError
         for positions outside the travel, and for a direction that was measured at some positions only.
     """
-    _check_travel(machine, diagonals)
+    for axis, values in enumerate(diagonals.position_mm.T):
+        low, high = machine.axes[axis].range_mm
+        for row in np.flatnonzero((values < low - 1e-3) | (values > high + 1e-3))[:1].tolist():
+            file, line = diagonals.origin[row] if diagonals.origin else (None, None)
+            text = f"{AXES[axis]} = {values[row]:g} mm lies outside the travel {low:g} to {high:g} mm"
+            raise InputError(text, file=file, line=line, field=f"column {AXES[axis].lower()}_mm")
     found = {}
     for name in diagonals.names:
         rows = diagonals.rows(name)
@@ -82,15 +86,6 @@ def diagonal_runs(machine: Machine, diagonals: Diagonals) -> dict[str, DiagonalR
             raise InputError(f"{name}, distance along it: {error.message}", file=file) from None
         found[name] = DiagonalRun(name, points[int(np.argmin(distance))], points[int(np.argmax(distance))], own)
     return found
-
-
-def _check_travel(machine: Machine, diagonals: Diagonals) -> None:
-    for axis, values in enumerate(diagonals.position_mm.T):
-        low, high = machine.axes[axis].range_mm
-        for row in np.flatnonzero((values < low - 1e-3) | (values > high + 1e-3))[:1].tolist():
-            file, line = diagonals.origin[row] if diagonals.origin else (None, None)
-            text = f"{AXES[axis]} = {values[row]:g} mm lies outside the travel {low:g} to {high:g} mm"
-            raise InputError(text, file=file, line=line, field=f"column {AXES[axis].lower()}_mm")
 
 
 def accuracy_of_diagonals(
@@ -114,32 +109,32 @@ def accuracy_of_diagonals(
     for name, run in runs.items():
         budget = budget_along(run, budgets or {})
         test = positioning_test(run.statistics, edition, budget)
-        groups[name], targets[name] = _figures_of(run, test, budget), test.targets
+        targets[name] = test.targets
+        groups[name] = {
+            key: replace(item, meaning=f"diagonal {name}, ISO 230-6: {item.meaning}")
+            for key, item in test.figures.items()
+            if key not in _NOT_ALONG
+        }
+        ways, last = run.statistics.directions, len(run.statistics.position_mm) - 1
+        ends = [(sign / len(ways), way, at) for way in ways for sign, at in ((1.0, last), (-1.0, 0))]
+        said = "mean of both directions" if len(ways) == 2 else "of the measured direction"
+        text = f"diagonal {name}: deviation of its length from end to end, {said}; own figure"
+        groups[name]["D"] = figure(run.statistics, combine(run.statistics, ends), text, budget)
     statements = [f"ISO 230-6, each diagonal as ISO 230-2:{edition}", *(_described(run) for run in runs.values())]
-    open_set = _why_no_set(runs)
+    missing = [name for name in BODY_DIAGONALS if name not in runs]
+    corners = {name: np.sort([run.start_mm, run.end_mm], axis=0) for name, run in runs.items()}
+    other = [n for n in BODY_DIAGONALS if not missing and np.max(np.abs(corners[n] - corners["PPP"])) > SAME_CORNER_MM]
     together: dict[str, dict[str, Figure]] = {}
-    if open_set is None:
-        together["diagonals"], said = _largest(runs, groups)
-        together["squareness indication"] = _squareness(machine, runs, groups)
-        statements += [*said, _SQUARENESS_TEXT]
+    if missing:
+        statements.append(f"Ed, Bd: not given; all four body diagonals are needed, {', '.join(missing)} missing")
+    elif other:
+        statements.append(f"Ed, Bd: not given; {', '.join(other)} belong to another box than PPP")
     else:
-        statements.append(f"Ed, Bd: not given; {open_set}")
+        together["diagonals"], remarks = _largest(runs, groups)
+        together["squareness indication"] = _squareness(machine, runs, groups)
+        statements += [*remarks, _SQUARENESS_TEXT]
     statements += [NO_PROOF, "checked against published formulas and worked examples, not certified"]
     return Accuracy({**together, **groups}, tuple(statements), targets)
-
-
-def _figures_of(run: DiagonalRun, test: PositioningTest, budget: SetupBudget) -> dict[str, Figure]:
-    found = {
-        key: replace(item, meaning=f"diagonal {run.name}, ISO 230-6: {item.meaning}")
-        for key, item in test.figures.items()
-        if key not in _NOT_ALONG
-    }
-    statistics = run.statistics
-    share, last = 1.0 / len(statistics.directions), len(statistics.position_mm) - 1
-    ends = [(sign * share, way, at) for way in statistics.directions for sign, at in ((1.0, last), (-1.0, 0))]
-    ways = "mean of both directions" if statistics.bidirectional else "of the measured direction"
-    text = f"diagonal {run.name}: deviation of its length from end to end, {ways}; own figure"
-    return {**found, "D": figure(statistics, combine(statistics, ends), text, budget)}
 
 
 def budget_along(run: DiagonalRun, budgets: Mapping[str, SetupBudget]) -> SetupBudget:
@@ -157,19 +152,6 @@ def _described(run: DiagonalRun) -> str:
         "in its direction only" if MEAN_UP in run.statistics.directions else "against its direction only"
     )  # fmt: skip
     return f"{run.name}: {ends} mm, {run.length_mm:g} mm, {len(run.statistics.position_mm)} positions, {ways}"
-
-
-def _why_no_set(runs: Mapping[str, DiagonalRun]) -> str | None:
-    """Why the diagonals are not the four of one box; None if they are."""
-    missing = [name for name in BODY_DIAGONALS if name not in runs]
-    if missing:
-        return f"all four body diagonals are needed, {', '.join(missing)} missing"
-    corners = {
-        name: np.array([np.minimum(runs[name].start_mm, runs[name].end_mm), np.maximum(runs[name].start_mm, runs[name].end_mm)])
-        for name in BODY_DIAGONALS
-    }  # fmt: skip
-    other = [n for n, box in corners.items() if np.max(np.abs(box - corners["PPP"])) > SAME_CORNER_MM]
-    return f"{', '.join(other)} belong to another box than PPP" if other else None
 
 
 def _largest(
@@ -210,17 +192,11 @@ def _squareness(
     found = {}
     for name, row in zip(SQUARENESS_NAMES, weights * MM_PER_UM / RAD_PER_URAD, strict=True):
         meaning = f"indication of squareness {name} from differences of the body diagonals; own figure"
-        found[name] = _combined(row, ends, meaning)
+        value = float(sum(w * item.value for w, item in zip(row, ends, strict=True)))
+        u = math.sqrt(sum((w * item.u) ** 2 for w, item in zip(row, ends, strict=True)))  # independent of each other
+        parts = {
+            key: math.sqrt(sum((w * i.contributions.get(key, 0.0)) ** 2 for w, i in zip(row, ends, strict=True)))
+            for key in dict.fromkeys(key for item in ends for key in item.contributions)
+        }
+        found[name] = Figure(value, u, "urad", meaning, parts)
     return found
-
-
-def _combined(weights: FloatArray, parts: list[Figure], meaning: str) -> Figure:
-    """Weighted sum of figures that are independent of each other, urad."""
-    value = float(sum(w * item.value for w, item in zip(weights, parts, strict=True)))
-    names = dict.fromkeys(key for item in parts for key in item.contributions)
-    found = {
-        key: math.sqrt(sum((w * i.contributions.get(key, 0.0)) ** 2 for w, i in zip(weights, parts, strict=True)))
-        for key in names
-    }
-    u = math.sqrt(sum((w * item.u) ** 2 for w, item in zip(weights, parts, strict=True)))
-    return Figure(value, u, "urad", meaning, found)

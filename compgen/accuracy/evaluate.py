@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from compgen.accuracy.field import Alignment, ErrorField, ErrorSource, aligned, grid_points, volume_figures
+from compgen.accuracy.field import (
+    Alignment,
+    ErrorField,
+    ErrorSource,
+    aligned,
+    grid_points,
+    range_weight,
+    volume_figures,
+)
 from compgen.accuracy.figure import Figure
 from compgen.accuracy.positioning import LATEST, NO_BUDGET, RunStatistics, SetupBudget, positioning_test, vdi_3441
 from compgen.data.axis_runs import BODY_DIAGONALS
@@ -20,7 +29,7 @@ from compgen.data.display import Bars, Drawable, Overview, Panel, shortened
 from compgen.data.error_table import Curve, ReversalCurves, read_reversal
 from compgen.data.files import read_text
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.errors import InputError
 from compgen.identify import Identification
 from compgen.kinematics.curves import fitted_line, hat_matrix
@@ -51,12 +60,17 @@ def straightness(position_mm: FloatArray, value_mm: FloatArray, line: str) -> tu
     constant, slope = fitted_line(position_mm, value_mm, line)
     rest = value_mm - constant - slope * position_mm
     high, low = int(np.argmax(rest)), int(np.argmin(rest))
-    if line == "minzone":
-        return float(np.ptp(rest)), _zone_derivative(position_mm, rest)
-    derivative = np.zeros(len(rest))
-    derivative[high] += 1.0
-    derivative[low] -= 1.0
-    return float(np.ptp(rest)), derivative - (position_mm[high] - position_mm[low]) * slope_weights(position_mm, line)
+    if line == "minzone":  # the width is the distance of the single contact from the line through the two others
+        first, last, against, side = _contacts(position_mm, rest)
+        share = (position_mm[against] - position_mm[first]) / (position_mm[last] - position_mm[first])
+        derivative = np.zeros(len(rest))
+        derivative[against] += side
+        derivative[first] -= side * (1.0 - share)
+        derivative[last] -= side * share
+        return float(np.ptp(rest)), derivative
+    return float(np.ptp(rest)), range_weight(rest) - (position_mm[high] - position_mm[low]) * slope_weights(
+        position_mm, line
+    )
 
 
 def slope_weights(position_mm: FloatArray, line: str, value: FloatArray | None = None) -> FloatArray:
@@ -98,17 +112,6 @@ def _contacts(position_mm: FloatArray, rest: FloatArray) -> tuple[int, int, int,
     return first, last, int(np.argmin(rest)), -1.0
 
 
-def _zone_derivative(position_mm: FloatArray, rest: FloatArray) -> FloatArray:
-    """Width = distance of the single contact from the line through the two others."""
-    first, last, against, side = _contacts(position_mm, rest)
-    share = (position_mm[against] - position_mm[first]) / (position_mm[last] - position_mm[first])
-    derivative = np.zeros(len(rest))
-    derivative[against] += side
-    derivative[first] -= side * (1.0 - share)
-    derivative[last] -= side * share
-    return derivative
-
-
 # Figures of identified errors: each curve by itself, squareness, axes, diagonals, orientation.
 
 
@@ -146,18 +149,11 @@ def _curve_figure(source: ErrorSource, name: str, line: str) -> Figure:
         value, weight = straightness(curve.position_mm, curve.value, line)
         meaning = f"straightness {name}, reference line: {LINES[line]}; ISO 230-1"
     else:
-        value, weight = float(np.ptp(curve.value)), _range_weight(curve.value)
+        value, weight = float(np.ptp(curve.value)), range_weight(curve.value)
         what = "mean bidirectional positioning error M (ISO 230-2)" if error.kind == "linear" else "angular error"
         meaning = f"{what} {name}, range over the travel"
     u = source.u_of(source.value_gradient(name, weight))
     return Figure(value / error.si_per_unit, u / error.si_per_unit, error.unit, meaning)
-
-
-def _range_weight(value: FloatArray) -> FloatArray:
-    weight = np.zeros(len(value))
-    weight[int(np.argmax(value))] += 1.0
-    weight[int(np.argmin(value))] -= 1.0
-    return weight
 
 
 def squareness_figure(source: ErrorSource, name: str, line: str = "ls") -> Figure:
@@ -168,7 +164,14 @@ def squareness_figure(source: ErrorSource, name: str, line: str = "ls") -> Figur
     """
     value = source.errors.squareness[name][0]
     gradient = source.value_gradient(name, np.ones(1))
-    for curve_name, factor in _line_curves(source.machine, name):
+    # A slope a of EXY moves x by a Y, as EC0Y does by -EC0Y Y (docs/conventions.md); a slope of EYX turns the reference line
+    # of X the same way. So the slopes of two curves act like the squareness error, with the sign that C gives it.
+    axis, component, other, across = SQUARENESS_LINES[name]
+    unit = np.zeros((1, 3))
+    unit[0, axis] = 1.0
+    column = c_matrix(source.machine, unit, np.zeros(3))[0, :, ERROR_INDEX[name]]
+    factor = 1.0 / column[component] if column[component] else -1.0  # squareness_reference = "Y": dY = -X EC0Y
+    for curve_name in (f"E{AXES[component]}{AXES[axis]}", f"E{AXES[across]}{AXES[other]}"):
         curve = source.errors.curves.get(curve_name)
         if curve is None or len(curve.value) < 2:
             continue
@@ -177,19 +180,6 @@ def squareness_figure(source: ErrorSource, name: str, line: str = "ls") -> Figur
         gradient = gradient + source.value_gradient(curve_name, weights)
     meaning = f"squareness {name} between reference lines of {LINES[line]}; ISO 230-1"
     return Figure(value / RAD_PER_URAD, source.u_of(gradient) / RAD_PER_URAD, "urad", meaning)
-
-
-def _line_curves(machine: Machine, name: str) -> list[tuple[str, float]]:
-    """Straightness curves whose slope acts like a squareness error, and its sign in it (docs/conventions.md).
-
-    A slope a of EXY moves x by a Y, as EC0Y does by -EC0Y Y; a slope of EYX turns the reference line of X the same way.
-    """
-    axis, component, other, across = SQUARENESS_LINES[name]
-    unit = np.zeros((1, 3))
-    unit[0, axis] = 1.0
-    column = c_matrix(machine, unit, np.zeros(3))[0, :, 18 + list(SQUARENESS_LINES).index(name)]
-    sign = 1.0 / column[component] if column[component] else -1.0  # squareness_reference = "Y": dY = -X EC0Y
-    return [(f"E{AXES[component]}{AXES[axis]}", sign), (f"E{AXES[across]}{AXES[other]}", sign)]
 
 
 def axis_figures(source: ErrorSource) -> dict[str, Figure]:
@@ -203,9 +193,9 @@ def axis_figures(source: ErrorSource) -> dict[str, Figure]:
         field = source.field(points)
         along = field.error_mm[:, k]
         weight = np.zeros_like(field.error_mm)
-        weight[:, k] = _range_weight(along)
+        weight[:, k] = range_weight(along)
         meaning = f"mean bidirectional positioning error M of {axis} on the line through the reference point; ISO 230-2"
-        found[f"M_{axis}"] = Figure(float(np.ptp(along)) / MM_PER_UM, field.spread(weight) / MM_PER_UM, "um", meaning)
+        found[f"M_{axis}"] = Figure.of_mm(np.ptp(along), field.spread(weight), meaning)
     return found
 
 
@@ -231,13 +221,14 @@ def diagonal_figures(source: ErrorSource) -> dict[str, Figure]:
         along = points[-1] - points[0]
         unit = along / np.linalg.norm(along)
         field = source.field(points)
-        deviation = (field.error_mm - field.error_mm[0]) @ unit
-        weight = _range_weight(deviation)[:, None] * unit
-        value, u = float(np.ptp(deviation)) / MM_PER_UM, field.spread(weight) / MM_PER_UM
-        found[name] = Figure(value, u, "um", f"systematic error E of the diagonal {name}; ISO 230-6")
+        deviation = diagonal_deviation(machine, field.error_mm, points)
+        u_mm = field.spread(range_weight(deviation)[:, None] * unit)
+        found[name] = Figure.of_mm(np.ptp(deviation), u_mm, f"systematic error E of the diagonal {name}; ISO 230-6")
     worst = max(found, key=lambda name: found[name].value)
-    text = f"largest systematic error of the body diagonals, {worst}; ISO 230-6"
-    return {**found, "Ed": Figure(found[worst].value, found[worst].u, "um", text)}
+    return {
+        **found,
+        "Ed": replace(found[worst], meaning=f"largest systematic error of the body diagonals, {worst}; ISO 230-6"),
+    }
 
 
 def diagonal_points(machine: Machine, signs: tuple[int, int, int], count: int = ALONG_DIAGONAL) -> FloatArray:
@@ -266,7 +257,7 @@ def orientation_figures(source: ErrorSource) -> dict[str, Figure]:
         for name in present:
             curve = source.errors.curves[name]
             value += float(np.ptp(curve.value))
-            part = source.value_gradient(name, _range_weight(curve.value))
+            part = source.value_gradient(name, range_weight(curve.value))
             gradient = part if gradient is None else gradient + part
         u = math.nan if gradient is None else source.u_of(gradient)
         missing = [name for name in names if name not in present]
@@ -323,30 +314,23 @@ def reversal_beside(path: Path) -> KnownReversal:
     stem = path.name.removesuffix(".errors.csv")
     names = [f"{stem}.reversal.csv", *(["identified.reversal.csv"] if stem == "fitted" else [])]
     named = next((path.parent / name for name in names if (path.parent / name).is_file()), None)
-    summed = _summed_up(path.parent / "identify.json") if stem in ("identified", "fitted") else {}
-    if named is None and not summed:
+    curves = {}
+    whole = path.parent / "identify.json"
+    if stem in ("identified", "fitted") and whole.is_file():
+        with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError):  # another file of that name
+            read = {}
+            for name, item in (json.loads(read_text(whole)).get("reversal") or {}).get("axes", {}).items():
+                for component, (value, u) in enumerate(zip(item["vector_um"], item["u_um"], strict=True)):
+                    parts = np.array([float(value)]) * MM_PER_UM, np.array([float(u)]) * MM_PER_UM
+                    read[AXES.index(name), component] = Curve(np.zeros(1), *parts)
+            curves = read
+    if named is None and not curves:
         return KnownReversal(
             None, f"reversal: not known: errors are means of both directions, {names[-1]} is not there"
         )
-    curves = {**summed, **({} if named is None else read_reversal(named).curves)}
-    where = " and ".join([*([named.name] if named else []), *(["identify.json"] if summed else [])])
+    where = " and ".join([*([named.name] if named else []), *(["identify.json"] if curves else [])])
+    curves |= {} if named is None else read_reversal(named).curves
     return KnownReversal(ReversalCurves(curves), f"reversal: {where}; a direction that is not there counts as zero")
-
-
-def _summed_up(path: Path) -> dict[tuple[int, int], Curve]:
-    """Mean reversals of ``identify.json`` with their uncertainties; none if it holds none or is another file."""
-    if not path.is_file():
-        return {}
-    curves = {}
-    try:
-        axes = (json.loads(read_text(path)).get("reversal") or {}).get("axes", {})
-        for name, item in axes.items():
-            for component, (value, u) in enumerate(zip(item["vector_um"], item["u_um"], strict=True)):
-                parts = np.array([float(value)]) * MM_PER_UM, np.array([float(u)]) * MM_PER_UM
-                curves[AXES.index(name), component] = Curve(np.zeros(1), *parts)
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return {}
-    return curves
 
 
 def reversal_figures(source: ErrorSource, reversal: ReversalCurves) -> dict[str, Figure]:
@@ -356,42 +340,32 @@ def reversal_figures(source: ErrorSource, reversal: ReversalCurves) -> dict[str,
     """
     found: dict[str, Figure] = {}
     for axis, letter in enumerate(AXES):
-        if (axis, axis) in reversal.curves:
-            found |= _of_axis(source, reversal, axis, letter)
-    return {**found, **_of_diagonals(source, reversal)} if reversal.curves else found
-
-
-def _of_axis(source: ErrorSource, reversal: ReversalCurves, axis: int, letter: str) -> dict[str, Figure]:
-    curve = reversal.curves[axis, axis]
-    low, high = source.machine.axes[axis].range_mm
-    inside = curve.position_mm[(curve.position_mm > low) & (curve.position_mm < high)]
-    levels = np.unique(np.concatenate([levels_of(source, axis), inside]))
-    points = np.tile(np.array(source.machine.reference_point_mm), (len(levels), 1))
-    points[:, axis] = levels
-    terms = [[((axis, axis), float(q), 1.0)] for q in levels]
-    unit = np.eye(3)[axis]
-    field = source.field(points)
-    share = 1.0 / len(curve.value)
-    mean = [((axis, axis), float(q), share) for q in curve.position_mm]
-    where = f"of {letter} on the line through the reference point; ISO 230-2"
-    return {
-        f"B_{letter}": _largest(reversal, terms, f"largest reversal error {where}"),
-        f"B_mean_{letter}": _figure(reversal, mean, 0.0, 0.0, f"mean reversal error of {letter}; ISO 230-2"),
-        f"E_{letter}": _both_ways(field, unit, reversal, terms, f"bidirectional systematic error {where}"),
-    }
-
-
-def _of_diagonals(source: ErrorSource, reversal: ReversalCurves) -> dict[str, Figure]:
+        curve = reversal.curves.get((axis, axis))
+        if curve is None:
+            continue
+        low, high = source.machine.axes[axis].range_mm
+        inside = curve.position_mm[(curve.position_mm > low) & (curve.position_mm < high)]
+        levels = np.unique(np.concatenate([levels_of(source, axis), inside]))
+        points = np.tile(np.array(source.machine.reference_point_mm), (len(levels), 1))
+        points[:, axis] = levels
+        terms: list[list[Term]] = [[((axis, axis), float(q), 1.0)] for q in levels]
+        mean = [((axis, axis), float(q), 1.0 / len(curve.value)) for q in curve.position_mm]
+        where = f"of {letter} on the line through the reference point; ISO 230-2"
+        found[f"B_{letter}"] = _largest(reversal, terms, f"largest reversal error {where}")
+        found[f"B_mean_{letter}"] = _figure(reversal, mean, 0.0, 0.0, f"mean reversal error of {letter}; ISO 230-2")
+        text = f"bidirectional systematic error {where}"
+        found[f"E_{letter}"] = _both_ways(source.field(points), np.eye(3)[axis], reversal, terms, text)
+    if not reversal.curves:
+        return found
     sizes, errors = {}, {}
     for name, signs in BODY_DIAGONALS.items():
         points = diagonal_points(source.machine, signs)
         unit = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
         terms = [[((a, c), float(point[a]), float(signs[a] * unit[c])) for a, c in reversal.curves] for point in points]
-        field = source.field(points)
         sizes[name] = _largest(reversal, terms, f"reversal error B of the diagonal {name}; ISO 230-6")
         text = f"bidirectional systematic error E of the diagonal {name}; ISO 230-6"
-        errors[name] = _both_ways(field, unit, reversal, terms, text)
-    found = {f"B {name}": item for name, item in sizes.items()} | {f"E {name}": item for name, item in errors.items()}
+        errors[name] = _both_ways(source.field(points), unit, reversal, terms, text)
+    found |= {f"B {name}": item for name, item in sizes.items()} | {f"E {name}": item for name, item in errors.items()}
     for key, group, text in (("Bd", sizes, "reversal error B"), ("Ed", errors, "bidirectional systematic error E")):
         worst = max(group, key=lambda name: group[name].value)
         found[key] = replace(group[worst], meaning=f"largest {text} of the body diagonals, {worst}; ISO 230-6")
@@ -402,8 +376,8 @@ def _value(reversal: ReversalCurves, terms: Sequence[Term]) -> float:
     return sum(factor * float(reversal.curves[key].at(np.array([q]))[0]) for key, q, factor in terms)
 
 
-def _u(reversal: ReversalCurves, terms: Sequence[Term]) -> float:
-    """Standard uncertainty of a sum of values of the curves; nan where one is not known."""
+def _figure(reversal: ReversalCurves, terms: Sequence[Term], value_mm: float, u_mm: float, meaning: str) -> Figure:
+    """A figure of a value with its own uncertainty plus a sum of reversal values; nan where one is not known."""
     square = 0.0
     for key in dict.fromkeys(key for key, _, _ in terms):
         curve = reversal.curves[key]
@@ -411,13 +385,7 @@ def _u(reversal: ReversalCurves, terms: Sequence[Term]) -> float:
         weights = np.asarray(gradient)
         used = weights != 0.0
         square += float(np.sum((weights[used] * curve.u[used]) ** 2))
-    return math.sqrt(square)
-
-
-def _figure(reversal: ReversalCurves, terms: Sequence[Term], value_mm: float, u_mm: float, meaning: str) -> Figure:
-    """A figure of a value with its own uncertainty plus a sum of reversal values."""
-    value, u = value_mm + _value(reversal, terms), math.hypot(u_mm, _u(reversal, terms))
-    return Figure(value / MM_PER_UM, u / MM_PER_UM, "um", meaning)
+    return Figure.of_mm(value_mm + _value(reversal, terms), math.hypot(u_mm, math.sqrt(square)), meaning)
 
 
 def _largest(reversal: ReversalCurves, terms: Sequence[Sequence[Term]], meaning: str) -> Figure:
@@ -495,17 +463,6 @@ class Accuracy(Drawable):
         return panels
 
 
-def nodes_of(machine: Machine, *sources: ErrorSource) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the nodes of the curves of all sources by axis; the ends of the travel where there is no curve."""
-    found = []
-    for k in range(3):
-        nodes = [np.array(machine.axes[k].range_mm)]
-        for source in sources:
-            nodes += [c.position_mm for name, c in source.errors.curves.items() if error_named(name).axis == k]
-        found.append(np.unique(np.concatenate(nodes)))
-    return found[0], found[1], found[2]
-
-
 def volume_fields(
     machine: Machine, sources: tuple[ErrorSource, ...], alignment: Alignment
 ) -> list[tuple[ErrorField, ErrorField]]:
@@ -513,13 +470,14 @@ def volume_fields(
 
     All have the same points: the nodes of all curves within the travel and the middles between them.
     """
-    nodes = nodes_of(machine, *sources)
-    grids = [grid_points(machine, volume_grid(machine, nodes, most).levels_mm) for most in (MOST_POINTS, MOST_IN_PAIRS)]
-    found = []
-    for source in sources:
-        full, pairs = (aligned(machine, source.field(points), alignment) for points in grids)
-        found.append((full, pairs))
-    return found
+    curves = [(error_named(name).axis, curve) for source in sources for name, curve in source.errors.curves.items()]
+    x, y, z = (
+        np.unique(np.concatenate([machine.axes[k].range_mm, *(c.position_mm for axis, c in curves if axis == k)]))
+        for k in range(3)
+    )
+    grids = [grid_points(machine, volume_grid(machine, (x, y, z), n).levels_mm) for n in (MOST_POINTS, MOST_IN_PAIRS)]
+    fields = [[aligned(machine, source.field(points), alignment) for points in grids] for source in sources]
+    return [(full, pairs) for full, pairs in fields]
 
 
 def accuracy_of_errors(
@@ -537,9 +495,7 @@ def accuracy_of_errors(
     ((full, pairs),) = volume_fields(source.machine, (source,), alignment)
     groups = {"volume": volume_figures(full, pairs), **groups_of_errors(source, line)}
     straight = straightness_figures(source)
-    groups["straightness"] = {
-        f"{name} {kind}": item for name, kinds in straight.items() for kind, item in kinds.items()
-    }
+    groups["straightness"] = {f"{name} {kind}": x for name, kinds in straight.items() for kind, x in kinds.items()}
     if reversal is not None and reversal.curves is not None:
         groups["reversal"] = reversal_figures(source, reversal.curves)
     said = () if reversal is None else (reversal.text,)

@@ -15,7 +15,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.names import ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.data.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
 from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.kinematics.curves import hat_matrix
@@ -130,7 +130,15 @@ def axis_lines(machine: Machine) -> FloatArray:
 
 
 def _to_axes(machine: Machine, field: ErrorField) -> ErrorField:
-    rows = [_row_of(field, point) for point in axis_lines(machine)]
+    rows = []
+    for point in axis_lines(machine):
+        distance = np.max(np.abs(field.position_mm - point), axis=1)
+        rows.append(int(np.argmin(distance)))
+        if distance[rows[-1]] > _SAME_MM:
+            where = ", ".join(f"{value:g}" for value in point)
+            raise InputError(
+                f"the alignment to the axes needs the point ({where}) mm, which is missing; take --alignment as-given or best-fit"
+            )
     parameters = np.zeros((6, len(field), 3))
     first, second = (0, 1) if machine.squareness_reference == "X" else (1, 0)
     for axis, other in ((first, True), (second, False)):
@@ -156,17 +164,6 @@ def _to_axes(machine: Machine, field: ErrorField) -> ErrorField:
     return _without(field, parameters, error, text)
 
 
-def _row_of(field: ErrorField, point_mm: FloatArray) -> int:
-    distance = np.max(np.abs(field.position_mm - point_mm), axis=1)
-    row = int(np.argmin(distance))
-    if distance[row] > _SAME_MM:
-        where = ", ".join(f"{value:g}" for value in point_mm)
-        raise InputError(
-            f"the alignment to the axes needs the point ({where}) mm, which is not there; take --alignment as-given or best-fit"
-        )
-    return row
-
-
 def volume_figures(field: ErrorField, pairs: ErrorField | None = None) -> dict[str, Figure]:
     """Return the figures of a volume: ISO 230-1 ranges V_X, V_Y, V_Z, and ours, labelled as such.
 
@@ -179,7 +176,9 @@ def volume_figures(field: ErrorField, pairs: ErrorField | None = None) -> dict[s
     found = {}
     for k, axis in enumerate("XYZ"):
         meaning = f"volumetric accuracy V_{axis}: range of the {axis} deviation {where}; ISO 230-1"
-        found[f"V_{axis}"] = _range(field, k, meaning)
+        along, weight = field.error_mm[:, k], np.zeros_like(field.error_mm)
+        weight[:, k] = range_weight(along)
+        found[f"V_{axis}"] = Figure.of_mm(np.ptp(along), field.spread(weight), meaning)
     size = np.linalg.norm(field.error_mm, axis=1)
     rms = float(np.sqrt(np.mean(size**2)))
     worst = int(np.argmax(size))
@@ -194,16 +193,16 @@ def volume_figures(field: ErrorField, pairs: ErrorField | None = None) -> dict[s
     return found | _between(pairs or field)
 
 
+def range_weight(value: FloatArray) -> FloatArray:
+    """Derivative (n,) of the range of values (n,): +1 at the largest, -1 at the smallest."""
+    weight = np.zeros(len(value))
+    weight[int(np.argmax(value))] += 1.0
+    weight[int(np.argmin(value))] -= 1.0
+    return weight
+
+
 def _figure(field: ErrorField, value_mm: float, weight: FloatArray, meaning: str) -> Figure:
-    return Figure(float(value_mm) / MM_PER_UM, field.spread(weight) / MM_PER_UM, "um", meaning)
-
-
-def _range(field: ErrorField, component: int, meaning: str) -> Figure:
-    along = field.error_mm[:, component]
-    weight = np.zeros_like(field.error_mm)
-    weight[int(np.argmax(along)), component] += 1.0
-    weight[int(np.argmin(along)), component] -= 1.0
-    return _figure(field, float(np.ptp(along)), weight, meaning)
+    return Figure.of_mm(value_mm, field.spread(weight), meaning)
 
 
 def _at(field: ErrorField, row: int, toward: FloatArray | None = None) -> FloatArray:
@@ -311,31 +310,37 @@ class ErrorSource:
             return unknown_spread
 
         def spread(weight: FloatArray) -> float:
+            # derivative (k,) of sum(weight * E) over points by the values of the table; E = C P is linear in them
             used = np.any(weight != 0.0, axis=1)
-            return self.u_of(self._gradient(position_mm[used], weight[used]))
+            position = position_mm[used]
+            through = np.einsum("nij,ni->nj", c_matrix(self.machine, position), weight[used])
+            gradient = np.empty(len(self.errors.values()))
+            for name, rows in self.rows.items():
+                column = through[:, ERROR_INDEX[name]]
+                if name in SQUARENESS_NAMES:
+                    gradient[rows] = column.sum()
+                else:
+                    nodes = self.errors.curves[name].position_mm
+                    gradient[rows] = column @ hat_matrix(nodes, position[:, error_named(name).axis])
+            return self.u_of(gradient)
 
         return spread
 
-    def _gradient(self, position_mm: FloatArray, weight: FloatArray) -> FloatArray:
-        """Derivative (k,) of sum(weight * E) over points by the values of the table; E = C P is linear in them."""
-        through = np.einsum("nij,ni->nj", c_matrix(self.machine, position_mm), weight)
-        parts = []
+    @property
+    def rows(self) -> dict[str, slice]:
+        """Where the values of each error are among those of the table."""
+        found, first = {}, 0
         for name in self.errors.names:
-            column = through[:, ERROR_INDEX[name]]
-            if name in SQUARENESS_NAMES:
-                parts.append(np.array([column.sum()]))
-            else:
-                nodes = self.errors.curves[name].position_mm
-                parts.append(column @ hat_matrix(nodes, position_mm[:, error_named(name).axis]))
-        return np.concatenate(parts)
+            count = 1 if name in self.errors.squareness else len(self.errors.curves[name].value)
+            found[name] = slice(first, first + count)
+            first += count
+        return found
 
     def value_gradient(self, name: str, weight: FloatArray) -> FloatArray:
         """Derivative (k,) of sum(weight * values of one error)."""
-        parts = []
-        for other in self.errors.names:
-            count = 1 if other in self.errors.squareness else len(self.errors.curves[other].value)
-            parts.append(np.asarray(weight) if other == name else np.zeros(count))
-        return np.concatenate(parts)
+        gradient = np.zeros(len(self.errors.values()))
+        gradient[self.rows[name]] = weight
+        return gradient
 
     def u_of(self, gradient: FloatArray) -> float:
         """Standard uncertainty of a functional of the values with derivative (k,); nan if it is not known."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from compgen.data.names import COVERAGE
+from compgen.data.names import COVERAGE, MM_PER_UM
 from compgen.identify.covariance import normalized_error
 
 Verdict = Literal["better", "worse", "not separated", "smaller", "larger", "same"]
@@ -33,6 +33,11 @@ class Figure:
     unit: str
     meaning: str
     contributions: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of_mm(cls, value_mm: float, u_mm: float, meaning: str) -> Figure:
+        """Return a figure in um."""
+        return cls(float(value_mm) / MM_PER_UM, u_mm / MM_PER_UM, "um", meaning)
 
     @property
     def expanded(self) -> float:

@@ -143,7 +143,12 @@ def run_statistics(position_mm: FloatArray, direction: FloatArray, deviation_mm:
     InputError
         if a direction was measured at some of the targets only, or there are fewer than two targets.
     """
-    position, target = _numbered_targets(np.asarray(position_mm, dtype=np.float64))
+    readings = np.asarray(position_mm, dtype=np.float64)
+    order = np.argsort(readings, kind="stable")
+    new = np.concatenate([[False], np.diff(readings[order]) > SAME_TARGET_MM])
+    position = readings[order[np.concatenate([[0], np.flatnonzero(new)])]]
+    target = np.empty(len(order))  # number of the target of each reading
+    target[order] = np.cumsum(new)
     values, count = np.full((4, len(position)), np.nan), np.zeros((2, len(position)))
     for row, sign in enumerate((1, -1)):
         for k in range(len(position)):
@@ -159,16 +164,6 @@ def run_statistics(position_mm: FloatArray, direction: FloatArray, deviation_mm:
     if len(position) < 2:
         raise InputError("a positioning test needs at least two targets")
     return RunStatistics(position, values, count)
-
-
-def _numbered_targets(position_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Targets (m,), and the number of the target of each reading (n,)."""
-    order = np.argsort(position_mm, kind="stable")
-    new = np.concatenate([[False], np.diff(position_mm[order]) > SAME_TARGET_MM])
-    number = np.empty(len(order))
-    number[order] = np.cumsum(new)
-    first = order[np.concatenate([[0], np.flatnonzero(new)])]
-    return position_mm[first], number
 
 
 def axis_statistics(runs: AxisRuns) -> dict[str, RunStatistics]:
@@ -225,8 +220,12 @@ def figure(statistics: RunStatistics, item: Combination, meaning: str, budget: S
     budget's. A single reading has no scatter of its own: u is nan then.
     """
     counts, scatter = statistics.count, statistics.values[2:]
+    # variance of s over sigma^2 for n normal readings: 1 - c4(n)^2, c4^2 = 2 / (n - 1) (G(n/2) / G((n-1)/2))^2
+    n = np.maximum(counts, 2.0)
+    c4_square = 2.0 / (n - 1.0) * np.exp(2.0 * (gammaln(0.5 * n) - gammaln(0.5 * (n - 1.0))))
+    of_estimator = np.where(counts > 1, 1.0 - c4_square, np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
-        variances = np.concatenate([scatter**2 / counts, scatter**2 * _estimator_variance(counts)])
+        variances = np.concatenate([scatter**2 / counts, scatter**2 * of_estimator])
     used = item.weight != 0.0
     repeatability = math.sqrt(float(np.sum(item.weight[used] ** 2 * variances[used])))
     parts = {"repeatability": repeatability / MM_PER_UM}
@@ -234,13 +233,6 @@ def figure(statistics: RunStatistics, item: Combination, meaning: str, budget: S
         parts[name] = u_mm / MM_PER_UM
     u = math.sqrt(sum(value**2 for value in parts.values()))
     return Figure(item.value / MM_PER_UM, u, "um", meaning, parts)
-
-
-def _estimator_variance(count: FloatArray) -> FloatArray:
-    """Variance of s over sigma^2 for n normal readings: 1 - c4(n)^2, c4^2 = 2 / (n - 1) (G(n/2) / G((n-1)/2))^2."""
-    n = np.maximum(count, 2.0)
-    c4_square = 2.0 / (n - 1.0) * np.exp(2.0 * (gammaln(0.5 * n) - gammaln(0.5 * (n - 1.0))))
-    return np.asarray(np.where(count > 1, 1.0 - c4_square, np.nan))
 
 
 # Positioning accuracy and repeatability of one axis after ISO 230-2.
@@ -306,7 +298,13 @@ def positioning_test(
         key: figure(statistics, item, f"{meaning}, ISO 230-2:{edition}", budget)
         for key, (item, meaning) in found.items()
     }
-    _check_identities(figures)
+    # what must hold between the figures whatever the readings are; if it does not, this is a bug, not bad input
+    for pair in ("A E", "A A_up", "A A_down", "E E_up", "E E_down", "E M", "R R_up", "R R_down", "R B"):
+        large, small = pair.split()
+        if large in figures and small in figures:
+            assert figures[large].value >= figures[small].value - 1e-9, f"{large} is below {small}"
+    if "E" in figures:
+        assert figures["E"].value <= figures["M"].value + figures["B"].value + 1e-9
     return PositioningTest(edition, statistics, figures, _figures_at_targets(statistics, k))
 
 
@@ -349,20 +347,16 @@ def _both_ways(statistics: RunStatistics, k: float) -> dict[str, tuple[Combinati
     ways = (MEAN_UP, MEAN_DOWN)
     found = {"E": (spread(_means(statistics, ways)), "systematic positioning error, bidirectional")}
     if statistics.repeated:
-        count = len(statistics.position_mm)
         accuracy = spread(_means(statistics, ways, k), _means(statistics, ways, -k))
-        repeatability = largest([_repeatability_at(statistics, i, k) for i in range(count)])
-        found["R"] = (repeatability, "positioning repeatability, bidirectional")
+        signs = np.sign(statistics.values[MEAN_UP] - statistics.values[MEAN_DOWN]).tolist()
+        widths = []
+        for i, sign in enumerate(signs):  # R_i as the largest of its three candidates
+            both = [(k, S_UP, i), (k, S_DOWN, i), (sign, MEAN_UP, i), (-sign, MEAN_DOWN, i)]
+            parts = (both, [(2.0 * k, S_UP, i)], [(2.0 * k, S_DOWN, i)])
+            widths.append(largest([combine(statistics, part) for part in parts]))
+        found["R"] = (largest(widths), "positioning repeatability, bidirectional")
         found["A"] = (accuracy, "positioning accuracy, bidirectional")
     return found
-
-
-def _repeatability_at(statistics: RunStatistics, target: int, k: float) -> Combination:
-    """R_i as the largest of its three candidates."""
-    sign = float(np.sign(statistics.values[MEAN_UP, target] - statistics.values[MEAN_DOWN, target]))
-    both = [(k, 2, target), (k, 3, target), (sign, MEAN_UP, target), (-sign, MEAN_DOWN, target)]
-    single = [[(2.0 * k, 2, target)], [(2.0 * k, 3, target)]]
-    return largest([combine(statistics, parts) for parts in (both, *single)])
 
 
 def _figures_at_targets(statistics: RunStatistics, k: float) -> dict[str, FloatArray]:
@@ -385,17 +379,6 @@ def _figures_at_targets(statistics: RunStatistics, k: float) -> dict[str, FloatA
         "u_mean_down_um": u_down,
         "u_B_um": np.hypot(u_up, u_down),
     }
-
-
-def _check_identities(figures: dict[str, Figure]) -> None:
-    """What must hold between the figures whatever the readings are; a broken one is a bug, not bad input."""
-    above = [("A", "E"), ("A", "A_up"), ("A", "A_down"), ("E", "E_up"), ("E", "E_down"), ("E", "M")]
-    above += [("R", "R_up"), ("R", "R_down"), ("R", "B")]
-    for large, small in above:
-        if large in figures and small in figures:
-            assert figures[large].value >= figures[small].value - 1e-9, f"{large} is below {small}"
-    if "E" in figures:
-        assert figures["E"].value <= figures["M"].value + figures["B"].value + 1e-9
 
 
 # Statistical test of the positioning of one axis after VDI/DGQ 3441.

@@ -31,7 +31,6 @@ from compgen.accuracy.evaluate import (
     volume_fields,
 )
 from compgen.accuracy.field import Alignment, ErrorField, ErrorSource, aligned, error_source
-from compgen.accuracy.figure import Figure
 from compgen.accuracy.positioning import RunStatistics, axis_statistics
 from compgen.controls.etalon_exchange import is_exchange_text, read_error_file
 from compgen.data.axis_runs import AxisRuns, read_diagonals
@@ -115,7 +114,11 @@ def read_side(
     u_um : standard uncertainty of measured deviations, um; default the file's own.
     reader : of measurements; that of :mod:`compgen.foreign` takes foreign files as well.
     """
-    source = _errors_in(Path(path))
+    source = Path(path)
+    if source.is_dir():  # of a command that wrote its errors there
+        source = source / "identified.errors.csv"
+        if not source.is_file():
+            raise InputError("is a folder without identified.errors.csv; give a file", file=source.parent)
     text = read_bytes(source, _LOOKED_AT).decode("utf-8-sig", errors="replace")  # to tell the kind; readers are strict
     header = names_in_header(text)
     if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
@@ -139,16 +142,6 @@ def read_side(
     found = identify_measurement(machine, measurement)
     known = _source_of(machine, found)
     return Side(machine, source, "six-DOF readings", source=known, reversal=identified_reversal(found))
-
-
-def _errors_in(path: Path) -> Path:
-    """Return the file of a folder that a command wrote; a file as it is."""
-    if not path.is_dir():
-        return path
-    found = path / "identified.errors.csv"
-    if not found.is_file():
-        raise InputError("is a folder without identified.errors.csv; give a file", file=path)
-    return found
 
 
 def covariance_beside(path: Path, errors: ErrorTable) -> Covariance | None:
@@ -211,7 +204,14 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
         if before.deviations is not None and after.deviations is not None:
             return _positions(before, after, options)
         if before.deviations is not None or after.deviations is not None:
-            return _errors_at_positions(before, after, options)
+            # errors on one side, taken at the positions that were measured on the other
+            measured = _own_tool(after if before.deviations is None else before)
+            other = before if before.deviations is None else after
+            taken = replace(measured, field=_predicted_at(other, measured.field))
+            sides = (taken, measured) if other is before else (measured, taken)
+            found = compare_fields(before.machine, *sides, options)
+            text = f"{other.path.name}: errors, the exact model moved with them to the measured positions"
+            return replace(found, statements=(text, *found.statements))
     said = []
     if before.lengths is not None and after.lengths is not None:
         said.append(check_same_positions(before.lengths, after.lengths, options.align))
@@ -223,18 +223,16 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
         if side.kind not in ("errors",):
             said.append(f"{side.path.name}: errors identified from {side.kind}")
     groups = {name: dict(group) for name, group in found.groups.items()}
-    both = [_reversal_of(side) for side in (first, second)]
-    if both[0] and both[1]:
-        groups |= paired_figures({"reversal": both[0]}, {"reversal": both[1]})
+    both = [
+        {"reversal": reversal_figures(side.source, side.reversal.curves)}
+        for side in (first, second)
+        if side.source is not None and side.reversal.curves is not None
+    ]
+    if len(both) == 2 and both[0]["reversal"] and both[1]["reversal"]:
+        groups |= paired_figures(both[0], both[1])
     else:
         said += [f"{side.path.name}: {side.reversal.text}" for side in (first, second) if side.reversal.curves is None]
     return replace(found, groups=groups, statements=(*said, *found.statements))
-
-
-def _reversal_of(side: Side) -> dict[str, Figure]:
-    if side.source is None or side.reversal.curves is None:
-        return {}
-    return reversal_figures(side.source, side.reversal.curves)
 
 
 def _positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
@@ -250,18 +248,6 @@ def _positions(before: Side, after: Side, options: CompareOptions) -> Comparison
     rest = {name: group for name, group in errors.groups.items() if name != "volume"}
     text = "axes, diagonals and single errors: identified from the points of each side; " + errors.statements[-2]
     return replace(found, groups={**found.groups, **rest}, statements=(*found.statements, text))
-
-
-def _errors_at_positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
-    """Errors on one side, taken at the positions that were measured on the other."""
-    measured = _own_tool(after if before.deviations is None else before)
-    other = before if before.deviations is None else after
-    field = _predicted_at(other, measured.field)
-    taken = MeasuredField(field, measured.keys, measured.measured)
-    sides = (taken, measured) if other is before else (measured, taken)
-    found = compare_fields(before.machine, *sides, options)
-    text = f"{other.path.name}: errors, the exact model moved with them to the measured positions"
-    return replace(found, statements=(text, *found.statements))
 
 
 def compare_prediction(predicted: Side, measured: Side, options: CompareOptions) -> Comparison:
