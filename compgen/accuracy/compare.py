@@ -136,7 +136,7 @@ def _joined(first: Curve, second: Curve, align: str) -> FloatArray:
 def resampled(source: ErrorSource, names: Sequence[str], nodes_mm: dict[str, FloatArray]) -> ErrorSource:
     """Return some errors of a source, linear between its positions, at new ones; the covariance follows."""
     curves, squareness, factors = {}, {}, []
-    for name, rows in source.rows.items():
+    for name, rows in source.errors.rows().items():
         if name not in names:
             continue
         old = source.errors.curves.get(name)
@@ -325,7 +325,7 @@ def in_common_gauge(source: ErrorSource) -> ErrorSource:
         where = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
         block = np.zeros((len(where), len(values)))
         lever = 1.0 if error.kind == "linear" else LEVER_MM
-        block[:, source.rows[name]] = lever * hat_matrix(errors.curves[name].position_mm, np.array(where))
+        block[:, errors.rows()[name]] = lever * hat_matrix(errors.curves[name].position_mm, np.array(where))
         blocks.append(block)
     change, conditions = np.vstack(changes), np.vstack(blocks)
     effect = conditions @ change

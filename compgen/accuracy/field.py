@@ -315,7 +315,7 @@ class ErrorSource:
             position = position_mm[used]
             through = np.einsum("nij,ni->nj", c_matrix(self.machine, position), weight[used])
             gradient = np.empty(len(self.errors.values()))
-            for name, rows in self.rows.items():
+            for name, rows in self.errors.rows().items():
                 column = through[:, ERROR_INDEX[name]]
                 if name in SQUARENESS_NAMES:
                     gradient[rows] = column.sum()
@@ -326,20 +326,10 @@ class ErrorSource:
 
         return spread
 
-    @property
-    def rows(self) -> dict[str, slice]:
-        """Where the values of each error are among those of the table."""
-        found, first = {}, 0
-        for name in self.errors.names:
-            count = 1 if name in self.errors.squareness else len(self.errors.curves[name].value)
-            found[name] = slice(first, first + count)
-            first += count
-        return found
-
     def value_gradient(self, name: str, weight: FloatArray) -> FloatArray:
         """Derivative (k,) of sum(weight * values of one error)."""
         gradient = np.zeros(len(self.errors.values()))
-        gradient[self.rows[name]] = weight
+        gradient[self.errors.rows()[name]] = weight
         return gradient
 
     def u_of(self, gradient: FloatArray) -> float:

@@ -160,20 +160,25 @@ class ErrorTable(Drawable):
     def _stacked(parts: Sequence[Sequence[float] | FloatArray]) -> FloatArray:
         return np.concatenate([np.zeros(0), *(np.asarray(part) for part in parts)])
 
+    def rows(self) -> dict[str, slice]:
+        """Where the values of each error are in :meth:`values`."""
+        found, first = {}, 0
+        for name in self.names:
+            count = 1 if name in self.squareness else len(self.curves[name].value)
+            found[name] = slice(first, first + count)
+            first += count
+        return found
+
     def with_values(self, values: FloatArray | None = None, u: FloatArray | None = None) -> ErrorTable:
         """Return the table with other values or uncertainties (k,), in the order of :meth:`values`."""
         values = self.values() if values is None else values
         u = self.uncertainties() if u is None else u
-        curves, squareness, first = {}, {}, 0
-        for name in self.names:
+        curves, squareness = {}, {}
+        for name, rows in self.rows().items():
             if name in self.squareness:
-                squareness[name] = (float(values[first]), float(u[first]))
-                first += 1
+                squareness[name] = (float(values[rows][0]), float(u[rows][0]))
             else:
-                old = self.curves[name]
-                rows = slice(first, first + len(old.value))
-                curves[name] = Curve(old.position_mm, values[rows], u[rows])
-                first = rows.stop
+                curves[name] = Curve(self.curves[name].position_mm, values[rows], u[rows])
         return ErrorTable(curves, squareness, self.metadata)
 
     def replace(

@@ -82,7 +82,15 @@ def compensated(readings: SixDof, instrument: SixDofInstrument) -> tuple[SixDof,
     """
     if not needs_air(readings):
         return readings, {}
-    index, wavelength_nm = _index(readings)
+    temperature = readings.covariates.get("temp_ambient_c")
+    if temperature is None:
+        message = "is missing; a phase, or wavelength_compensated = false, asks for the air temperature of each row"
+        raise InputError(message, file=_file(readings), field="column temp_ambient_c")
+    _check_complete(readings, "temp_ambient_c", temperature, np.ones(len(readings), dtype=bool))
+    pressure = _air(readings, "pressure_hpa", STANDARD_PRESSURE_HPA, (500.0, 1200.0))
+    humidity = _air(readings, "humidity_percent", STANDARD_HUMIDITY_PERCENT, (0.0, 100.0))
+    wavelength_nm = _metadata_number(readings, "wavelength_nm", HELIUM_NEON_NM, (350.0, 1700.0))
+    index = refractive_index(temperature, pressure, humidity, wavelength_nm)
     phase = readings.covariates.get("phase_rad")
     if phase is None:
         standard = refractive_index(
@@ -94,8 +102,12 @@ def compensated(readings: SixDof, instrument: SixDofInstrument) -> tuple[SixDof,
         assumed, optical = 1.0, wavelength_nm * MM_PER_NM * phase / (4.0 * np.pi)
     change = np.empty(len(readings))
     for axis, _, rows in readings.runs():
-        first = rows[0]
-        dead = _dead_path_mm(readings, instrument, axis, int(first))
+        # dead path: in air from the unit to the target at the first row, which is l_0, the outer prism of Z, and L
+        first, entry, optics = rows[0], instrument.axes.get(axis), instrument.optics
+        distance = float(readings.distance_mm[first])
+        if not np.isfinite(distance):
+            distance = float(entry.distance_first_mm or 0.0) if entry else 0.0
+        dead = distance + optics.exit_to_prism_mm + (optics.prism_leg_mm if axis == 2 else 0.0)
         change[rows] = (optical[rows] - optical[first] - (index[rows] - index[first]) * dead) / index[rows]
     signals = {**readings.signals_mm, "displacement_mm": change}
     covariates = {name: values for name, values in readings.covariates.items() if name != "phase_rad"}
@@ -131,19 +143,6 @@ def growth_notes(machine: Machine, readings: SixDof) -> dict[str, Any]:
     return {"temperature": notes} if notes else {}
 
 
-def _index(readings: SixDof) -> tuple[FloatArray, float]:
-    """Index of the air at each row (n,), and the vacuum wavelength in nm."""
-    temperature = readings.covariates.get("temp_ambient_c")
-    if temperature is None:
-        message = "is missing; a phase, or wavelength_compensated = false, asks for the air temperature of each row"
-        raise InputError(message, file=_file(readings), field="column temp_ambient_c")
-    _check_complete(readings, "temp_ambient_c", temperature, np.ones(len(readings), dtype=bool))
-    pressure = _air(readings, "pressure_hpa", STANDARD_PRESSURE_HPA, (500.0, 1200.0))
-    humidity = _air(readings, "humidity_percent", STANDARD_HUMIDITY_PERCENT, (0.0, 100.0))
-    wavelength = _metadata_number(readings, "wavelength_nm", HELIUM_NEON_NM, (350.0, 1700.0))
-    return refractive_index(temperature, pressure, humidity, wavelength), wavelength
-
-
 def _air(readings: SixDof, name: str, default: float, allowed: tuple[float, float]) -> FloatArray | float:
     """The column of that name, else the comment, else the default."""
     column = readings.covariates.get(name)
@@ -170,14 +169,6 @@ def _metadata_number(readings: SixDof, key: str, default: float, allowed: tuple[
         message = f"the comment {key} = {value:g} must lie within {allowed[0]:g} ... {allowed[1]:g}"
         raise InputError(message, file=_file(readings))
     return value
-
-
-def _dead_path_mm(readings: SixDof, instrument: SixDofInstrument, axis: int, row: int) -> float:
-    """Path in air from the unit to the target at a row: l_0, the outer prism of Z, and L."""
-    entry, optics = instrument.axes.get(axis), instrument.optics
-    read = float(readings.distance_mm[row])
-    distance = read if np.isfinite(read) else float(entry.distance_first_mm or 0.0) if entry else 0.0
-    return distance + optics.exit_to_prism_mm + (optics.prism_leg_mm if axis == 2 else 0.0)
 
 
 def _check_complete(readings: SixDof, column: str, values: FloatArray, wanted: FloatArray) -> None:

@@ -92,8 +92,18 @@ def axis_errors(machine: Machine, runs: Sequence[AxisRun]) -> AxisErrors:
     for run in runs:
         values = np.hstack([run.delta_mm, run.eps_rad])
         for direction in np.unique(run.direction):
+            # means at the targets, nan where there is no reading
             rows = run.direction == direction
-            signed.append((float(direction), _on(positions, run.position_mm[rows], values[rows])))
+            index = np.searchsorted(positions, run.position_mm[rows] + SAME_MM) - 1
+            index = np.clip(index, 0, len(positions) - 1)
+            total, readings = np.zeros((len(positions), values.shape[1])), np.zeros(len(positions))
+            np.add.at(total, index, values[rows])
+            np.add.at(readings, index, 1.0)
+            readings[readings == 0.0] = np.nan
+            signed.append((float(direction), total / readings[:, None]))
+    ways = [[values for direction, values in signed if direction == sign] for sign in (1.0, -1.0)]
+    forward, backward = (np.mean(np.array(way), axis=0) if way else None for way in ways)
+    reversal = None if forward is None or backward is None else np.asarray(forward - backward)
     stacked = np.array([values for _, values in signed])
     count = np.sum(~np.isnan(stacked[:, :, 0]), axis=0)
     mean = np.nanmean(stacked, axis=0)
@@ -102,25 +112,7 @@ def axis_errors(machine: Machine, runs: Sequence[AxisRun]) -> AxisErrors:
     turns = (
         {} if any(run.contradiction for run in runs) else turned_by(machine, axis, unit_at_tool=runs[0].unit_at_tool)
     )
-    return AxisErrors(axis, positions, mean[:, :3], mean[:, 3:], spread, _reversal(signed), count, turns)
-
-
-def _on(positions: FloatArray, at_mm: FloatArray, values: FloatArray) -> FloatArray:
-    """Means of values (m, 6) at their positions among the targets, (n, 6), nan where there is none."""
-    index = np.clip(np.searchsorted(positions, at_mm + SAME_MM) - 1, 0, len(positions) - 1)
-    total, count = np.zeros((len(positions), values.shape[1])), np.zeros(len(positions))
-    np.add.at(total, index, values)
-    np.add.at(count, index, 1.0)
-    count[count == 0.0] = np.nan
-    return np.asarray(total / count[:, None])
-
-
-def _reversal(signed: Sequence[tuple[float, FloatArray]]) -> FloatArray | None:
-    ways = [[values for direction, values in signed if direction == sign] for sign in (1.0, -1.0)]
-    if not all(ways):
-        return None
-    forward, backward = (np.mean(np.array(way), axis=0) for way in ways)
-    return np.asarray(forward - backward)
+    return AxisErrors(axis, positions, mean[:, :3], mean[:, 3:], spread, reversal, count, turns)
 
 
 def evaluate(machine: Machine, instrument: SixDofInstrument, runs: Sequence[AxisRun]) -> Evaluation:
@@ -136,7 +128,13 @@ def evaluate_axes(machine: Machine, instrument: SixDofInstrument, axes: Mapping[
     curves: dict[str, Curve] = {}
     slopes: dict[str, float] = {}
     for axis, entry in axes.items():
-        delta = entry.delta_mm - _carried(instrument, entry, axes, turns)
+        # without what the rotation of the other axes, where they stood, adds to the measured translations
+        stood, turn = instrument.axes[axis].position_mm or (0.0, 0.0, 0.0), np.zeros(3)
+        for other, times in entry.turned_by.items():
+            if other in axes:
+                at = axes[other].position_mm
+                turn += [times * np.interp(stood[other], at, turns[other][:, k]) for k in range(3)]
+        delta = entry.delta_mm - np.cross(turn, along(axis, entry.position_mm))
         for component in range(3):
             name, value = f"E{AXES[component]}{AXES[axis]}", delta[:, component]
             if component != axis:
@@ -145,40 +143,20 @@ def evaluate_axes(machine: Machine, instrument: SixDofInstrument, axes: Mapping[
             curves[name] = _as_curve(entry.position_mm, zeroed(machine, axis, entry.position_mm, value[:, None])[:, 0])
             angle = f"E{'ABC'[component]}{AXES[axis]}"
             curves[angle] = _as_curve(entry.position_mm, turns[axis][:, component])
-    measured = _squareness(slopes, axes)
+    measured = {
+        name: sum(slopes[f"E{AXES[component]}{AXES[axis]}"] for component, axis in pair)
+        for name, pair in zip(SQUARENESS, SLOPES, strict=True)
+        if all(axis in axes for _, axis in pair)
+    }
     signs = dict(zip(SQUARENESS, instrument.squareness_signs, strict=True))
     squareness = {name: (signs[name] * value, np.nan) for name, value in measured.items()}
-    ordered = {name: curves[name] for name in sorted(curves, key=_order)}
+    order = sorted(curves, key=lambda name: ("XYZ".index(name[2]), "XYZABC".index(name[1])))
+    ordered = {name: curves[name] for name in order}
     return Evaluation(ErrorTable(ordered, squareness), axes, slopes, measured)
-
-
-def _order(name: str) -> tuple[int, int]:
-    return "XYZ".index(name[2]), "XYZABC".index(name[1])
 
 
 def _as_curve(position_mm: FloatArray, value: FloatArray) -> Curve:
     return Curve(position_mm, np.asarray(value), np.full(len(position_mm), np.nan))
-
-
-def _carried(
-    instrument: SixDofInstrument, entry: AxisErrors, axes: Mapping[int, AxisErrors], turns: Mapping[int, FloatArray]
-) -> FloatArray:
-    """What the rotation of the other axes, where they stood, adds to the measured translations, (n, 3)."""
-    stood = instrument.axes[entry.axis].position_mm or (0.0, 0.0, 0.0)
-    turn = np.zeros(3)
-    for other, times in entry.turned_by.items():
-        if other in axes:
-            at = axes[other].position_mm
-            turn += [times * np.interp(stood[other], at, turns[other][:, k]) for k in range(3)]
-    return np.cross(turn, along(entry.axis, entry.position_mm))
-
-
-def _squareness(slopes: Mapping[str, float], axes: Mapping[int, AxisErrors]) -> dict[str, float]:
-    found = {}
-    for name, pair in zip(SQUARENESS, SLOPES, strict=True):
-        if all(axis in axes for _, axis in pair):
-            found[name] = sum(slopes[f"E{AXES[component]}{AXES[axis]}"] for component, axis in pair)
-    return found
 
 
 # From readings to the 21 errors in one call: reduce every run, turn it into errors of the machine, evaluate.
@@ -191,22 +169,19 @@ def axis_runs(machine: Machine, readings: SixDof, instrument: SixDofInstrument) 
     """
     reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
     grown = {axis: growth_mm(machine, readings, axis) for axis in {run.axis for run in reduced}}
-    runs = [
-        printed_run(machine, readings, instrument, run)
-        if instrument.as_printed
-        else errors_of_run(machine, instrument, run)
-        for run in reduced
-    ]
-    return [_cold(run, grown[run.axis][part.rows]) for run, part in zip(runs, reduced, strict=True)]
-
-
-def _cold(run: AxisRun, grown_mm: FloatArray) -> AxisRun:
-    """The run of a machine whose scales are at 20 degC."""
-    if not np.any(grown_mm):
-        return run
-    delta = run.delta_mm.copy()
-    delta[:, run.axis] -= grown_mm
-    return replace(run, delta_mm=delta)
+    runs = []
+    for part in reduced:
+        if instrument.as_printed:
+            run = printed_run(machine, readings, instrument, part)
+        else:
+            run = errors_of_run(machine, instrument, part)
+        growth = grown[run.axis][part.rows]
+        if np.any(growth):  # as on a machine whose scales are at 20 degC
+            delta = run.delta_mm.copy()
+            delta[:, run.axis] -= growth
+            run = replace(run, delta_mm=delta)
+        runs.append(run)
+    return runs
 
 
 def evaluate_readings(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> Evaluation:

@@ -81,7 +81,17 @@ def sixdof_health(machine: Machine, readings: SixDof, instrument: SixDofInstrume
         found += _swapped(readings, runs)
         found += _drift(readings, instrument, runs)
         found += _crosstalk(machine, instrument, runs)
-    return found + list(_drift_zero(readings, reduced))
+    # PSD2 must keep one zero for all axes: readings that begin anew at zero in every run lose the common reference
+    for name in ("y_psd2_mm", "z_psd2_mm"):
+        monitor = readings.signals_mm[name]
+        starts = np.array([monitor[run.rows[0]] for run in reduced])
+        if len(reduced) > 1 and np.abs(starts).max() < ZERO_MM and np.ptp(monitor) > 0.1 * MM_PER_UM:
+            text = (
+                f"{name} begins at zero in every run though it drifts: it was zeroed anew. For squareness it must keep "
+                "one zero for all axes"
+            )
+            found.append(Suspicion("drift_zero", "", text, {"range_um": float(np.ptp(monitor)) / MM_PER_UM}))
+    return found
 
 
 def _letter(runs: Sequence[RelativeRun]) -> str:
@@ -199,14 +209,21 @@ def _crosstalk(machine: Machine, instrument: SixDofInstrument, runs: Sequence[Re
     axis, set_up, optics = runs[0].axis, instrument.axes[runs[0].axis].set_up, instrument.optics
     delta, eps = (np.mean([getattr(run, name) for run in errors], axis=0) for name in ("delta_mm", "eps_rad"))
     position = errors[0].position_mm
+    along = (position - position.mean()) / np.ptp(position)
     kappa = HANDEDNESS[axis]
     at_tool = runs[0].away < 0  # only then does L enter the straightness
     largest = LARGEST_OFFSET_MM if at_tool else LARGEST_DEPTH_MM
     arm = float(np.abs(cross_talk_arm_mm(optics, set_up, runs[0].distance_mm)).mean())
     for channel, (name, sign) in enumerate((("yaw", kappa), ("pitch", -kappa))):
         straight, angle = delta[:, DIRECTIONS[axis][1 + channel]], eps[:, ROTATIONS[axis][channel]]
-        found = _same_at_all_orders(position, angle, straight)
-        if not found or not 1.0 < abs(found["slope"]) < largest:
+        # the regression without lines counts if it is the same without cubics: smooth curves are alike by chance at first
+        found, fine = (
+            _regression(*(value - np.polyval(np.polyfit(along, value, order), along) for value in (angle, straight)))
+            for order in (1, 3)
+        )
+        if not found or not fine or abs(found["slope"] - fine["slope"]) > ALIKE * abs(found["slope"]):
+            continue
+        if not 1.0 < abs(found["slope"]) < largest:
             continue
         found |= {"arm_mm": arm, "expected_arm_sign": float(sign)}
         which = "distance_offset" if at_tool else f"crosstalk_{name}"
@@ -214,20 +231,6 @@ def _crosstalk(machine: Machine, instrument: SixDofInstrument, runs: Sequence[Re
             "the distance L may be off by so much" if at_tool else "a wrong t or mode, or a bend of the axis"
         )
         yield Suspicion(which, AXES[axis], text, found)
-
-
-def _same_at_all_orders(position_mm: FloatArray, cause: FloatArray, effect: FloatArray) -> dict[str, float] | None:
-    """The regression without lines, if it is the same without cubics: two smooth curves are alike by chance at first."""
-    span = np.ptp(position_mm)
-    along = (position_mm - position_mm.mean()) / span
-    results = []
-    for order in (1, 3):
-        left = [value - np.polyval(np.polyfit(along, value, order), along) for value in (cause, effect)]
-        results.append(_regression(*left))
-    first, fine = results
-    if not first or not fine or abs(first["slope"] - fine["slope"]) > ALIKE * abs(first["slope"]):
-        return None
-    return first
 
 
 def _regression(cause: FloatArray, effect: FloatArray) -> dict[str, float] | None:
@@ -243,18 +246,3 @@ def _regression(cause: FloatArray, effect: FloatArray) -> dict[str, float] | Non
     if abs(slope) < SIGNIFICANT * error or explained < EXPLAINED:
         return None
     return {"slope": slope, "standard_error": error, "explained": explained}
-
-
-def _drift_zero(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
-    """PSD2 must keep one zero for all axes: readings that begin anew at zero in every run lose the common reference."""
-    if len(runs) < 2:
-        return
-    for name in ("y_psd2_mm", "z_psd2_mm"):
-        monitor = readings.signals_mm[name]
-        starts = np.array([monitor[run.rows[0]] for run in runs])
-        if np.abs(starts).max() < ZERO_MM and np.ptp(monitor) > 0.1 * MM_PER_UM:
-            text = (
-                f"{name} begins at zero in every run though it drifts: it was zeroed anew. For squareness it must keep "
-                "one zero for all axes"
-            )
-            yield Suspicion("drift_zero", "", text, {"range_um": float(np.ptp(monitor)) / MM_PER_UM})

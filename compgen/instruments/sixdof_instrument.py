@@ -270,16 +270,13 @@ def systematic_columns(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -
     (lambda: None, builder.first_prism, builder.second_prism)[set_up.axis]()
     if set_up.beam_direction > 0:
         return builder.columns
-    return {name: TURNED_SIGNALS * column * _turn_of(name, set_up) for name, column in builder.columns.items()}
-
-
-def _turn_of(name: str, set_up: SetUp) -> float:
-    """Sign of a parameter under half a turn about the vertical direction; beams belong to the unit's own frame."""
-    kind, _, rest = name.partition("_")
-    if rest.startswith("PE"):  # tilts in the unit's frame: y is read with the opposite sign, z alike
-        return -1.0 if rest == "PEz" else 1.0
-    vertical = DIRECTIONS[set_up.axis][2]
-    return 1.0 if "xyz".index(rest[0]) == vertical else -1.0
+    # half a turn about the vertical direction; beams belong to the unit's own frame: y is read with the opposite sign, z alike
+    vertical, turned = "xyz"[DIRECTIONS[set_up.axis][2]], {}
+    for name, column in builder.columns.items():
+        rest = name.partition("_")[2]
+        unchanged = rest != "PEz" if rest.startswith("PE") else rest[0] == vertical
+        turned[name] = TURNED_SIGNALS * column * (1.0 if unchanged else -1.0)
+    return turned
 
 
 def systematic_signals(
@@ -436,26 +433,21 @@ def _read_numbers(section: toml_files.Section, names: tuple[str, ...]) -> dict[s
 
 def _read_axes(section: toml_files.Section, common: Mapping[str, float]) -> dict[int, AxisSetUp]:
     found = {}
-    for number, letter in enumerate(AXES):
-        if letter in section:
-            found[number] = _read_axis(section.section(letter), number, common)
+    for axis, letter in enumerate(AXES):
+        if letter not in section:
+            continue
+        entry = section.section(letter)
+        mode = entry.take("mode", toml_files.whole(1, 2))
+        direction = entry.take("beam_direction", _beam_direction, 1)
+        own = read_systematics(entry.section("systematics", required=False), axis)
+        known = {name: value for name, value in common.items() if name in known_systematics(axis)}
+        found[axis] = toml_files.read_settings(
+            AxisSetUp, entry, set_up=SetUp(axis, mode, direction), systematics={**known, **own}
+        )
     section.finish()
     if not found:
         raise section.fail("X", "no axis is described; give [axes.X], [axes.Y] or [axes.Z]")
     return found
-
-
-def _read_axis(entry: toml_files.Section, axis: int, common: Mapping[str, float]) -> AxisSetUp:
-    mode = entry.take("mode", toml_files.whole(1, 2))
-    direction = entry.take("beam_direction", _beam_direction, 1)
-    own = read_systematics(entry.section("systematics", required=False), axis)
-    known = known_systematics(axis)
-    return toml_files.read_settings(
-        AxisSetUp,
-        entry,
-        set_up=SetUp(axis, mode, direction),
-        systematics={**{name: value for name, value in common.items() if name in known}, **own},
-    )
 
 
 def read_systematics(

@@ -82,33 +82,6 @@ _SIXDOF = Schema(
 def read_sixdof(files: str | Path | Sequence[str | Path]) -> SixDof:
     """Read one or more ``*.sixdof.csv`` files strictly; the same run in two files is an error."""
     tables = _SIXDOF.read_tables(files)
-    _check_runs(tables)
-    _check_alike(tables)
-    parts = [SixDof(**_SIXDOF.values(table)) for table in tables]
-    second = all("y_qd2_mm" in part.signals_mm for part in parts)
-    return _SIXDOF.joined([_with_signals(part, second=second) for part in parts])
-
-
-def _with_signals(part: SixDof, *, second: bool) -> SixDof:
-    """Give the readings the displacement, nan if the phase was read, and the second spot only if all files have it."""
-    names = (*SPOTS, "displacement_mm", *(("y_qd2_mm",) if second else ()))
-    unknown = np.full(len(part), np.nan)
-    return replace(part, signals_mm={name: part.signals_mm.get(name, unknown) for name in names})
-
-
-def _check_alike(tables: Sequence[CsvTable]) -> None:
-    """The interferometer's reading is there once, and of one kind in all files."""
-    for table in tables:
-        kinds = [name for name in ("displacement_mm", "phase_rad") if name in table.columns]
-        if len(kinds) != 1:
-            message = "holds both of them" if kinds else "holds neither of them"
-            field = "columns displacement_mm, phase_rad"
-            raise InputError(f"{message}; give the one that the interferometer read", file=table.path, field=field)
-        if kinds[0] not in tables[0].columns:
-            raise InputError(f"has {kinds[0]}, but {tables[0].path} has not; give all files alike", file=table.path)
-
-
-def _check_runs(tables: Sequence[CsvTable]) -> None:
     seen: dict[tuple[str, str], Path] = {}
     for table in tables:
         for key in dict.fromkeys(zip(table.columns["axis"], table.columns["run"], strict=True)):
@@ -116,6 +89,22 @@ def _check_runs(tables: Sequence[CsvTable]) -> None:
                 message = f"run {key[1]} of {key[0]} is also in {seen[key]}; number the runs of all files"
                 raise InputError(message, file=table.path, field="column run")
             seen[key] = table.path
+    for table in tables:  # the interferometer's reading is there once, and of one kind in all files
+        kinds = [name for name in ("displacement_mm", "phase_rad") if name in table.columns]
+        if len(kinds) != 1:
+            message = "holds both of them" if kinds else "holds neither of them"
+            field = "columns displacement_mm, phase_rad"
+            raise InputError(f"{message}; give the one that the interferometer read", file=table.path, field=field)
+        if kinds[0] not in tables[0].columns:
+            raise InputError(f"has {kinds[0]}, but {tables[0].path} has not; give all files alike", file=table.path)
+    parts = [SixDof(**_SIXDOF.values(table)) for table in tables]
+    # the displacement is nan if the phase was read; the second spot counts only if all files have it
+    second = ("y_qd2_mm",) if all("y_qd2_mm" in part.signals_mm for part in parts) else ()
+    names = (*SPOTS, "displacement_mm", *second)
+    for k, part in enumerate(parts):
+        unknown = np.full(len(part), np.nan)
+        parts[k] = replace(part, signals_mm={name: part.signals_mm.get(name, unknown) for name in names})
+    return _SIXDOF.joined(parts)
 
 
 def format_sixdof(readings: SixDof) -> str:

@@ -95,38 +95,17 @@ def reduce_runs(readings: SixDof, instrument: SixDofInstrument, expected_away: d
             file, line = readings.origin[int(rows[0])] if readings.origin else (None, None)
             raise InputError(f"run {run} of {AXES[axis]} has fewer than two positions", file=file, line=line)
         first.setdefault(axis, float(readings.position_mm[rows[0]]))
-        reduced.append(_reduce(readings, instrument, axis, run, rows, first[axis], expected_away[axis]))
+        set_up, position = instrument.axes[axis], readings.position_mm[rows]
+        away, nominal = _travel(readings, axis, run, rows, set_up, expected_away[axis])
+        distance = _distance(readings, rows, set_up, instrument, away * (position - first[axis]))
+        motion = relative_motion(readings, instrument, rows, axis, distance, nominal)
+        shift, turn = np.zeros((len(rows), 3)), np.zeros((len(rows), 3))
+        shift[:, list(DIRECTIONS[axis])] = motion[:, :3]
+        turn[:, list(ROTATIONS[axis])] = motion[:, 3:]
+        shift, turn = shift - shift[0], turn - turn[0]
+        direction = readings.direction[rows]
+        reduced.append(RelativeRun(axis, run, rows, position, distance, shift, turn, away, direction))
     return reduced
-
-
-def _reduce(
-    readings: SixDof,
-    instrument: SixDofInstrument,
-    axis: int,
-    run: int,
-    rows: NDArray[np.int64],
-    first_mm: float,
-    expected_away: int,
-) -> RelativeRun:
-    set_up = instrument.axes[axis]
-    position = readings.position_mm[rows]
-    away, nominal = _travel(readings, axis, run, rows, set_up, expected_away)
-    distance = _distance(readings, rows, set_up, instrument, away * (position - first_mm))
-    motion = relative_motion(readings, instrument, rows, axis, distance, nominal)
-    shift, turn = np.zeros((len(rows), 3)), np.zeros((len(rows), 3))
-    shift[:, list(DIRECTIONS[axis])] = motion[:, :3]
-    turn[:, list(ROTATIONS[axis])] = motion[:, 3:]
-    return RelativeRun(
-        axis=axis,
-        run=run,
-        rows=rows,
-        position_mm=position,
-        distance_mm=distance,
-        shift_mm=shift - shift[0],
-        turn_rad=turn - turn[0],
-        away=away,
-        direction=readings.direction[rows],
-    )
 
 
 def relative_motion(
@@ -266,15 +245,27 @@ def expected_away(machine: Machine, instrument: SixDofInstrument) -> dict[int, i
 
 def errors_of_run(machine: Machine, instrument: SixDofInstrument, run: RelativeRun) -> AxisRun:
     """Errors of the axis over a run; a CompgenWarning where chain and readings contradict each other."""
-    expected = expected_away(machine, instrument)[run.axis]
-    if run.away != expected:
-        return _component_run(machine, instrument, run)
     entry, at_tool = instrument.axes[run.axis], run.away < 0
+    if run.away != expected_away(machine, instrument)[run.axis]:
+        # the errors of the moving body in its own axes and at its own reference point
+        set_up, rises = entry.set_up, run.away * entry.set_up.beam_direction > 0
+        text = (
+            f"{AXES[run.axis]}: displacement_mm {'rises' if rises else 'falls'} with position_mm, which contradicts mode "
+            f"{set_up.mode} and beam_direction {set_up.beam_direction} on this chain; taken as the motion of the moving body in "
+            "its own axes. Check mode, beam_direction and the chain: a wrong one turns signs"
+        )
+        warnings.warn(text, CompgenWarning, stacklevel=2)
+        motion = (run.shift_mm, run.turn_rad) if set_up.mode == 1 else motion_of_unit(instrument, run)
+        delta, eps = (zeroed(machine, run.axis, run.position_mm, values) for values in motion)
+        return AxisRun(run.axis, run.run, run.position_mm, delta, eps, run.direction, False, text)
     error, turn = motion_of_unit(instrument, run) if at_tool else (run.shift_mm, run.turn_rad)
     eps = zeroed(machine, run.axis, run.position_mm, turn)
     if at_tool:
         error = error + np.cross(eps[0], along(run.axis, run.position_mm))
-    lever = lever_arm(machine, run.axis, _positions(entry, run), np.array(entry.target_offset_mm))
+    # the other axes are where the instrument file says, else at zero
+    position = np.tile(np.array(entry.position_mm or (0.0, 0.0, 0.0)), (len(run.position_mm), 1))
+    position[:, run.axis] = run.position_mm
+    lever = lever_arm(machine, run.axis, position, np.array(entry.target_offset_mm))
     delta = zeroed(machine, run.axis, run.position_mm, error - np.cross(eps, lever))
     return AxisRun(run.axis, run.run, run.position_mm, delta, eps, run.direction, at_tool)
 
@@ -296,28 +287,6 @@ def motion_of_unit(instrument: SixDofInstrument, run: RelativeRun) -> tuple[Floa
     beam = instrument.axes[run.axis].set_up.beam_direction * np.eye(3)[run.axis]
     reach = (run.distance_mm + instrument.optics.lever_mm(run.axis))[:, None] * beam
     return np.cross(run.turn_rad, reach) - run.shift_mm, -run.turn_rad
-
-
-def _component_run(machine: Machine, instrument: SixDofInstrument, run: RelativeRun) -> AxisRun:
-    """Errors of the moving body in its own axes and at its own reference point."""
-    set_up = instrument.axes[run.axis].set_up
-    letter, rises = AXES[run.axis], run.away * set_up.beam_direction > 0
-    text = (
-        f"{letter}: displacement_mm {'rises' if rises else 'falls'} with position_mm, which contradicts mode {set_up.mode} "
-        f"and beam_direction {set_up.beam_direction} on this chain; taken as the motion of the moving body in its own "
-        "axes. Check mode, beam_direction and the chain: a wrong one turns signs"
-    )
-    warnings.warn(text, CompgenWarning, stacklevel=2)
-    delta, eps = (run.shift_mm, run.turn_rad) if set_up.mode == 1 else motion_of_unit(instrument, run)
-    delta, eps = (zeroed(machine, run.axis, run.position_mm, values) for values in (delta, eps))
-    return AxisRun(run.axis, run.run, run.position_mm, delta, eps, run.direction, False, text)
-
-
-def _positions(entry: AxisSetUp, run: RelativeRun) -> FloatArray:
-    """Positions of all axes over the run, (n, 3): the others stand where the instrument file says, else at zero."""
-    position = np.tile(np.array(entry.position_mm or (0.0, 0.0, 0.0)), (len(run.position_mm), 1))
-    position[:, run.axis] = run.position_mm
-    return position
 
 
 def lever_arm(machine: Machine, axis: int, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:

@@ -129,20 +129,16 @@ def scatter_of(
     stated = _stated(readings, instrument, runs, rows, size, at_tool) if instrument.noise else {}
     motion = [body_motion(instrument, run, at_tool) for run in runs]
     observed = _repeats(runs, motion, rows, size) if len(runs) > 1 else None
-    if observed is None and not stated:
-        observed = _neighbours(motion)
+    if observed is None and not stated:  # by second differences of neighbours, which a smooth curve hardly shows
+        seconds = [values[2:] - 2 * values[1:-1] + values[:-2] for values in motion if len(values) > 3]
+        observed = np.diag(np.mean(np.vstack(seconds) ** 2, axis=0) / 6.0) if seconds else np.zeros((6, 6))
     sources = dict(stated)
     if observed is not None:
         known = sum((value.mean(axis=0) for value in stated.values()), np.zeros((6, 6)))
-        sources["repeatability"] = np.tile(_excess(observed, known), (size, 1, 1))
+        if np.any(known):  # the part beyond what is known
+            observed = np.diag(np.maximum(np.diag(observed) - np.diag(known), 0.0))
+        sources["repeatability"] = np.tile(observed, (size, 1, 1))
     return Scatter(runs[0].axis, rows, count, sources)
-
-
-def _excess(observed: FloatArray, known: FloatArray) -> FloatArray:
-    """The part of an observed covariance (6, 6) beyond what is known; all of it where nothing is."""
-    if not np.any(known):
-        return observed
-    return np.diag(np.maximum(np.diag(observed) - np.diag(known), 0.0))
 
 
 def _repeats(
@@ -174,15 +170,6 @@ def student_variance(freedom: float) -> float:
     return freedom / max(freedom - 2.0, 0.5)
 
 
-def _neighbours(motion: Sequence[FloatArray]) -> FloatArray:
-    """Variances (6, 6) from second differences of neighbouring readings, which a smooth curve hardly shows."""
-    seconds = [values[2:] - 2 * values[1:-1] + values[:-2] for values in motion if len(values) > 3]
-    if not seconds:
-        return np.zeros((6, 6))
-    stacked = np.vstack(seconds)
-    return np.diag(np.mean(stacked**2, axis=0) / 6.0)
-
-
 def _stated(
     readings: SixDof,
     instrument: SixDofInstrument,
@@ -191,34 +178,32 @@ def _stated(
     size: int,
     at_tool: bool,
 ) -> dict[str, FloatArray]:
-    """Covariances (groups, 6, 6) of the body's motion by the stated noise of detectors and drift monitor."""
-    result = {}
-    for source, channels in (("detectors", DETECTORS), ("drift monitor", MONITOR)):
-        covariance = np.zeros((size, 6, 6))
-        for run, index in zip(runs, rows, strict=True):
-            columns = [
-                instrument.noise.get(kind, 0.0) * _response(readings, instrument, run, at_tool, name)
-                for name, kind in channels.items()
-            ]
-            covariance[index] = sum(np.einsum("ni,nj->nij", column, column) for column in columns)
-        result[source] = covariance
-    return result
+    """Covariances (groups, 6, 6) of the body's motion by the stated noise of detectors and drift monitor.
 
+    The motion that 1 mm more of a signal makes, (n, 6), is found by differences of the real reduction.
+    """
 
-def _response(readings: SixDof, instrument: SixDofInstrument, run: RelativeRun, at_tool: bool, name: str) -> FloatArray:
-    """Motion of the body (n, 6) that 1 mm more of one signal makes, by differences of the real reduction."""
-
-    def reduced(step: float) -> FloatArray:
-        signals = {**readings.signals_mm, name: readings.signals_mm[name] + step}
+    def motion(run: RelativeRun, name: str, step: float) -> FloatArray:
+        moved = replace(readings, signals_mm={**readings.signals_mm, name: readings.signals_mm[name] + step})
         zero = np.zeros(len(run.rows))
-        moved = replace(readings, signals_mm=signals)
         roles = relative_motion(moved, instrument, run.rows, run.axis, run.distance_mm, zero)
         part = replace(run, shift_mm=np.zeros((len(zero), 3)), turn_rad=np.zeros((len(zero), 3)))
         part.shift_mm[:, list(DIRECTIONS[run.axis])] = roles[:, :3]
         part.turn_rad[:, list(ROTATIONS[run.axis])] = roles[:, 3:]
         return body_motion(instrument, part, at_tool)
 
-    return np.asarray((reduced(STEP_MM) - reduced(-STEP_MM)) / (2.0 * STEP_MM))
+    result = {}
+    for source, channels in (("detectors", DETECTORS), ("drift monitor", MONITOR)):
+        covariance = np.zeros((size, 6, 6))
+        for run, index in zip(runs, rows, strict=True):
+            columns = [
+                instrument.noise.get(kind, 0.0)
+                * ((motion(run, name, STEP_MM) - motion(run, name, -STEP_MM)) / (2.0 * STEP_MM))
+                for name, kind in channels.items()
+            ]
+            covariance[index] = sum(np.einsum("ni,nj->nij", column, column) for column in columns)
+        result[source] = covariance
+    return result
 
 
 # What calibration leaves uncertain, as changes of readings and instrument by standard uncertainties.
@@ -234,59 +219,52 @@ Change = Callable[[float], Case]
 def calibration_changes(readings: SixDof, instrument: SixDofInstrument) -> Iterator[tuple[str, float, Change]]:
     """Everything that calibration leaves uncertain: its name, its standard uncertainty, and the change by a step of it."""
     u = {name: instrument.u_constants.get(name, 0.0) for name in U_CONSTANTS}
-    cases: list[tuple[str, float, Callable[..., Case], tuple[object, ...]]] = []
-    cases += [(item.name, u[item.name], _with_optics, (item.name,)) for item in fields(Optics)]
+    cases: list[tuple[str, float, str, Sequence[str], Sequence[int]]] = []  # name, u, what changes, its names, axes
+    cases += [(item.name, u[item.name], "optics", (item.name,), ()) for item in fields(Optics)]
     for axis in instrument.axes:
-        cases.append((f"distance of {AXES[axis]}", u["distance_first_mm"], _with_distance, (axis,)))
+        cases.append((f"distance of {AXES[axis]}", u["distance_first_mm"], "distance", (), (axis,)))
         drift_mm = u["parallel_drift_um"] * 1e-3
-        cases += [("parallel drift", drift_mm, _drifted, (axis, letter)) for letter in "yz"]
-    cases.append(("drift gain", u["drift_gain_percent"] / 100.0, _scaled, (("y_psd2_mm", "z_psd2_mm"),)))
-    cases.append(("wavelength", u["displacement_ppm"] * 1e-6, _scaled, (("displacement_mm",),)))
+        cases += [("parallel drift", drift_mm, "drift", (f"{k}_qd1_mm", f"{k}_qd2_mm"), (axis,)) for k in "yz"]
+    cases.append(("drift gain", u["drift_gain_percent"] / 100.0, "scale", ("y_psd2_mm", "z_psd2_mm"), ()))
+    cases.append(("wavelength", u["displacement_ppm"] * 1e-6, "scale", ("displacement_mm",), ()))
     for name, u_value in instrument.u_systematics.items():
         having = [axis for axis in instrument.axes if name in known_systematics(axis)]
         for axes in [having] if name in SHARED else [[axis] for axis in having]:
             where = "" if name in SHARED or len(having) == 1 else f" of {AXES[axes[0]]}"
-            cases.append((name + where, u_value if axes else 0.0, _with_systematic, (axes, name)))
-    for source, u_source, changed, what in cases:
+            cases.append((name + where, u_value if axes else 0.0, "systematic", (name,), axes))
+    for source, u_source, what, names, on in cases:
         if u_source > 0:
-            yield source, u_source, partial(changed, readings, instrument, *what)
+            yield source, u_source, partial(_changed, readings, instrument, what, names, on)
 
 
-def _with_optics(readings: SixDof, instrument: SixDofInstrument, name: str, step: float) -> Case:
-    values = {name: getattr(instrument.optics, name) + step}
-    return readings, replace(instrument, optics=replace(instrument.optics, **values))
-
-
-def _with_distance(readings: SixDof, instrument: SixDofInstrument, axis: int, step: float) -> Case:
-    distance = readings.distance_mm + np.where(readings.axis == axis, step, 0.0)
-    entry = instrument.axes[axis]
-    first = None if entry.distance_first_mm is None else entry.distance_first_mm + step
-    axes = {**instrument.axes, axis: replace(entry, distance_first_mm=first)}
-    return replace(readings, distance_mm=distance), replace(instrument, axes=axes)
-
-
-def _with_systematic(readings: SixDof, instrument: SixDofInstrument, on: Sequence[int], name: str, step: float) -> Case:
-    axes = dict(instrument.axes)
-    for axis in on:
-        values = dict(axes[axis].systematics)
-        values[name] = values.get(name, 0.0) + step
-        axes[axis] = replace(axes[axis], systematics=values)
-    return readings, replace(instrument, axes=axes)
-
-
-def _scaled(readings: SixDof, instrument: SixDofInstrument, names: Sequence[str], step: float) -> Case:
-    signals = {**readings.signals_mm, **{name: readings.signals_mm[name] * (1 + step) for name in names}}
-    return replace(readings, signals_mm=signals), instrument
-
-
-def _drifted(readings: SixDof, instrument: SixDofInstrument, axis: int, letter: str, step_mm: float) -> Case:
-    """Both beams move parallel to themselves by so much from the first to the last row of each run of the axis."""
+def _changed(
+    readings: SixDof, instrument: SixDofInstrument, what: str, names: Sequence[str], on: Sequence[int], step: float
+) -> Case:
+    """Readings and instrument changed by a step of an optical constant, a systematic parameter, L, a scale or drift."""
+    axes, signals = dict(instrument.axes), dict(readings.signals_mm)
+    if what == "optics":
+        values = {name: getattr(instrument.optics, name) + step for name in names}
+        return readings, replace(instrument, optics=replace(instrument.optics, **values))
+    if what == "systematic":
+        for axis in on:
+            changed = {name: axes[axis].systematics.get(name, 0.0) + step for name in names}
+            axes[axis] = replace(axes[axis], systematics={**axes[axis].systematics, **changed})
+        return readings, replace(instrument, axes=axes)
+    if what == "distance":
+        for axis in on:
+            first = axes[axis].distance_first_mm
+            axes[axis] = replace(axes[axis], distance_first_mm=None if first is None else first + step)
+        distance = readings.distance_mm + np.where(np.isin(readings.axis, on), step, 0.0)
+        return replace(readings, distance_mm=distance), replace(instrument, axes=axes)
+    if what == "scale":
+        signals |= {name: signals[name] * (1 + step) for name in names}
+        return replace(readings, signals_mm=signals), instrument
+    # both beams move parallel to themselves by so much from the first to the last row of each run of the axis
     ramp_mm = np.zeros(len(readings))
     for which, _, rows in readings.runs():
-        if which == axis:
-            ramp_mm[rows] = np.linspace(0.0, step_mm, len(rows))
-    names = [name for name in (f"{letter}_qd1_mm", f"{letter}_qd2_mm") if name in readings.signals_mm]
-    signals = {**readings.signals_mm, **{name: readings.signals_mm[name] - ramp_mm for name in names}}
+        if which in on:
+            ramp_mm[rows] = np.linspace(0.0, step, len(rows))
+    signals |= {name: signals[name] - ramp_mm for name in names if name in signals}
     return replace(readings, signals_mm=signals), instrument
 
 
@@ -318,7 +296,7 @@ class SixDofBudget:
         """Largest standard uncertainty over the travel by error and source, and ``combined``, mm and rad."""
         names = np.array(self.sources)
         result = {}
-        for name, rows in _rows_of(self.errors):
+        for name, rows in self.errors.rows().items():
             part = {
                 source: float(np.sqrt(np.sum(self.factor[rows][:, names == source] ** 2, axis=1)).max())
                 for source in dict.fromkeys(self.sources)
@@ -326,14 +304,6 @@ class SixDofBudget:
             part["combined"] = float(np.sqrt(np.sum(self.factor[rows] ** 2, axis=1)).max())
             result[name] = part
         return result
-
-
-def _rows_of(errors: ErrorTable) -> Iterator[tuple[str, slice]]:
-    first = 0
-    for name in errors.names:
-        size = 1 if name in errors.squareness else len(errors.curves[name].value)
-        yield name, slice(first, first + size)
-        first += size
 
 
 def uncertainty_budget(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> SixDofBudget:
@@ -350,12 +320,25 @@ def uncertainty_budget(machine: Machine, readings: SixDof, instrument: SixDofIns
         warnings.simplefilter("ignore", CompgenWarning)
         runs = axis_runs(machine, readings, instrument)
         errors = evaluate(machine, instrument, runs).errors
-        random = _random_columns(machine, readings, instrument)
-        columns = [
-            *random,
-            *_run_to_run(errors, random, each_run(machine, instrument, runs)),
-            *_constant_columns(machine, readings, instrument),
-        ]
+        # responses of the values to the scatter of every target position of every axis
+        columns: list[Column] = []
+        reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
+        measured = sorted({run.axis for run in reduced})
+        by_axis = {axis: [run for run in reduced if run.axis == axis] for axis in measured}
+        means = {axis: _means(machine, instrument, part) for axis, part in by_axis.items()}
+        for part in by_axis.values():
+            scatter = scatter_of(machine, readings, instrument, part)
+            responses = _responses(machine, instrument, part, means, scatter)
+            for source, covariance in scatter.sources.items():
+                for group, response in enumerate(responses):
+                    root = _root(covariance[group] / scatter.count[group])
+                    columns += [(source, column) for column in (response @ root).T if np.any(column)]
+        columns += _run_to_run(errors, columns, each_run(machine, instrument, runs))
+        # half of the change of all values between each constant up and down by its standard uncertainty
+        for source, u, changed in calibration_changes(readings, instrument):
+            up, down = (evaluate_readings(machine, *changed(step)).errors.values() for step in (u, -u))
+            if np.any(up - down):
+                columns.append((source, 0.5 * (up - down)))
     sources = tuple(source for source, _ in columns)
     size = len(errors.values())
     factor = np.column_stack([column for _, column in columns]) if columns else np.zeros((size, 0))
@@ -371,22 +354,6 @@ def with_u(errors: ErrorTable, factor: FloatArray) -> ErrorTable:
 Column = tuple[str, FloatArray]
 
 
-def _random_columns(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> list[Column]:
-    """Responses of the values to the scatter of every target position of every axis."""
-    reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
-    by_axis = {axis: [run for run in reduced if run.axis == axis] for axis in sorted({run.axis for run in reduced})}
-    means = {axis: _means(machine, instrument, runs) for axis, runs in by_axis.items()}
-    columns: list[Column] = []
-    for runs in by_axis.values():
-        scatter = scatter_of(machine, readings, instrument, runs)
-        responses = _responses(machine, instrument, runs, means, scatter)
-        for source, covariance in scatter.sources.items():
-            for group, response in enumerate(responses):
-                root = _root(covariance[group] / scatter.count[group])
-                columns += [(source, column) for column in (response @ root).T if np.any(column)]
-    return columns
-
-
 def _run_to_run(errors: ErrorTable, random: Sequence[Column], evaluations: Sequence[Evaluation]) -> list[Column]:
     """What whole runs differ by beyond the scatter of their readings: drift from run to run, slopes above all.
 
@@ -396,26 +363,18 @@ def _run_to_run(errors: ErrorTable, random: Sequence[Column], evaluations: Seque
     count = len(evaluations)
     if count < 2:
         return []
-    tables = [_resampled(item.errors, errors) for item in evaluations]
+    tables = []  # the values of each at the positions of the errors
+    for item in evaluations:
+        curves = {name: item.errors.curves[name].at(curve.position_mm) for name, curve in errors.curves.items()}
+        constants = {name: np.array([item.errors.squareness[name][0]]) for name in errors.squareness}
+        tables.append(np.concatenate([{**curves, **constants}[name] for name in errors.names]))
     part = (np.array(tables) - np.mean(tables, axis=0)) / np.sqrt(count * (count - 1))
     limit = float(chdtri(count - 1, UNLIKELY)) / (count - 1)
     known = sum((column**2 for _, column in random), np.zeros(part.shape[1]))
     kept = np.zeros(part.shape[1], dtype=bool)
-    for _, rows in _rows_of(errors):
+    for rows in errors.rows().values():
         kept[rows] = np.mean(np.sum(part[:, rows] ** 2, axis=0)) > limit * np.mean(known[rows])
     return [("run to run", np.where(kept, column, 0.0)) for column in part] if np.any(kept) else []
-
-
-def _resampled(errors: ErrorTable, like: ErrorTable) -> FloatArray:
-    """Values of a table at the positions of another one, in the order of its file."""
-    return np.concatenate(
-        [
-            np.array([errors.squareness[name][0]])
-            if name in like.squareness
-            else errors.curves[name].at(like.curves[name].position_mm)
-            for name in like.names
-        ]
-    )
 
 
 def _means(machine: Machine, instrument: SixDofInstrument, runs: Sequence[RelativeRun]) -> AxisErrors:
@@ -460,17 +419,3 @@ def _responses(
             response[:, component] = (values(group, component, step) - other) / (step * (1 + two_sided))
         found.append(response)
     return found
-
-
-def _constant_columns(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> list[Column]:
-    """Half of the change of all values between each constant up and down by its standard uncertainty."""
-
-    def values(case: tuple[SixDof, SixDofInstrument]) -> FloatArray:
-        return evaluate_readings(machine, *case).errors.values()
-
-    columns = []
-    for source, u, changed in calibration_changes(readings, instrument):
-        column = 0.5 * (values(changed(u)) - values(changed(-u)))
-        if np.any(column):
-            columns.append((source, column))
-    return columns
