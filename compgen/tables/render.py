@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from decimal import Decimal
+from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -116,7 +117,7 @@ def template_folders(name: str, folder: Path | None = None) -> list[Path]:
 def check_templates(name: str, folder: Path) -> None:
     """Check what a plug-in's control brings below ``folder``: the card, every template that it names, their syntax."""
     card = _read_format(folder / name / "format.toml", name)
-    environment = _environment([folder, data_folder("templates")])
+    environment = _environment((folder, data_folder("templates")))
     for template in (*(spec.template for spec in card.files), "preflight.md.j2"):
         path = folder / name / template
         if not path.is_file():
@@ -134,7 +135,8 @@ def load_format(name: str, folder: Path | None = None) -> Format:
     for base in template_folders(name, folder):
         path = base / name / "format.toml"
         if path.is_file():
-            return _read_format(path, name)
+            state = path.stat()
+            return _known_format(path, name, (state.st_mtime_ns, state.st_size))
     raise InputError(f"no format.toml for {name!r} in {folder or data_folder('templates')}")
 
 
@@ -157,6 +159,12 @@ def _file_name(value: Any) -> str:
     if PurePath(name).name != name or "\\" in name or name.startswith(".") or name.lower() in OWN_FILES:
         raise ValueError(f"a plain file name without folder, other than {', '.join(OWN_FILES)}, is expected")
     return name
+
+
+@lru_cache(maxsize=64)
+def _known_format(path: Path, name: str, _state: tuple[int, int]) -> Format:
+    """Read a card once for as long as time and size of its file stay: every run looks at the cards of all controls."""
+    return _read_format(path, name)
 
 
 def _read_format(path: Path, name: str) -> Format:
@@ -208,7 +216,9 @@ class _Bounded(ImmutableSandboxedEnvironment):
         return super().call_binop(context, operator, left, right)
 
 
-def _environment(folders: Sequence[Path]) -> ImmutableSandboxedEnvironment:
+@lru_cache(maxsize=32)
+def _environment(folders: tuple[Path, ...]) -> ImmutableSandboxedEnvironment:
+    """Return the environment of some folders; it is kept with its compiled templates, and reads those that changed again."""
     environment = _Bounded(
         loader=ChoiceLoader([FileSystemLoader(folder) for folder in folders]),
         undefined=StrictUndefined,
@@ -249,7 +259,7 @@ def render(card: Format, template: str, context: Mapping[str, Any], folder: Path
     """
     folders = template_folders(card.name, folder)
     try:
-        page = _environment(folders).get_template(f"{card.name}/{template}")
+        page = _environment(tuple(folders)).get_template(f"{card.name}/{template}")
         with _ended_after(LONGEST_S):
             # An endless template is stopped as soon as the page is too long.
             parts = page.generate({**{key: _inert(value) for key, value in context.items()}, "format": card})

@@ -6,8 +6,10 @@ contains what a first-order model leaves out, e.g. the 4 um over a metre that co
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -86,7 +88,7 @@ class Projector:
         return np.asarray((self.transform @ solution[: self.transform.shape[1]]).T)
 
     def field(self, values: FloatArray, position_mm: FloatArray | None = None) -> FloatArray:
-        """Return the correction field of table values at the sample points or at others, shape (n, 3), mm."""
+        """Return the correction field of table values at the sample points or at others, see :func:`basis_field`."""
         if position_mm is None:
             return basis_field(self.basis, values, self.position_mm, self.sample_tool_mm)
         return basis_field(self.basis, values, position_mm, self.tool_mm)
@@ -105,11 +107,17 @@ def placed_terms(basis: Sequence[Term]) -> Iterator[tuple[Term, slice]]:
 
 
 def basis_field(basis: Sequence[Term], values: FloatArray, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
-    """Return the correction field of a basis with the given values (all terms in a row) at points (n, 3)."""
-    field = np.zeros((len(position_mm), 3))
+    """Return the correction field of a basis at points (n, 3), shape (n, 3), mm.
+
+    ``values`` are those of all terms in a row; several rows (k, parameters) give as many fields (k, n, 3).
+    """
+    rows = np.atleast_2d(values)
+    fields = np.zeros((len(rows), len(position_mm), 3))
     for term, place in placed_terms(basis):
-        field += term.carrier_field(position_mm, tool_mm) * term.curve(values[place], position_mm)[:, None]
-    return field
+        carrier = term.carrier_field(position_mm, tool_mm)
+        for one, row in zip(fields, rows, strict=True):
+            one += carrier * term.curve(row[place], position_mm)[:, None]
+    return fields if values.ndim == 2 else np.asarray(fields[0])
 
 
 def _design(basis: Sequence[Term], position_mm: FloatArray, tool_mm: FloatArray) -> csr_array:
@@ -145,6 +153,29 @@ def projector(
     anchored : True if a constant offset per axis is no part of what the control can do.
     tools_mm : every point is sampled with each of these tool offsets; by default with the machine's own.
     """
+    volume = (machine.axes[0].range_mm, machine.axes[1].range_mm, machine.axes[2].range_mm, machine.emphasis)
+    about_terms = [(term.name, term.axis, term.carrier, term.zero_at_mm, term.keep_mm, term.zeros_mm) for term in basis]
+    about = pickle.dumps((volume, machine.tool_offset_mm, about_terms, anchored, tools_mm))
+    nodes = tuple(np.asarray(term.nodes_mm, dtype=np.float64).tobytes() for term in basis)
+    found = _factorised(_Problem((about, *nodes), machine, tuple(basis), anchored, tuple(tools_mm)))
+    return replace(found, basis=tuple(basis))
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """A least-squares problem; two are the same if the volume and the tables are, whatever values the tables hold."""
+
+    key: tuple[bytes, ...]
+    machine: Machine = field(compare=False)
+    basis: tuple[Term, ...] = field(compare=False)
+    anchored: bool = field(compare=False)
+    tools_mm: tuple[Vector3, ...] = field(compare=False)
+
+
+@lru_cache(maxsize=4)
+def _factorised(problem: _Problem) -> Projector:
+    """Factorise once what an export, its verification and the next measurement of the machine have in common."""
+    machine, basis, tools_mm = problem.machine, problem.basis, problem.tools_mm
     nodes = tuple(
         np.unique(np.concatenate([[low, high], *(term.nodes_mm for term in basis if term.axis == axis)]))
         for axis, (low, high) in enumerate(item.range_mm for item in machine.axes)
@@ -156,7 +187,7 @@ def projector(
         tool_mm = np.repeat(np.array(tools_mm, dtype=np.float64), len(position_mm), axis=0)
         position_mm, weight = np.tile(position_mm, (len(tools_mm), 1)), np.tile(weight, len(tools_mm))
     transform = _transform(machine, basis)
-    offsets = 3 if anchored else 0
+    offsets = 3 if problem.anchored else 0
     size = transform.shape[1] + offsets
     design = _design(basis, position_mm, tool_mm) @ transform
     if offsets:
@@ -172,7 +203,7 @@ def projector(
     regular[: transform.shape[1], : transform.shape[1]] += KEEP * rows.T @ rows
     factor = cho_factor(normal * scale[:, None] * scale + regular, lower=True)
     sampled = (position_mm, weight, own_tool_mm, tool_mm)
-    return Projector(tuple(basis), *sampled, transform, offsets, design, factor, scale)
+    return Projector(basis, *sampled, transform, offsets, design, factor, scale)
 
 
 def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
