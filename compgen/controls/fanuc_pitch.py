@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from compgen.controls.fanuc_pitch_tables import (
     AT_REFERENCE,
+    DIRECTIONS,
     INTERVAL,
     MOST_MISSED,
     NEGATIVE_FIRST,
@@ -30,7 +30,7 @@ from compgen.controls.fanuc_pitch_tables import (
     shortfall_text,
 )
 from compgen.controls.fanuc_records import PointGrid, Punched, Sample, as_sample
-from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis, plan_contradictions
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controls.shared.grids import (
     EquidistantGrid,
     common_step,
@@ -75,13 +75,17 @@ def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, ax
     if asked_mm is not None:
         return equidistant_grid(machine, errors, axis, most=most, step_mm=asked_mm, anchor=True)
     nodes_mm = curve_nodes_mm(machine, errors, axis, most)
-    wanted_mm = _wanted_mm(machine, errors, axis, nodes_mm)
+    # its own positioning error, and angular errors as they act in the middle of the volume
+    (term,) = one_dimensional_terms(machine, errors, [nodes_mm] * 3, [(axis, axis)])
+    wanted_mm = term.start
     loss_mm = max(worth_mm(errors, axis, settings.loss_mm), NEGLIGIBLE_COUNTS * settings.count_mm(axis))
     flat: list[tuple[float, EquidistantGrid]] = []
     grids = _grids(machine, settings, errors, axis, most)
     for grid in grids:
         at_ends_mm = _extended(grid.nodes_mm, nodes_mm, wanted_mm)
-        if _is_flat(settings, axis, at_ends_mm):
+        largest = float(np.max(np.abs(np.diff(at_ends_mm)))) / settings.count_mm(axis)
+        staircase = settings.interpolation == "staircase"
+        if largest <= 1.0 if staircase else STEEPER * largest + 1.0 <= settings.increment_limit:
             lost_mm = float(np.max(np.abs(np.interp(nodes_mm, grid.nodes_mm, at_ends_mm) - wanted_mm)))
             flat.append((lost_mm, grid))
             if lost_mm <= loss_mm:
@@ -109,26 +113,12 @@ def _grids(
     return [grid for grid in grids if grid.count <= most] or grids[:1]
 
 
-def _wanted_mm(machine: Machine, errors: ErrorTable, axis: int, nodes_mm: FloatArray) -> FloatArray:
-    """Correction of the axis by its own positioning error and by angular errors mid-volume, at nodes (n,), mm."""
-    (term,) = one_dimensional_terms(machine, errors, [nodes_mm] * 3, [(axis, axis)])
-    return term.start
-
-
 def _step_mm(machine: Machine, settings: PitchSettings, axis: int, intervals: int) -> float:
     """Travel over ``intervals``, rounded up to what can be written, not below the least interval."""
     quantum = settings.interval_quantum_mm
     length = max(machine.axes[axis].length_mm / intervals, settings.least_interval_mm)
     steps = Decimal(repr(round(length, 9))) / quantum
     return float(max(Decimal(1), steps.to_integral_value(rounding=ROUND_CEILING)) * quantum)
-
-
-def _is_flat(settings: PitchSettings, axis: int, at_ends_mm: FloatArray) -> bool:
-    """Whether the increments of a correction at the section ends (n,), with a margin, stay within the limit."""
-    largest = float(np.max(np.abs(np.diff(at_ends_mm)))) / settings.count_mm(axis)
-    if settings.interpolation == "staircase":
-        return largest <= 1.0
-    return STEEPER * largest + 1.0 <= settings.increment_limit
 
 
 def _extended(position_mm: FloatArray, nodes_mm: FloatArray, value: FloatArray) -> FloatArray:
@@ -152,12 +142,6 @@ Span = tuple[int, int]
 def reference_node(machine: Machine, axis: int, nodes_mm: FloatArray) -> int:
     """Return the index of the section end at the reference point."""
     return int(np.argmin(np.abs(nodes_mm - machine.reference_point_mm[axis])))
-
-
-def _renumbered(shortfall: PitchShortfall, block: PitchBlock | None) -> PitchShortfall:
-    """Point numbers in place of the sections' counts, which begin with 0."""
-    assert block is not None
-    return replace(shortfall, sections=tuple(int(block.curve_numbers[k + 1]) for k in shortfall.sections))
 
 
 def _block(
@@ -296,6 +280,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
     settings_class = PitchSettings
     anchored = True
     bidirectional = True
+    has_plan = True
     sample_setting = "style_from"
 
     @classmethod
@@ -310,7 +295,16 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> PitchTables:
         """Find the best whole cumulative curves within the limit, and give the axes consecutive point numbers."""
-        return self._tables_of(self._wanted_curves(basis, values))
+        terms = {term.name: term for term in basis}
+        wanted: list[RequestedPitch | None] = [None, None, None]
+        for axis in range(3):
+            name = one_dimensional_name(axis, axis)
+            if name in terms:
+                nodes_mm, curve = terms[name].nodes_mm, np.asarray(values[name], dtype=np.float64)
+                below = reference_node(self.machine, axis, nodes_mm)
+                counts = self.settings.sign * (curve - curve[below]) / self.settings.count_mm(axis)
+                wanted[axis] = RequestedPitch(nodes_mm, counts)
+        return self._tables_of(wanted)
 
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
         """Return the reversal of each axis along itself if ``bidirectional`` is set, else none."""
@@ -325,8 +319,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         """Return the context beyond the common one; ``plan`` holds point number -> value for a binary transfer."""
         settings = self.settings
         present = [(axis, block) for axis, block in enumerate(tables.blocks) if block is not None]
-        records = self._records(present)
-        punched = self._punched(present)
+        separate = settings.sample.points_style is not None
         points = {number: value for _, block in present for number, value in block.points()}
         return {
             "sign_statement": self._sign_statement(),
@@ -337,18 +330,16 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             ],
             "tables": [self._summary(axis, block) for axis, block in present],
             "style": settings,
-            "records": records,
-            "file": punched,
-            "parameter_file": self._parameter_file(present),
-            "container": "separate" if settings.sample.points_style is not None else "one file",
-            "separate": settings.sample.points_style is not None,
+            "file": self._punched(present),
+            "parameter_file": Punched(settings.style.file(self._parameter_records(present), [])) if separate else None,
+            "container": "separate" if separate else "one file",
+            "separate": separate,
             "overwrites": self._overwrites(present),
             "has_sample": settings.sample.shows_points,
             "style_notes": list(settings.sample.notes),
             "bidirectional": settings.bidirectional,
-            "points": [{"number": settings.number_base + number, "value": value} for number, value in points.items()],
             "plan": {
-                "parameters": {record["number"]: {a["axis"]: a["value"] for a in record["axes"]} for record in records},
+                "parameters": self._parameters(present),
                 "points": points,
                 "value_type": settings.value_type,
                 "bidirectional": settings.bidirectional,
@@ -362,14 +353,6 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         """Read parameters 3620 ... 3624 and the points they name; a ``.json`` plan is passed over."""
         return parse_pitch(self.settings, files)
 
-    def contradictions(self, tables: PitchTables, files: Sequence[SourceFile]) -> list[str]:
-        """Say where a plan beside the text differs from it."""
-        return plan_contradictions(files, lambda: self.context(tables)["plan"])
-
-    def remarks(self, tables: PitchTables, files: Sequence[SourceFile]) -> list[str]:
-        """Say which unit was assumed, which axes were kept apart, and how many records were passed over."""
-        return list(tables.remarks)
-
     def emulate(self, tables: PitchTables, points: Points) -> FloatArray:
         """Return sign * count * A at each point, A held beyond the first and the last section end."""
         added = np.zeros((len(points), 3))
@@ -379,9 +362,13 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
                 continue
             along = points.position_mm[:, axis] - self.machine.reference_point_mm[axis]
             count_mm = block.magnification * self.settings.detection_unit_um * MM_PER_UM
-            up, down = (
-                self._output(block, curve, along) for curve in block.curves(self.settings.reference_return[axis])
-            )
+            curves = block.curves(self.settings.reference_return[axis])
+            if self.settings.interpolation == "linear":
+                up, down = (np.interp(along, block.curve_mm, curve) for curve in curves)
+            else:  # a section's value is put out at its beginning: A[n] for ((n-1-ref) d, (n-ref) d]
+                section = np.ceil(along / float(block.interval_mm) - 1e-9) + block.reference
+                inside = np.clip(section, block.curve_numbers[0], block.last).astype(np.int64)
+                up, down = (curve[inside - block.curve_numbers[0]].astype(np.float64) for curve in curves)
             travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, axis])
             counts = np.where(travel > 0, up, np.where(travel < 0, down, 0.5 * (up + down)))
             added[:, axis] = self.settings.sign * count_mm * counts
@@ -439,27 +426,8 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         """Return half a count: the bound of :mod:`compgen.controls.shared.integers` where the limit does not bind."""
         return 0.5 * max(self.settings.count_mm(axis) for axis in range(3))
 
-    def _wanted_curves(
-        self, basis: Sequence[Term], values: Mapping[str, FloatArray]
-    ) -> tuple[RequestedPitch | None, RequestedPitch | None, RequestedPitch | None]:
-        """Return for X, Y, Z the wanted cumulative curve at the section ends in counts, zero at the reference point."""
-        terms = {term.name: term for term in basis}
-        found: list[RequestedPitch | None] = [None, None, None]
-        for axis in range(3):
-            name = one_dimensional_name(axis, axis)
-            if name in terms:
-                nodes_mm = terms[name].nodes_mm
-                curve = np.asarray(values[name], dtype=np.float64)
-                below = reference_node(self.machine, axis, nodes_mm)
-                found[axis] = RequestedPitch(
-                    nodes_mm, self.settings.sign * (curve - curve[below]) / self.settings.count_mm(axis)
-                )
-        return found[0], found[1], found[2]
-
     def _tables_of(
-        self,
-        wanted: tuple[RequestedPitch | None, RequestedPitch | None, RequestedPitch | None],
-        reversal: ReversalCurves | None = None,
+        self, wanted: Sequence[RequestedPitch | None], reversal: ReversalCurves | None = None
     ) -> PitchTables:
         """Return the best whole tables for wanted curves, with the reversal of each axis along itself, and their numbers."""
         blocks: list[PitchBlock | None] = [None, None, None]
@@ -469,32 +437,43 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
                 blocks[axis], limited = _block(self.machine, self.settings, axis, curve, reversal)
                 shortfalls += limited
         placed = _placed(self.settings, blocks)
-        numbered = [_renumbered(item, placed[item.axis]) for item in shortfalls]
-        return PitchTables((placed[0], placed[1], placed[2]), shortfalls=tuple(numbered), wanted=wanted)
+        numbered = []
+        for item in shortfalls:  # their sections count from 0, those of the control from the first point number
+            numbers = placed[item.axis].curve_numbers  # type: ignore[union-attr]
+            numbered.append(replace(item, sections=tuple(int(numbers[k + 1]) for k in item.sections)))
+        return PitchTables(tuple(placed), shortfalls=tuple(numbered), wanted=tuple(wanted))
 
-    def _interval_text(self, interval_mm: Decimal) -> str:
-        """Interval as it is written, e.g. ``50.0``, or a whole number of the machine file's unit."""
-        real = self.settings.style.real_point
-        return self.settings.style.length(interval_mm if real else interval_mm / self.settings.interval_quantum_mm)
+    def _values_of(self, block: PitchBlock) -> dict[int, str]:
+        """Parameter number -> value as text for one axis."""
+        settings, whole = self.settings, self.settings.style.whole
+        # without a decimal point the interval counts in the unit that the machine file states
+        unit = Decimal(1) if settings.style.real_point else settings.interval_quantum_mm
+        found = dict(
+            zip(
+                PARAMETERS,
+                (
+                    *map(whole, (block.reference, block.first, block.last, block.magnification)),
+                    settings.style.length(block.interval_mm / unit),
+                ),
+                strict=True,
+            )
+        )
+        if settings.bidirectional:
+            found |= {NEGATIVE_FIRST: whole(block.negative_first), AT_REFERENCE: whole(block.at_reference)}
+        return found
 
-    def _parameter_values(self, block: PitchBlock) -> tuple[str, ...]:
-        whole = self.settings.style.whole
-        numbers = (block.reference, block.first, block.last, block.magnification)
-        found = (*map(whole, numbers), self._interval_text(block.interval_mm))
+    def _parameters(self, present: list[tuple[int, PitchBlock]]) -> dict[int, dict[int, str]]:
+        """Parameter number -> axis number, ascending -> value as text."""
+        columns = sorted((self.settings.axis_numbers[axis], self._values_of(block)) for axis, block in present)
         return (
-            (*found, whole(block.negative_first), whole(block.at_reference)) if self.settings.bidirectional else found
+            {number: {axis: values[number] for axis, values in columns} for number in columns[0][1]} if columns else {}
         )
 
-    def _numbers(self) -> tuple[int, ...]:
-        return (*PARAMETERS, NEGATIVE_FIRST, AT_REFERENCE) if self.settings.bidirectional else PARAMETERS
-
     def _parameter_records(self, present: list[tuple[int, PitchBlock]]) -> list[str]:
-        style, parameters = self.settings.style, []
-        columns = [(self.settings.axis_numbers[axis], self._parameter_values(block)) for axis, block in present]
-        for k, number in enumerate(self._numbers()):
-            letter = style.real_letter if number == INTERVAL else "P"
-            parameters += style.parameter(number, [(axis, values[k]) for axis, values in columns], letter)
-        return parameters if present else []
+        style, records = self.settings.style, []
+        for number, values in self._parameters(present).items():
+            records += style.parameter(number, values.items(), style.real_letter if number == INTERVAL else "P")
+        return records
 
     def _punched(self, present: list[tuple[int, PitchBlock]]) -> Punched:
         """Text of the file in its style: parameters by number unless they have a file of their own, points by number."""
@@ -505,12 +484,6 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         if separate is not None:
             return Punched(separate.file([], points))
         return Punched(style.file(self._parameter_records(present), points))
-
-    def _parameter_file(self, present: list[tuple[int, PitchBlock]]) -> Punched | None:
-        """Text of the file of the parameters, where the sample has parameters and points in files of their own."""
-        if self.settings.sample.points_style is None:
-            return None
-        return Punched(self.settings.style.file(self._parameter_records(present), []))
 
     def _overwrites(self, present: list[tuple[int, PitchBlock]]) -> list[str]:
         """Say what the files overwrite, other axes first."""
@@ -541,11 +514,11 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             ]
         for axis, block in present:
             number, name = settings.axis_numbers[axis], f"{AXES[axis]} (A{settings.axis_numbers[axis]})"
-            values = zip(self._numbers(), self._parameter_values(block), strict=True)
+            values = self._values_of(block).items()
             found.append(f"Parameters of {name}: " + ", ".join(_change(sample, p, number, text) for p, text in values))
             spans = [(block.first, block.last)]
             if block.negative:
-                spans.append((block.negative_first, block.negative_first + len(block.negative) - 1))
+                spans.append((block.negative_first, block.negative_last))
             texts = [
                 f"{low} to {high} (N{settings.number_base + low} to N{settings.number_base + high})"
                 for low, high in spans
@@ -556,22 +529,19 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             found.append(f"Points of {name}: {' and '.join(texts)}{told}")
         return found
 
-    def _records(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, Any]]:
-        """Parameters 3620 ... in order, each with its axes in ascending axis number, values as text."""
-        columns = sorted((self.settings.axis_numbers[axis], self._parameter_values(block)) for axis, block in present)
-        return [
-            {"number": parameter, "axes": [{"axis": number, "value": values[k]} for number, values in columns]}
-            for k, parameter in enumerate(self._numbers())
-        ]
-
     def _preflight_parameters(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:
         settings = self.settings
         rows = [
             {"name": f"{number} ({AXES[axis]}, A{settings.axis_numbers[axis]})", "value": value, "meaning": meaning}
             for axis, block in present
-            for number, value, meaning in zip(self._numbers(), self._parameter_values(block), MEANINGS, strict=False)
+            for (number, value), meaning in zip(self._values_of(block).items(), MEANINGS, strict=False)
         ]
-        linear = settings.interpolation == "linear"
+        bits = [
+            f"{AXES[axis]} {text}"
+            for axis, _ in present
+            if (text := settings.sample.bits(DIRECTIONS, settings.axis_numbers[axis])) is not None
+        ]
+        shown = f"; the sample has {', '.join(bits)} (bit 7 first)" if bits else ""
         rows += [
             {
                 "name": "3605#0",
@@ -585,23 +555,13 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             },
             {
                 "name": "3605, interpolated type",
-                "value": "on" if linear else "off",
+                "value": "on" if settings.interpolation == "linear" else "off",
                 "meaning": f"interpolated pitch compensation; the files were checked as {settings.interpolation}. "
                 "Bit 1 is set on a 30i that was seen, bit 2 (IPP) is remembered: read the parameter manual, and leave the bits "
-                "as the backup has them" + self._bits_of_sample(present),
+                f"as the backup has them{shown}",
             },
         ]
         return rows + (self._directional_rows(present) if settings.bidirectional else [])
-
-    def _bits_of_sample(self, present: list[tuple[int, PitchBlock]]) -> str:
-        """3605 of the axes in the sample, in words."""
-        numbers = [(AXES[axis], self.settings.axis_numbers[axis]) for axis, _ in present]
-        found = [
-            f"{name} {bits}"
-            for name, number in numbers
-            if (bits := self.settings.sample.bits(3605, number)) is not None
-        ]
-        return f"; the sample has {', '.join(found)} (bit 7 first)" if found else ""
 
     def _directional_rows(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:
         """Reference return as the tables take it, and backlash, which the tables of both directions hold already."""
@@ -638,20 +598,18 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         count_um, other = settings.count_mm(0) / MM_PER_UM, ""
         if len(set(settings.magnifications)) > 1:
             other = " of X; " + ", ".join(f"{settings.count_mm(k) / MM_PER_UM:g} um of {AXES[k]}" for k in (1, 2))
-        return (
+        text = (
             f"The numbers are {stored}; one count is {count_um:g} um{other} (magnification "
             f"{', '.join(map(str, dict.fromkeys(settings.magnifications)))} times detection unit "
             f"{settings.detection_unit_um:g} um). {kind}. An X axis that travels {2 * count_um:g} um too "
             f"short over a section in the positive direction gets {2 * settings.sign:+d} there."
-            + (self._directional_statement() if settings.bidirectional else "")
         )
-
-    def _directional_statement(self) -> str:
-        settings = self.settings
+        if not settings.bidirectional:
+            return text
         return (
-            " Points from 3621 to 3622 act in travel in positive direction, as many from 3626 on in negative direction, their "
-            "values seen in the positive direction as well. With a reference return in positive direction an axis that stops "
-            f"{settings.count_mm(0) / MM_PER_UM:g} um farther after positive than after negative travel gets "
+            f"{text} Points from 3621 to 3622 act in travel in positive direction, as many from 3626 on in negative direction, "
+            "their values seen in the positive direction as well. With a reference return in positive direction an axis that "
+            f"stops {settings.count_mm(0) / MM_PER_UM:g} um farther after positive than after negative travel gets "
             f"{settings.sign:+d} in 3627."
         )
 
@@ -703,7 +661,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             "largest_step": max(int(np.max(np.abs(np.diff(curve)), initial=0)) for curve in curves),
             "largest_sum": max(int(np.max(np.abs(curve))) for curve in curves),
             "negative_first": block.negative_first,
-            "negative_last": block.negative_first + len(block.negative) - 1,
+            "negative_last": block.negative_last,
             "at_reference": block.at_reference,
         }
 
@@ -727,16 +685,3 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             "short_mm": float(block.interval_mm) - 2 * settings.count_mm(axis),
             "short_counts": 2 * settings.sign,
         }
-
-    def _output(self, block: PitchBlock, curve: NDArray[np.int64], along_mm: FloatArray) -> FloatArray:
-        """Counts of a cumulative curve (m,) at positions (n,) from the reference point, shape (n,)."""
-        if self.settings.interpolation == "linear":
-            return np.interp(along_mm, block.curve_mm, curve)
-        return _staircase(block, curve, along_mm).astype(np.float64)
-
-
-def _staircase(block: PitchBlock, curve: NDArray[np.int64], along_mm: FloatArray) -> NDArray[np.int64]:
-    """Curve where a section's value is put out at its beginning: A[n] for ((n-1-ref) d, (n-ref) d], shape (n,)."""
-    section = np.ceil(along_mm / float(block.interval_mm) - 1e-9) + block.reference
-    inside = np.clip(section, block.curve_numbers[0], block.last).astype(np.int64)
-    return np.asarray(curve[inside - block.curve_numbers[0]], dtype=np.int64)

@@ -274,6 +274,11 @@ class PitchBlock:
         return self.first + len(self.values) - 1
 
     @property
+    def negative_last(self) -> int:
+        """Last number for travel in negative direction."""
+        return self.negative_first + len(self.negative) - 1
+
+    @property
     def curve_numbers(self) -> NDArray[np.int64]:
         """Point numbers of the cumulative curve, shape (m,); its positions are (number - reference) intervals."""
         return np.arange(self.first if self.total else self.first - 1, self.last + 1)
@@ -334,13 +339,11 @@ class PitchTables:
     there are on the reading.
     """
 
-    blocks: tuple[PitchBlock | None, PitchBlock | None, PitchBlock | None]
+    blocks: tuple[PitchBlock | None, ...]
     others: tuple[tuple[int, int, int], ...] = ()
     turns: tuple[tuple[int, int], ...] = field(default=(), compare=False)
     shortfalls: tuple[PitchShortfall, ...] = field(default=(), compare=False)
-    wanted: tuple[RequestedPitch | None, RequestedPitch | None, RequestedPitch | None] = field(
-        default=(None, None, None), compare=False
-    )
+    wanted: tuple[RequestedPitch | None, ...] = field(default=(None, None, None), compare=False)
     remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
@@ -358,52 +361,28 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
     if not texts:
         raise InputError("no FANUC text file is given; PITCH.TXT (or a file punched from the control) is needed")
     found, points = PunchedRecords(settings.sample.style.path or 1), PointRecords()
-    for file in texts:
-        for record in read_records(file):
-            _sort_in(record, settings.number_base, found, points)
+    base, known = settings.number_base, (*AXIS_PARAMETERS, UNIT_PARAMETER, TOTAL_PARAMETER)
+    for record in (record for file in texts for record in read_records(file)):
+        kind = type_word(record, record.words())[0]
+        # a parameter may have the number of a point: what it is shows when the points of a block are looked at
+        if 0 <= record.number - base <= MOST_NUMBER and kind != 1:
+            points.setdefault(record.number - base, []).append(record)
+        elif record.number not in known:
+            found.passed_over += 1
+        if record.number in known and not (base < 10000 and kind == 0):
+            found.take(record, is_point=False)
     found.check_metric()
     if not settings.total:
         check_increments(found.common)
-    parameters = found.axes
-    _check_directions(settings, parameters)
-    blocks = [_block(settings, texts[0], axis, parameters, points) for axis in range(3)]
+    blocks = tuple(_block(settings, texts[0], axis, found.axes, points) for axis in range(3))
     if not any(blocks):
         numbers = ", ".join(f"A{number}" for number in settings.axis_numbers)
         raise texts[0].fail(f"holds none of the parameters 3620 to 3624 for the axes {numbers}; punch them as well")
-    others = _others(settings, parameters)
-    turns = _turns(settings, others, parameters, points)
-    return PitchTables(
-        (blocks[0], blocks[1], blocks[2]), others, turns, remarks=_remarks(settings, found, others, points)
-    )
+    others, turns = _other_axes(settings, found.axes, points)
+    return PitchTables(blocks, others, turns, remarks=_remarks(settings, found, others))
 
 
-def _sort_in(record: Record, base: int, found: PunchedRecords, points: PointRecords) -> None:
-    """Put a record where it belongs: among the points (a parameter of the same number is told later), or parameters."""
-    point, parameter = record.number - base, record.number in (*AXIS_PARAMETERS, UNIT_PARAMETER, TOTAL_PARAMETER)
-    kind = type_word(record, record.words())[0]
-    if 0 <= point <= MOST_NUMBER and kind != 1:
-        points.setdefault(point, []).append(record)
-    elif not parameter:
-        found.passed_over += 1
-    if parameter and not (base < 10000 and kind == 0):
-        found.take(record, is_point=False)
-
-
-def _check_directions(settings: PitchSettings, parameters: Parameters) -> None:
-    """Refuse a file whose 3605#0 says otherwise than ``bidirectional``: half of its tables would be read wrongly."""
-    for letter, number in zip(AXES, settings.axis_numbers, strict=True):
-        text, record = parameters.get((DIRECTIONS, number), ("", None))
-        if record is not None and text.endswith("1") != settings.bidirectional:
-            word = "true" if text.endswith("1") else "false"
-            raise record.fail(
-                f"bit 0 of {letter} (A{number}) is {text[-1:]}: set bidirectional = {word} in [controllers.fanuc-pitch] to "
-                f"read this file"
-            )
-
-
-def _remarks(
-    settings: PitchSettings, found: PunchedRecords, others: Sequence[tuple[int, int, int]], points: PointRecords
-) -> tuple[str, ...]:
+def _remarks(settings: PitchSettings, found: PunchedRecords, others: Sequence[tuple[int, int, int]]) -> tuple[str, ...]:
     """Say what was assumed of the unit, which axes are kept apart, and how many records were passed over."""
     said = [found.unit_remark(settings.detection_unit_um)]
     for axis, first, last in others:
@@ -427,25 +406,17 @@ def _remarks(
     return tuple(said)
 
 
-def _point_values(settings: PitchSettings, records: Sequence[Record]) -> list[tuple[int, Record]]:
-    """Values of the records that are pitch data: of type Q0, or without type and axis word.
-
-    A parameter of the same number has the type word Q1 or axis words.
-    """
-    found = []
-    for record in records:
-        kind, words = type_word(record, record.words())
-        if kind == 0 or (kind is None and settings.number_base >= 10000 and not any(w[0] in "AS" for w in words)):
-            if len(words) != 1 or words[0][0] != "P":
-                raise record.fail("expected a single value word P for a compensation point, e.g. P-2")
-            found.append((record.whole(words[0][1], -10 * MOST_TOTAL, 10 * MOST_TOTAL), record))
-    return found
-
-
 def _block(
     settings: PitchSettings, file: SourceFile, axis: int, parameters: Parameters, points: PointRecords
 ) -> PitchBlock | None:
     number = settings.axis_numbers[axis]
+    bits, record = parameters.get((DIRECTIONS, number), ("", None))
+    if record is not None and bits.endswith("1") != settings.bidirectional:  # half of the tables would be read wrongly
+        word = "true" if bits.endswith("1") else "false"
+        raise record.fail(
+            f"bit 0 of {AXES[axis]} (A{number}) is {bits[-1:]}: set bidirectional = {word} in [controllers.fanuc-pitch] to "
+            f"read this file"
+        )
     needed = (*PARAMETERS, NEGATIVE_FIRST, AT_REFERENCE) if settings.bidirectional else PARAMETERS
     missing = [str(parameter) for parameter in needed if (parameter, number) not in parameters]
     if set(map(str, PARAMETERS)) <= set(missing):
@@ -485,14 +456,23 @@ def _block(
 
 
 def _values(settings: PitchSettings, span: tuple[int, int], who: Record, points: PointRecords) -> tuple[int, ...]:
-    """Values of the points from ``span[0]`` to ``span[1]``, each of which must be there once."""
+    """Values of the points from ``span[0]`` to ``span[1]``, each of which must be there once.
+
+    A record is pitch data if it is of type Q0, or without type and axis word; a parameter of the same number has them.
+    """
     values, absent = [], []
     for number in range(span[0], span[1] + 1):
-        found = _point_values(settings, points.get(number, ()))
+        found: list[tuple[str, Record]] = []
+        for record in points.get(number, ()):
+            kind, words = type_word(record, record.words())
+            if kind == 0 or (kind is None and settings.number_base >= 10000 and not any(w[0] in "AS" for w in words)):
+                if len(words) != 1 or words[0][0] != "P":
+                    raise record.fail("expected a single value word P for a compensation point, e.g. P-2")
+                found.append((words[0][1], record))
         if len(found) > 1:
             first = found[0][1]
             raise found[1][1].fail(f"is given a second time (first in {first.file.path}:{first.line})")
-        values += [value for value, _ in found]
+        values += [record.whole(text, -10 * MOST_TOTAL, 10 * MOST_TOTAL) for text, record in found]
         absent += [] if found else [number]
     if absent:
         some = ", ".join(map(str, absent[:5])) + (", ..." if len(absent) > 5 else "")
@@ -500,33 +480,29 @@ def _values(settings: PitchSettings, span: tuple[int, int], who: Record, points:
     return tuple(values)
 
 
-def _others(settings: PitchSettings, parameters: Parameters) -> tuple[tuple[int, int, int], ...]:
-    """Blocks of axes other than X, Y, Z that are switched on (magnification above zero)."""
-    found = []
+def _other_axes(
+    settings: PitchSettings, parameters: Parameters, points: PointRecords
+) -> tuple[tuple[tuple[int, int, int], ...], tuple[tuple[int, int], ...]]:
+    """Blocks of axes other than X, Y, Z that are switched on (magnification above zero), and sums over a revolution.
+
+    A sum is that of a rotary axis whose numbers span its travel per revolution (3625). Source: Series 0i-PB parameter
+    manual B-63980EN/01, p. 100: the numbers go from the reference point's to it plus travel per revolution over interval;
+    the values behind the first must sum to zero.
+    """
+    others, turns = [], []
     for axis in sorted({axis for _, axis in parameters} - set(settings.axis_numbers)):
         entries = [parameters.get((number, axis)) for number in (FARTHEST_NEGATIVE, FARTHEST_POSITIVE, MAGNIFICATION)]
         numbers = [record.whole(text, 0, MOST_NUMBER) for text, record in (entry for entry in entries if entry)]
-        if len(numbers) == 3 and numbers[2] > 0:
-            found.append((axis, numbers[0], numbers[1]))
-    return tuple(found)
-
-
-def _turns(
-    settings: PitchSettings, others: Sequence[tuple[int, int, int]], parameters: Parameters, points: PointRecords
-) -> tuple[tuple[int, int], ...]:
-    """Sum of the values over a revolution, of further axes whose numbers span their travel per revolution (3625).
-
-    Source: Series 0i-PB parameter manual B-63980EN/01, p. 100: the numbers go from the reference point's to it plus
-    travel per revolution over interval; the values behind the first must sum to zero.
-    """
-    found = []
-    for axis, first, last in others:
-        text, record = parameters.get((PER_TURN, axis), ("0", None))
+        if len(numbers) < 3 or not numbers[2]:
+            continue
+        first, last, _ = numbers
+        others.append((axis, first, last))
+        travel, record = parameters.get((PER_TURN, axis), ("0", None))
         interval = Decimal(parameters[INTERVAL, axis][0]) if (INTERVAL, axis) in parameters else Decimal(0)
         there = all(number in points for number in range(first + 1, last + 1))
-        if there and record is not None and interval > 0 and Decimal(text) == (last - first) * interval:
-            found.append((axis, sum(_values(settings, (first + 1, last), record, points))))
-    return tuple(found)
+        if there and record is not None and interval > 0 and Decimal(travel) == (last - first) * interval:
+            turns.append((axis, sum(_values(settings, (first + 1, last), record, points))))
+    return tuple(others), tuple(turns)
 
 
 # Limits of stored pitch error compensation: what tables break, how much of each limit they use.
@@ -553,7 +529,19 @@ def pitch_violations(machine: Machine, settings: PitchSettings, tables: PitchTab
                 f"the values of the rotary axis A{axis_number} sum to {total} counts over a revolution; they must sum to 0, "
                 f"else every revolution adds to the error"
             )
-    return messages + _overlaps(tables)
+    present = [(AXES[k], block) for k, block in enumerate(tables.blocks) if block is not None]
+    spans = [(name, block.first, block.last) for name, block in present]
+    spans += [
+        (f"{name} in negative travel", block.negative_first, block.negative_last)
+        for name, block in present
+        if block.negative
+    ]
+    spans += [(f"axis A{number}", first, last) for number, first, last in tables.others]
+    return messages + [
+        f"the compensation points of {a} ({a_first} to {a_last}) and {b} ({b_first} to {b_last}) overlap"
+        for (a, a_first, a_last), (b, b_first, b_last) in combinations(spans, 2)
+        if a_first <= b_last and b_first <= a_last
+    ]
 
 
 def shortfall_text(settings: PitchSettings, shortfall: PitchShortfall) -> str:
@@ -568,29 +556,6 @@ def shortfall_text(settings: PitchSettings, shortfall: PitchShortfall) -> str:
 
 
 def _block_violations(settings: PitchSettings, name: str, block: PitchBlock) -> list[str]:
-    messages = _value_violations(settings, name, block)
-    if block.last > settings.last_number:
-        messages.append(
-            f"{name}: the points {block.first} to {block.last} go beyond the last number {settings.last_number}"
-        )
-    if block.negative and block.negative_first + len(block.negative) - 1 > settings.negative_last_number:
-        messages.append(
-            f"{name}: the points for travel in negative direction, from {block.negative_first} on, go beyond the last "
-            f"number {settings.negative_last_number}"
-        )
-    if block.negative and block.magnification != 1:
-        messages.append(f"{name}: whether 3627 counts with the magnification {block.magnification} is not documented")
-    if block.magnification == 0:
-        messages.append(f"{name}: the magnification is 0, which switches the table off")
-    if float(block.interval_mm) < settings.least_interval_mm - 1e-9:
-        messages.append(
-            f"{name}: the interval {block.interval_mm:f} mm is shorter than the {settings.least_interval_mm:g} mm that "
-            f"{settings.max_feed_mm_min:g} mm/min need"
-        )
-    return messages
-
-
-def _value_violations(settings: PitchSettings, name: str, block: PitchBlock) -> list[str]:
     messages = []
     for curve, way in zip(block.curves(1), ("", " in negative travel"), strict=True):
         steps = np.abs(np.diff(curve))
@@ -605,22 +570,25 @@ def _value_violations(settings: PitchSettings, name: str, block: PitchBlock) -> 
         messages.append(f"{name}: a total value of {most} counts does not fit 16 bits ({MOST_TOTAL})")
     if block.total and block.values[block.reference - block.first] != 0:
         messages.append(f"{name}: the total value at the reference point {block.reference} must be 0")
+    if block.last > settings.last_number:
+        messages.append(
+            f"{name}: the points {block.first} to {block.last} go beyond the last number {settings.last_number}"
+        )
+    if block.negative and block.negative_last > settings.negative_last_number:
+        messages.append(
+            f"{name}: the points for travel in negative direction, from {block.negative_first} on, go beyond the last "
+            f"number {settings.negative_last_number}"
+        )
+    if block.negative and block.magnification != 1:
+        messages.append(f"{name}: whether 3627 counts with the magnification {block.magnification} is not documented")
+    if block.magnification == 0:
+        messages.append(f"{name}: the magnification is 0, which switches the table off")
+    if float(block.interval_mm) < settings.least_interval_mm - 1e-9:
+        messages.append(
+            f"{name}: the interval {block.interval_mm:f} mm is shorter than the {settings.least_interval_mm:g} mm that "
+            f"{settings.max_feed_mm_min:g} mm/min need"
+        )
     return messages
-
-
-def _overlaps(tables: PitchTables) -> list[str]:
-    spans = [(AXES[k], block.first, block.last) for k, block in enumerate(tables.blocks) if block is not None]
-    spans += [
-        (f"{AXES[k]} in negative travel", block.negative_first, block.negative_first + len(block.negative) - 1)
-        for k, block in enumerate(tables.blocks)
-        if block is not None and block.negative
-    ]
-    spans += [(f"axis A{number}", first, last) for number, first, last in tables.others]
-    return [
-        f"the compensation points of {a} ({a_first} to {a_last}) and {b} ({b_first} to {b_last}) overlap"
-        for (a, a_first, a_last), (b, b_first, b_last) in combinations(spans, 2)
-        if a_first <= b_last and b_first <= a_last
-    ]
 
 
 def pitch_usage(settings: PitchSettings, tables: PitchTables) -> list[Usage]:

@@ -144,6 +144,8 @@ class Controller(ABC, Generic[Settings, Tables]):
     at_axes: bool = False
     #: True if the correction is not the sum of the tables: the control moves the chain by finite rotations.
     finite_rotations: bool = False
+    #: True if a plan for a binary transfer (``plan`` of the context, a ``.json`` file) is written beside the text.
+    has_plan: bool = False
     #: Folder with the sub-folder of templates of a plug-in's control; None: the shipped templates.
     templates: Path | None = None
     #: Setting that names a file of the user's own control to follow: "style_from", "template_from", or None.
@@ -207,15 +209,15 @@ class Controller(ABC, Generic[Settings, Tables]):
 
     def contradictions(self, tables: Tables, files: Sequence[SourceFile]) -> list[str]:
         """Return where files that are not needed to read the tables (a plan for their transfer) say something else."""
-        return []
+        return plan_contradictions(files, lambda: self.context(tables)["plan"]) if self.has_plan else []
 
     def remarks(self, tables: Tables, files: Sequence[SourceFile]) -> list[str]:
         """Return what reading these files assumed, passed over, or kept apart (tables of other axes), in words.
 
         For a person who reads the backup of a control. Lines that could change a table and are not understood are not
-        a remark: ``parse`` refuses them.
+        a remark: ``parse`` refuses them. The default are the ``remarks`` of the tables, if they have any.
         """
-        return []
+        return list(getattr(tables, "remarks", ()))
 
     def keeping_others(self, tables: Tables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
         """Return settings with which an export keeps what these files of the user's control hold of other axes.
