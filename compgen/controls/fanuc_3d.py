@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
-from itertools import permutations
+from itertools import pairwise, permutations
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from compgen.controls.fanuc_records import (
     read_records,
     spacing_of,
     type_word,
+    whole_numbers_of,
     width_of,
 )
 from compgen.controls.shared.base import (
@@ -32,9 +33,9 @@ from compgen.controls.shared.base import (
     Usage,
     coverage_violations,
     nodes_by_axis,
-    plan_contradictions,
 )
 from compgen.controls.shared.grids import STEP_QUANTUM, EquidistantGrid, equidistant_grid, loss_setting, trilinear
+from compgen.controls.shared.scanner import check_size
 from compgen.controls.shared.terms import one_dimensional_terms, product_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
@@ -106,15 +107,7 @@ def volume_style_of(file: SourceFile) -> VolumeStyle:
             raise record.fail(f"does not follow N{before.number}; expected the records of one table, in their order")
     style = spacing_of(frame_of(file, records, data), data)
     texts = [text for record in data for letter, text in record.words() if letter in "PXYZ"]
-    padded = [text.lstrip("+-").rstrip(".") for text in texts]
-    style = replace(
-        style,
-        point_digits=width_of(data, 5),
-        digits=width_of(parameters, 5),
-        whole_point=all(text.endswith(".") for text in texts),
-        plus=any(text.startswith("+") for text in texts),
-        zeros=max((len(text) for text in padded if len(text) > 1 and text[0] == "0"), default=0),
-    )
+    style = replace(whole_numbers_of(style, texts), point_digits=width_of(data, 5), digits=width_of(parameters, 5))
     notes = (
         f"records of the form {FORMS[form]}, the first is N{data[0].number}, {len(data)} of them",
         f"parameters {'stand' if parameters else 'do not stand'} in the same file",
@@ -206,9 +199,9 @@ _KEY = re.compile(r"#\s{0,9}([a-z_]{1,40})\s{0,9}=\s{0,9}([^\s].{0,300})")
 class VolumeTable:
     """``counts`` (nx, ny, nz, 3) at the vertices of three grids in machine coordinates; one count per ``magnification``."""
 
-    grids: tuple[EquidistantGrid, EquidistantGrid, EquidistantGrid]
+    grids: tuple[EquidistantGrid, ...]
     counts: NDArray[np.int64]
-    magnification: tuple[int, int, int]
+    magnification: tuple[int, ...]
 
     def __eq__(self, other: object) -> bool:
         """Compare numbers by value."""
@@ -284,23 +277,6 @@ def _row(file: SourceFile, text: str, line: int) -> Row:
     return int(found[1]), (x, y, z), (p, q, r), line
 
 
-def _grid_of_positions(file: SourceFile, axis: int, positions: list[Decimal]) -> EquidistantGrid:
-    if len(positions) < 2:
-        raise file.fail(f"has one position of {AXES[axis]}; expected at least two")
-    step = positions[1] - positions[0]
-    if any(after - before != step for before, after in zip(positions, positions[1:], strict=False)):
-        raise file.fail(f"the positions of {AXES[axis]} are not evenly spaced")
-    return EquidistantGrid(positions[0], step, len(positions))
-
-
-def _magnification(file: SourceFile, keys: dict[str, tuple[str, int]]) -> tuple[int, int, int]:
-    text, line = keys.get("magnification", ("", None))
-    if not re.fullmatch(r"\d{1,3} \d{1,3} \d{1,3}", text):
-        raise file.fail("the line '# magnification = 1 1 1' (of X, Y and Z) is missing or wrong", line)
-    x, y, z = map(int, text.split())
-    return x, y, z
-
-
 # What the templates of three-dimensional compensation show: vertices, plan, what to set, worked numbers.
 
 
@@ -323,6 +299,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
     name = "fanuc-3d"
     settings_class = VolumeSettings
     anchored = True
+    has_plan = True
     sample_setting = "style_from"
 
     @classmethod
@@ -371,8 +348,14 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         count_mm = np.array([self.settings.count_mm(axis) for axis in range(3)])
         counts = np.floor(self.settings.sign * field / count_mm + 0.5).astype(np.int64)
         shape = (len(nodes[0]), len(nodes[1]), len(nodes[2]), 3)
-        grids = [self._grid_of_nodes(axis, nodes[axis]) for axis in range(3)]
-        return VolumeTable((grids[0], grids[1], grids[2]), counts.reshape(shape), self.settings.magnification)
+        grids = []
+        for axis, nodes_mm in enumerate(nodes):  # in exact decimals, the reference point one of the vertices
+            length = Decimal(repr(round(float(nodes_mm[-1] - nodes_mm[0]), 9)))
+            step = (length / (len(nodes_mm) - 1)).quantize(STEP_QUANTUM)
+            reference = self.machine.reference_point_mm[axis]
+            below = int(np.argmin(np.abs(nodes_mm - reference)))
+            grids.append(EquidistantGrid(Decimal(repr(reference)) - below * step, step, len(nodes_mm)))
+        return VolumeTable(tuple(grids), counts.reshape(shape), self.settings.magnification)
 
     def context(self, tables: VolumeTable) -> dict[str, Any]:
         """Return the vertices, the plan point number -> values, what to set, and the statement of the sign."""
@@ -451,10 +434,6 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             )
         return table
 
-    def contradictions(self, tables: VolumeTable, files: Sequence[SourceFile]) -> list[str]:
-        """Say where a plan beside the text differs from it."""
-        return plan_contradictions(files, lambda: self.context(tables)["plan"])
-
     def emulate(self, tables: VolumeTable, points: Points) -> FloatArray:
         """Return sign * count * trilinear value, that of the grid's surface outside."""
         count_mm = np.array(tables.magnification) * self.settings.count_mm(0) / self.settings.magnification[0]
@@ -509,10 +488,19 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return 0.5 * max(self.settings.count_mm(axis) for axis in range(3))
 
     def _read_csv(self, file: SourceFile) -> VolumeTable:
-        if len(file.text) > MOST_CHARACTERS:
-            raise file.fail(f"holds {len(file.text)} characters; that is no table (at most {MOST_CHARACTERS})")
+        check_size(file, MOST_CHARACTERS)
         keys, rows = _rows(file)
-        grids = tuple(_grid_of_positions(file, axis, sorted({row[1][axis] for row in rows})) for axis in range(3))
+        text, line = keys.get("magnification", ("", None))
+        if not re.fullmatch(r"\d{1,3} \d{1,3} \d{1,3}", text):
+            raise file.fail("the line '# magnification = 1 1 1' (of X, Y and Z) is missing or wrong", line)
+        grids = []
+        for axis, letter in enumerate(AXES):
+            nodes = sorted({row[1][axis] for row in rows})
+            if len(nodes) < 2:
+                raise file.fail(f"has one position of {letter}; expected at least two")
+            if any(after - before != nodes[1] - nodes[0] for before, after in pairwise(nodes)):
+                raise file.fail(f"the positions of {letter} are not evenly spaced")
+            grids.append(EquidistantGrid(nodes[0], nodes[1] - nodes[0], len(nodes)))
         shape = tuple(grid.count for grid in grids)
         if len(rows) != int(np.prod(shape)):
             raise file.fail(
@@ -529,7 +517,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
                     )
                 seen[what] = line
             counts[index] = values
-        table = VolumeTable((grids[0], grids[1], grids[2]), counts, _magnification(file, keys))
+        table = VolumeTable(tuple(grids), counts, tuple(map(int, text.split())))
         by_number = {row[0]: row for row in rows}
         for number, place in table.numbered(self.settings.order):
             due = tuple(grids[k].start + place[k] * grids[k].step for k in range(3))
@@ -587,9 +575,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             grids.append(EquidistantGrid(start, step, count))
             magnification.append(whole(10809 + axis, 1, 100))
         counts = np.zeros((*(grid.count for grid in grids), 3), dtype=np.int64)
-        return VolumeTable(
-            (grids[0], grids[1], grids[2]), counts, (magnification[0], magnification[1], magnification[2])
-        )
+        return VolumeTable(tuple(grids), counts, tuple(magnification))
 
     def _values(self, file: SourceFile, data: Sequence[Record]) -> list[list[int]]:
         """Three values of each point, in the order of the records' numbers."""
@@ -683,11 +669,3 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             "second": numbers[0, table.counts.shape[1] - 1, 0],
             "second_place": _place(table, (0, table.counts.shape[1] - 1, 0)).replace(",", ", "),
         }
-
-    def _grid_of_nodes(self, axis: int, nodes_mm: FloatArray) -> EquidistantGrid:
-        """Exact grid of nodes (n,), one of them at the reference point."""
-        length = Decimal(repr(round(float(nodes_mm[-1] - nodes_mm[0]), 9)))
-        step = (length / (len(nodes_mm) - 1)).quantize(STEP_QUANTUM)
-        reference = self.machine.reference_point_mm[axis]
-        below = int(np.argmin(np.abs(nodes_mm - reference)))
-        return EquidistantGrid(Decimal(repr(reference)) - below * step, step, len(nodes_mm))

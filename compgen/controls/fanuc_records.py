@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from compgen.controls.shared.base import SourceFile
+from compgen.controls.shared.scanner import check_size
 from compgen.data import toml_files
 from compgen.data.files import read_bytes
 from compgen.data.machine import Machine
@@ -73,8 +74,7 @@ class Record:
 
 def read_records(file: SourceFile) -> Iterator[Record]:
     """Yield the records between pairs of ``%``; InputError for anything else, and for a missing last ``%``."""
-    if len(file.text) > MOST_CHARACTERS:
-        raise file.fail(f"holds {len(file.text)} characters; that is no parameter file (at most {MOST_CHARACTERS})")
+    check_size(file, MOST_CHARACTERS)
     lines = file.text.split("\n" if "\n" in file.text else "\r")
     inside, marks, blocks = False, 0, 0
     for number, line in enumerate(lines, start=1):
@@ -86,26 +86,26 @@ def read_records(file: SourceFile) -> Iterator[Record]:
             elif block:
                 blocks += 1
                 if blocks > MOST_BLOCKS:
-                    raise file.fail(f"holds more than {MOST_BLOCKS} blocks; that is no parameter file", number)
-                yield _record(file, block, number, inside)
+                    raise file.fail(f"has more than {MOST_BLOCKS} blocks; a parameter file has fewer", number)
+                if not inside:
+                    raise file.fail(f"{one_line(block[:20])!r} is outside the pair of '%'", number)
+                if len(block) > MOST_IN_BLOCK:
+                    raise file.fail(
+                        f"this block has {len(block)} characters; at most {MOST_IN_BLOCK} are possible", number
+                    )
+                found = _RECORD.match(block)
+                if found is None:
+                    message = f"{one_line(block[:20])!r} is not a block; expected 'N' and a number of at most 8 digits"
+                    raise file.fail(message, number)
+                if found.end() != len(block):
+                    what = one_line(block[found.end() : found.end() + 20])
+                    message = f"{what!r} has no place in a block; words are a letter and a decimal number with '.'"
+                    raise file.fail(message, number)
+                yield Record(int(found[1]), found[2], file, number, len(found[1]), found[1].startswith("0"))
     if marks == 0:
         raise file.fail("holds no '%'; a FANUC file begins and ends with one")
     if inside:
         raise file.fail("the last '%' is missing: the file is truncated", len(lines))
-
-
-def _record(file: SourceFile, block: str, line: int, inside: bool) -> Record:
-    if not inside:
-        raise file.fail(f"{one_line(block[:20])!r} stands outside the pair of '%'", line)
-    if len(block) > MOST_IN_BLOCK:
-        raise file.fail(f"this block has {len(block)} characters; at most {MOST_IN_BLOCK} are possible", line)
-    found = _RECORD.match(block)
-    if found is None:
-        raise file.fail(f"{one_line(block[:20])!r} is not a block; expected 'N' and a number of at most 8 digits", line)
-    if found.end() != len(block):
-        what = one_line(block[found.end() : found.end() + 20])
-        raise file.fail(f"{what!r} has no place in a block; words are a letter and a decimal number with '.'", line)
-    return Record(int(found[1]), found[2], file, line, len(found[1]), found[1].startswith("0"))
 
 
 def type_word(record: Record, words: Sequence[tuple[str, str]]) -> tuple[int | None, list[tuple[str, str]]]:
@@ -569,8 +569,13 @@ def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:
         entries = [parameters.get((number, axis)) for number in (3620, 3621, 3622)]
         numbers = tuple(record.whole(text, 0, MOST_NUMBER) for text, record in (entry for entry in entries if entry))
         if len(numbers) < 3:
-            if any(numbers):
-                raise _incomplete(axis, entries)
+            missing = [str(3620 + k) for k, entry in enumerate(entries) if entry is None]
+            for entry in entries:
+                if entry is not None and Decimal(entry[0]):
+                    raise entry[1].fail(
+                        f"axis A{axis} has a value here, but none for {' and '.join(missing)}: which points it uses is not "
+                        "known, and they could be overwritten. Punch all parameters of the control"
+                    )
             continue
         (reference, first, last), record = numbers, entries[1][1]  # type: ignore[index]
         text, at = parameters.get((LENGTH_PARAMETER, axis), ("0", record))
@@ -587,16 +592,6 @@ def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:
         grid = PointGrid(reference, first, last, interval)
         found[axis] = AxisPoints(axis, grid, factor, negative, record)
     return found
-
-
-def _incomplete(axis: int, entries: Sequence[tuple[str, Record] | None]) -> InputError:
-    """Return the error of an axis whose points are not known: some of 3620 to 3622 are there, but not all."""
-    missing = [str(3620 + k) for k, entry in enumerate(entries) if entry is None]
-    record = next(entry[1] for entry in entries if entry is not None and Decimal(entry[0]))
-    return record.fail(
-        f"axis A{axis} has a value here, but none for {' and '.join(missing)}: which points it uses is not known, and they "
-        "could be written over. Punch all parameters of the control"
-    )
 
 
 def length_of(record: Record, text: str, unit_mm: float) -> Decimal:
@@ -719,6 +714,17 @@ def width_of(records: Sequence[Record], usual: int) -> int:
     return filled[0].digits
 
 
+def whole_numbers_of(style: FanucStyle, texts: Sequence[str]) -> FanucStyle:
+    """How whole numbers are written: with a point behind them, a plus sign, filled with zeros."""
+    padded = [text.lstrip("+-").rstrip(".") for text in texts]
+    return replace(
+        style,
+        whole_point=all(text.endswith(".") for text in texts),
+        plus=any(text.startswith("+") for text in texts),
+        zeros=max((len(text) for text in padded if len(text) > 1 and text[0] == "0"), default=0),
+    )
+
+
 def _parameter_style(style: FanucStyle, records: Sequence[Record]) -> FanucStyle:
     """Axis words, and how lengths are written, from the parameters 3620 ... 3627."""
     values = [(record, axis_values(record, type_word(record, record.words())[1])) for record in records]
@@ -751,18 +757,9 @@ def _point_style(style: FanucStyle, points: Sequence[Record]) -> FanucStyle:
         if len(words) != 1 or words[0][0] != "P":
             raise record.fail("expected a single value word P for a compensation point, e.g. P-2")
         record.whole(words[0][1], -10_000_000, 10_000_000)
-    bare = [words[0][1] for words in texts]
-    padded = [text.lstrip("+-").rstrip(".") for text in bare]
-    zeros = max((len(text) for text in padded if len(text) > 1 and text[0] == "0"), default=0)
-    numbers = [record.number for record in points]
-    return replace(
-        style,
-        point_digits=width_of(points, style.point_digits),
-        number_base=min(numbers) // 10000 * 10000,
-        whole_point=all(text.endswith(".") for text in bare),
-        plus=any(text.startswith("+") for text in bare),
-        zeros=zeros,
-    )
+    style = whole_numbers_of(style, [words[0][1] for words in texts])
+    base = min(record.number for record in points) // 10000 * 10000
+    return replace(style, point_digits=width_of(points, style.point_digits), number_base=base)
 
 
 def _notes(style: FanucStyle, points: Sequence[Record], others: Sequence[Record]) -> tuple[str, ...]:

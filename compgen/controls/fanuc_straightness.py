@@ -33,7 +33,6 @@ from compgen.controls.shared.base import (
     Usage,
     coverage_violations,
     nodes_by_axis,
-    plan_contradictions,
 )
 from compgen.controls.shared.grids import curve_nodes_mm
 from compgen.controls.shared.terms import ACROSS, one_dimensional_name, one_dimensional_terms
@@ -267,17 +266,6 @@ class Polyline:
     square: float
 
 
-@dataclass(frozen=True)
-class _Segments:
-    """Sums over the samples of each segment from candidate p to q, shape (m, m), only p < q."""
-
-    g00: FloatArray
-    g01: FloatArray
-    g11: FloatArray
-    r0: FloatArray
-    r1: FloatArray
-
-
 def best_polyline(
     candidates_mm: FloatArray, position_mm: FloatArray, wanted: FloatArray, weight: FloatArray
 ) -> Polyline:
@@ -290,8 +278,7 @@ def best_polyline(
     """
     if len(candidates_mm) < 4:
         raise ValueError("at least four candidates are needed")
-    parts = _segments(candidates_mm, position_mm, wanted, weight)
-    gain = _gain_of_inner_knots(parts)
+    gain = _gain_of_inner_knots(_segments(candidates_mm, position_mm, wanted, weight))
     b, c = (int(k) for k in np.unravel_index(int(np.argmax(gain)), gain.shape))
     knots = (0, b, c, len(candidates_mm) - 1)
     matrix = hat_matrix(candidates_mm[list(knots)], position_mm)
@@ -300,7 +287,10 @@ def best_polyline(
     return Polyline(knots, np.asarray(values), float(np.sum(weight * (matrix @ values - wanted) ** 2)))
 
 
-def _segments(candidates: FloatArray, position: FloatArray, wanted: FloatArray, weight: FloatArray) -> _Segments:
+def _segments(
+    candidates: FloatArray, position: FloatArray, wanted: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, ...]:
+    """Sums of h0^2, h0 h1, h1^2, h0 y, h1 y over the samples of each segment from candidate p to q, (m, m), only p < q."""
     middle = 0.5 * (candidates[0] + candidates[-1])
     x, y = position - middle, wanted
     at = candidates - middle
@@ -314,43 +304,27 @@ def _segments(candidates: FloatArray, position: FloatArray, wanted: FloatArray, 
     h1 = (s1 - first * s0) / length
     g11 = (s2 - 2.0 * first * s1 + first**2 * s0) / length**2
     r1 = (t1 - first * t0) / length
-    return _Segments(s0 - 2.0 * h1 + g11, h1 - g11, g11, t0 - r1, r1)
+    return s0 - 2.0 * h1 + g11, h1 - g11, g11, t0 - r1, r1
 
 
-def _gain_of_inner_knots(parts: _Segments) -> FloatArray:
+def _gain_of_inner_knots(sums: tuple[FloatArray, ...]) -> FloatArray:
     """How much the squared deviation falls with inner knots b (row) and c (column), shape (m, m); -inf where b >= c."""
-    count = len(parts.g00)
+    count = len(sums[0])
     b, c = np.arange(count)[:, None], np.arange(count)[None, :]
-    start, middle, last = (np.zeros_like(c), b), (b, c), (c, np.full_like(c, count - 1))
-
-    def at(table: FloatArray, where: tuple[np.ndarray, np.ndarray]) -> FloatArray:
-        return np.asarray(table[where])
-
-    diagonal = [
-        at(parts.g00, start),
-        at(parts.g11, start) + at(parts.g00, middle),
-        at(parts.g11, middle) + at(parts.g00, last),
-        at(parts.g11, last),
-    ]
-    beside = [at(parts.g01, where) for where in (start, middle, last)]
-    right = [
-        at(parts.r0, start),
-        at(parts.r1, start) + at(parts.r0, middle),
-        at(parts.r1, middle) + at(parts.r0, last),
-        at(parts.r1, last),
-    ]
-    scale = float(np.max(np.abs(parts.g00)))
+    # the three segments from knot to knot, each sum with the shape of all pairs (b, c)
+    where = ((np.zeros_like(c), b), (b, c), (c, np.full_like(c, count - 1)))
+    g00, g01, g11, r0, r1 = ([table[rows, columns] for rows, columns in where] for table in sums)
+    diagonal = [g00[0], g11[0] + g00[1], g11[1] + g00[2], g11[2]]
+    right = [r0[0], r1[0] + r0[1], r1[1] + r0[2], r1[2]]
+    scale = float(np.max(np.abs(sums[0])))
     pivot, rest = np.maximum(diagonal[0], TINY * scale), right[0]
     gain = rest**2 / pivot
     for k in range(1, 4):
-        factor = beside[k - 1] / pivot
-        pivot, rest = np.maximum(diagonal[k] - factor * beside[k - 1], TINY * scale), right[k] - factor * rest
+        factor = g01[k - 1] / pivot
+        pivot, rest = np.maximum(diagonal[k] - factor * g01[k - 1], TINY * scale), right[k] - factor * rest
         gain = gain + rest**2 / pivot
     allowed = (b > 0) & (b < c) & (c < count - 1)
     return np.where(allowed, gain, -np.inf)
-
-
-# What the templates of straightness compensation show: records, plan, parameters to set, worked numbers.
 
 
 # FANUC straightness compensation: one axis shifted as a function of another, a polyline of four knots each.
@@ -364,6 +338,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
     name = "fanuc-straightness"
     settings_class = StraightnessSettings
     anchored = True
+    has_plan = True
     sample_setting = "style_from"
 
     @classmethod
@@ -419,8 +394,8 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             "not_written": bool(not_written),
             "switches": [MOVING + k for k in self._free_entries()[0]],
             "plan": {
-                "common": common,
-                "axes": {number: {axis: text for axis, text in values} for number, values in grids.items()},
+                "parameters": common,
+                "axis_parameters": {number: dict(values) for number, values in grids.items()},
                 "stores": settings.stores,
                 "detection_unit_um": settings.detection_unit_um,
             },
@@ -471,19 +446,6 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         if found.passed_over:
             remarks.append(found.passed_over_remark("straightness"))
         return StraightTables(entries, tuple(remarks))
-
-    def contradictions(self, tables: StraightTables, files: Sequence[SourceFile]) -> list[str]:
-        """Say where a plan beside the text differs from it."""
-        return plan_contradictions(files, lambda: self._plan(tables))
-
-    def _plan(self, tables: StraightTables) -> dict[str, Any]:
-        plan = self.context(tables)["plan"]
-        same = {key: plan[key] for key in ("stores", "detection_unit_um")}
-        return {**same, "axis_parameters": plan["axes"], "parameters": plan["common"]}
-
-    def remarks(self, tables: StraightTables, files: Sequence[SourceFile]) -> list[str]:
-        """Say which unit was assumed, which entries were kept apart, and how many records were passed over."""
-        return list(tables.remarks)
 
     def emulate(self, tables: StraightTables, points: Points) -> FloatArray:
         """Return sign * count * polyline at each point, zero outside the knots."""
@@ -540,7 +502,9 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
 
     def resolution_mm(self) -> float:
         """Return half a count for each of the two tables that may move one axis."""
-        return 0.5 * self.settings.count_mm * self._most_on_one_axis()
+        outputs = [output for output, _ in self.settings.pairs or ()]
+        tables = max(map(outputs.count, outputs), default=2)
+        return 0.5 * self.settings.count_mm * tables
 
     def _free_entries(self) -> tuple[list[int], set[int]]:
         """Return the entries 0 ... 2 that the sample leaves free, and the moving axes 0 ... 2 that it uses for other axes.
@@ -798,13 +762,6 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             "change_um": self.settings.sign * counts * self.settings.detection_unit_um,
         }
 
-    def _most_on_one_axis(self) -> int:
-        """How many tables may move the same axis."""
-        if self.settings.pairs is None:
-            return 2
-        outputs = [output for output, _ in self.settings.pairs]
-        return max(outputs.count(output) for output in outputs)
-
     def _candidates_mm(self, axis: int) -> FloatArray:
         """Positions of the compensation points that may be knots: those within the travel, and one beyond either end."""
         grid = self.settings.grids[axis]
@@ -825,19 +782,16 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         position = np.unique(np.concatenate([position, 0.5 * (position[1:] + position[:-1])]).round(9))
         position = position[(position >= candidates[0] - 1e-9) & (position <= candidates[-1] + 1e-9)]
         (term,) = one_dimensional_terms(self.machine, errors, [position] * 3, [(output, axis)], anchored=False)
-        return best_polyline(candidates, position, term.start, self._weights(axis, position))
-
-    def _weights(self, axis: int, position_mm: FloatArray) -> FloatArray:
-        """Length that each sample stands for; more within the work zone, almost nothing beyond the travel."""
-        half = 0.5 * np.diff(position_mm)
+        # the length that each sample stands for; more within the work zone, almost nothing beyond the travel
+        half = 0.5 * np.diff(position)
         weight = np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
         low, high = self.machine.axes[axis].range_mm
-        weight = np.where((position_mm >= low - 1e-9) & (position_mm <= high + 1e-9), weight, 1e-6 * weight)
+        weight = np.where((position >= low - 1e-9) & (position <= high + 1e-9), weight, 1e-6 * weight)
         zone = self.machine.emphasis.zone_mm[axis]
         if zone is not None:
-            inside = (position_mm >= zone[0]) & (position_mm <= zone[1])
+            inside = (position >= zone[0]) & (position <= zone[1])
             weight = np.where(inside, self.machine.emphasis.zone_weight * weight, weight)
-        return np.asarray(weight)
+        return best_polyline(candidates, position, term.start, weight)
 
     def _chosen(self, errors: ErrorTable) -> tuple[tuple[int, int], ...]:
         """Return the pairs of the settings, else for each moving axis the one that takes away most, by mean square."""
@@ -855,18 +809,13 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             )
         if settings.pairs is not None:
             return settings.pairs
-        gain = {
-            (k, axis): self._gain_of_pair_mm2(errors, k, axis) for k, axis in product(range(3), possible) if k != axis
-        }
-        found = []
-        for axis in possible:
-            output = max((k for k in range(3) if k != axis), key=lambda k: gain[k, axis])
-            found.append((output, axis))
+        # mean square over the travel that the polyline of each pair takes away, a constant apart
+        gain: dict[tuple[int, int], float] = {}
+        for axis, output in product(possible, range(3)):
+            if output != axis:
+                line = self._fitted(errors, output, axis)
+                along = np.linspace(*self.machine.axes[axis].range_mm, 201)
+                nodes = self._candidates_mm(axis)[list(line.knots)]
+                gain[output, axis] = float(np.var(np.interp(along, nodes, line.values)))
+        found = [max((pair for pair in gain if pair[1] == axis), key=gain.__getitem__) for axis in possible]
         return tuple(sorted(found, key=lambda pair: -gain[pair])[: len(free)])
-
-    def _gain_of_pair_mm2(self, errors: ErrorTable, output: int, axis: int) -> float:
-        """Mean square over the travel that the polyline takes away, a constant apart."""
-        line = self._fitted(errors, output, axis)
-        nodes = self._candidates_mm(axis)[list(line.knots)]
-        along = np.linspace(*self.machine.axes[axis].range_mm, 201)
-        return float(np.var(np.interp(along, nodes, line.values)))

@@ -263,7 +263,7 @@ def test_an_axis_whose_points_are_not_known_is_refused(controls_files, make_erro
         export(machine, make_errors(machine), "fanuc-pitch")
     assert caught.value.line
     path.write_text("\n".join(row for row in PARAMETERS.split("\n") if f"N0{number}" not in row))
-    with pytest.raises(InputError, match="could be written over. Punch all parameters"):
+    with pytest.raises(InputError, match="could be overwritten. Punch all parameters"):
         export(machine, make_errors(machine), "fanuc-pitch")
 
 
