@@ -8,9 +8,10 @@ The names are loaded on first use, so that a program that needs one of them does
 
 import sys
 import warnings
-from importlib import import_module
 from types import ModuleType
 from typing import Any
+
+from compgen.resources import on_first_use
 
 #: The public names by the module that defines them.
 _HOMES = {
@@ -47,21 +48,16 @@ _REMOVED_IN = "0.3"
 __all__ = sorted(name for names in _HOMES.values() for name in names.split())
 
 
-def _on_first_use(name: str, home: str, *, deprecated: bool = False) -> property:
-    """A public name as a property: importing the sub-package ``compgen.fit`` must not hide the function ``fit``."""
+def _deprecated(name: str, home: str) -> property:
+    """A name that is loaded as the others, with a warning that names its replacement."""
+    found = on_first_use(name, home)
 
     def load(package: ModuleType) -> Any:
-        if deprecated:
-            text = f"compgen.{name} is deprecated and will be removed in {_REMOVED_IN}; use `from {home} import {name}`"
-            warnings.warn(text, DeprecationWarning, stacklevel=2)
-        return getattr(import_module(home), name)
+        text = f"compgen.{name} is deprecated and will be removed in {_REMOVED_IN}; use `from {home} import {name}`"
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        return found.__get__(package)
 
-    def keep(package: ModuleType, value: Any) -> None:
-        # the import system sets every sub-package as an attribute of the package; the public name stays what it is
-        if not isinstance(value, ModuleType):
-            raise AttributeError(f"compgen.{name} cannot be replaced; it belongs to {home}")
-
-    return property(load, keep)
+    return property(load, found.fset)
 
 
 def __dir__() -> list[str]:
@@ -72,8 +68,8 @@ sys.modules[__name__].__class__ = type(
     "_Package",
     (ModuleType,),
     {
-        name: _on_first_use(name, home, deprecated=table is _DEPRECATED)
-        for table in (_HOMES, _DEPRECATED)
+        name: make(name, home)
+        for table, make in ((_HOMES, on_first_use), (_DEPRECATED, _deprecated))
         for home, names in table.items()
         for name in names.split()
     },

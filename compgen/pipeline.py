@@ -9,25 +9,24 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from compgen import effects
 from compgen.controls import controller_named
 from compgen.data.csv_files import FloatArray, format_csv
-from compgen.data.deviations import Deviations, format_deviations
 from compgen.data.display import Bars, Drawable, Overview, Panel
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, format_errors, format_reversal
 from compgen.data.files import OutputFolder, read_bytes, sha256_of, working_folder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
-from compgen.effects import with_effects_reversal
 from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.fit import FitOptions, FitResult, fit
-from compgen.foreign import given_errors, open_measurement
-from compgen.identify import Identification, IdentifyOptions, covariance, describe, identify_measurement
-from compgen.identify.any_measurement import Measurement, evidence_files
-from compgen.identify.monte_carlo import SelfCheck
+from compgen.foreign.opening import open_measurement
+from compgen.identify import Identification, IdentifyOptions, covariance
+from compgen.identify.any_measurement import Measurement, describe, evidence_files, identify_measurement
 from compgen.identify.reversal_errors import SIGNIFICANT
 from compgen.tables import (
     REJECTED_PREFIX,
@@ -40,7 +39,6 @@ from compgen.tables import (
     usable_format,
     verify,
 )
-from compgen.tables.active import ActiveTables, without_active
 from compgen.tables.safety import SafetyLimits
 from compgen.tables.signs import check_files
 from compgen.tables.verification import (
@@ -50,6 +48,10 @@ from compgen.tables.verification import (
     taken_away_um,
     verification_files,
 )
+
+if TYPE_CHECKING:
+    from compgen.identify.monte_carlo import SelfCheck
+    from compgen.tables.active import ActiveTables
 
 Progress = Callable[[str], None]
 
@@ -147,6 +149,8 @@ def identification_files(
     if stations:
         files["stations.csv"] = format_csv(columns, {"machine": result.errors.metadata.get("machine", "")})
     if result.positions is not None:
+        from compgen.data.deviations import format_deviations
+
         files["measured.deviations.csv"] = format_deviations(result.positions)
     if checked is not None:
         summary["monte_carlo"] = checked.summary()
@@ -177,7 +181,8 @@ def identified_reversal(result: Identification) -> ReversalCurves | None:
 
     Backlash of the machine file that was taken out of the readings is part of them.
     """
-    return with_effects_reversal(result.layout.machine, _found_reversal(result), result.corrections.get("effects", {}))
+    found, taken_out = _found_reversal(result), result.corrections.get("effects", {})
+    return effects.with_effects_reversal(result.layout.machine, found, taken_out) if taken_out else found
 
 
 def _found_reversal(result: Identification) -> ReversalCurves | None:
@@ -293,10 +298,14 @@ def identify_bare(
     Errors that another program identified are used as given. ``corrections["active_tables"]`` of the result says what
     was taken out.
     """
-    if active is None and isinstance(measurement, ErrorTable):
-        return given_errors(machine, measurement)
     if active is None and not isinstance(measurement, ErrorTable):
         return identify_measurement(machine, measurement, options)
+    from compgen.data.deviations import Deviations
+    from compgen.foreign.given import given_errors
+    from compgen.tables.active import without_active
+
+    if active is None and isinstance(measurement, ErrorTable):
+        return given_errors(machine, measurement)
     if active is None or not isinstance(measurement, Lengths | Deviations):
         raise InputError(
             "tables that were active (--active) can be taken out of lengths and deviations only; measure anything else with "

@@ -1,8 +1,13 @@
-"""Where the shipped ``templates/`` and ``machines/`` folders are."""
+"""What the installed package has on disk: shipped folders, its version, and the public names of its rooms."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterable
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 
 def data_folder(kind: str) -> Path:
@@ -26,3 +31,35 @@ def program_version() -> str:
         return version("compgen")
     except PackageNotFoundError:
         return "unknown"
+
+
+def on_first_use(name: str, home: str) -> property:
+    """Return a public name of a package as a property that imports its ``home`` when it is used.
+
+    A property, and not the ``__getattr__`` of a module: importing the sub-module ``compgen.fit`` must not hide the
+    function ``fit``.
+    """
+
+    def load(package: ModuleType) -> Any:
+        return getattr(import_module(home), name)
+
+    def keep(package: ModuleType, value: Any) -> None:
+        # the import system sets every sub-module as an attribute of its package; the public name stays what it is
+        if not isinstance(value, ModuleType):
+            raise AttributeError(f"{package.__name__}.{name} cannot be replaced; it belongs to {home}")
+
+    return property(load, keep)
+
+
+def load_on_first_use(package: str, names: Iterable[str]) -> None:
+    """Let a room import what it exports on first use; a command should not wait for what it does not need.
+
+    The homes of the names are those that the ``if TYPE_CHECKING`` block of its ``__init__`` gives.
+    """
+    import ast
+
+    module = sys.modules[package]
+    imports = [node for node in ast.walk(ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8")))
+               if isinstance(node, ast.ImportFrom)]  # fmt: skip
+    homes = {alias.name: str(node.module) for node in imports for alias in node.names}
+    module.__class__ = type("Room", (ModuleType,), {name: on_first_use(name, homes[name]) for name in names})

@@ -1,19 +1,24 @@
 """Accuracy figures of the standards, with uncertainty, and before against after."""
 
-from compgen.accuracy.compare import CompareOptions, Comparison, compare_errors, compare_fields, compare_runs
-from compgen.accuracy.evaluate import Accuracy, accuracy_of_errors, accuracy_of_runs, straightness
-from compgen.accuracy.field import ErrorField, ErrorSource, aligned, error_source, volume_figures
-from compgen.accuracy.figure import ComparedFigure, Figure
-from compgen.accuracy.positioning import (
-    PositioningTest,
-    RunStatistics,
-    SetupBudget,
-    axis_statistics,
-    positioning_test,
-    run_statistics,
-    vdi_3441,
-)
-from compgen.accuracy.sides import Side, compare_prediction, compare_sides, read_side, with_prediction
+from typing import TYPE_CHECKING
+
+from compgen.resources import load_on_first_use
+
+if TYPE_CHECKING:
+    from compgen.accuracy.compare import CompareOptions, Comparison, compare_errors, compare_fields, compare_runs
+    from compgen.accuracy.evaluate import Accuracy, accuracy_of_errors, accuracy_of_runs, straightness
+    from compgen.accuracy.field import ErrorField, ErrorSource, aligned, error_source, volume_figures
+    from compgen.accuracy.figure import ComparedFigure, Figure
+    from compgen.accuracy.positioning import (
+        PositioningTest,
+        RunStatistics,
+        SetupBudget,
+        axis_statistics,
+        positioning_test,
+        run_statistics,
+        vdi_3441,
+    )
+    from compgen.accuracy.sides import Side, compare_prediction, compare_sides, read_side, with_prediction
 
 __all__ = [
     "Accuracy",
@@ -45,3 +50,5 @@ __all__ = [
     "volume_figures",
     "with_prediction",
 ]
+
+load_on_first_use(__name__, __all__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -25,10 +26,9 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.errors import InputError
 from compgen.fit import FitOptions, fit
-from compgen.foreign import open_errors, open_measurement
-from compgen.identify import IdentifyOptions, describe
-from compgen.identify.any_measurement import evidence_files
-from compgen.identify.monte_carlo import self_check
+from compgen.foreign.opening import open_errors, open_measurement
+from compgen.identify import IdentifyOptions
+from compgen.identify.any_measurement import describe, evidence_files
 from compgen.pipeline import (
     add_identification,
     failure_reported,
@@ -39,7 +39,9 @@ from compgen.pipeline import (
     write_all,
 )
 from compgen.report.terminal import fit_table, identification_table
-from compgen.tables.active import ActiveTables
+
+if TYPE_CHECKING:
+    from compgen.tables.active import ActiveTables
 
 
 @click.command("identify")
@@ -102,6 +104,8 @@ def identify_command(
         if replicates is not None:
             if active is not None or not isinstance(measurement, Lengths):
                 raise InputError("--self-check needs tracer lengths that were measured without active tables")
+            from compgen.identify.monte_carlo import self_check
+
             with mapper(workers, cluster) as spread:
                 checked = self_check(
                     machine,

@@ -29,7 +29,7 @@ from compgen.data.messages import nearest
 from compgen.data.names import AXES, error_named
 from compgen.data.registry import Kind
 from compgen.effects import ANY_STATION, FAMILIES, catalogue, listed
-from compgen.effects.catalogue import STATION_NAME
+from compgen.effects.active import STATION_NAME
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
 from compgen.kinematics import modelled_errors

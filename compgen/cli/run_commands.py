@@ -24,7 +24,6 @@ from compgen.cli.shared_options import (
     templates_option,
     unverified_option,
 )
-from compgen.cli.table_commands import explain_run
 from compgen.cli.terminal import progress, say, say_paths, stdout
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
@@ -33,11 +32,11 @@ from compgen.fit import FitOptions
 from compgen.identify import IdentifyOptions
 from compgen.pipeline import run
 from compgen.report.terminal import identification_table, run_json, verification_table
-from compgen.tables.active import ActiveTables
 from compgen.tables.safety import SafetyLimits
 
 if TYPE_CHECKING:
     from compgen.report.html.write import Further
+    from compgen.tables.active import ActiveTables
 
 
 # ``volcomp report``.
@@ -195,6 +194,8 @@ def run_command(
         for path in result.earlier_report:
             path.unlink(missing_ok=True)
     if explain:
+        from compgen.cli.table_commands import explain_run
+
         explain_run(machine, result, out, templates)
     if as_json:
         print_json({**run_json(result), "report": None if report is None else str(report)})

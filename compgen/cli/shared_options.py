@@ -9,10 +9,11 @@ from contextlib import closing, contextmanager
 from dataclasses import MISSING, Field, fields, is_dataclass, replace
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import click
 
+from compgen import effects
 from compgen.cli.common import NUMBER, PATH, Command
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.data.error_table import ErrorTable
@@ -20,15 +21,15 @@ from compgen.data.files import read_bytes, sha256_of
 from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
 from compgen.data.messages import nearest
 from compgen.data.names import AXES
-from compgen.data.registry import why_missing
-from compgen.effects import active_effects
 from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions
 from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
-from compgen.kinematics.parallel import Map, opened_workers, spread
-from compgen.plugins import with_plugins
-from compgen.tables.active import ActiveTables, keeping_others, read_active
+from compgen.resources import data_folder
 from compgen.tables.safety import SafetyLimits
+
+if TYPE_CHECKING:
+    from compgen.kinematics.parallel import Map
+    from compgen.tables.active import ActiveTables
 
 
 def path_option(name: str, text: str, *, metavar: str | None = "FILE", **how: Any) -> Callable[[Command], Command]:
@@ -37,16 +38,24 @@ def path_option(name: str, text: str, *, metavar: str | None = "FILE", **how: An
 
 
 def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:
-    """Load a machine and check the settings of every control and the effects that its file names."""
+    """Load a machine and check the settings of every control and the effects that its file names.
+
+    A shipped machine file is known to be right (a test reads all of it): of its controls those that the command uses
+    are read, and no other is loaded.
+    """
     machine = load_machine(name, tuple(machines))
+    shipped = machine.source is not None and machine.source.resolve().parent == data_folder("machines")
     for controller in machine.controllers:
-        if controller in CONTROLLERS:
-            CONTROLLERS[controller].read_settings(machine)
-        else:
+        if controller not in CONTROLLERS:
+            from compgen.data.registry import why_missing
+
             message = f"is not a controller; {nearest(controller, CONTROLLERS)}"
             message += why_missing("control", controller) or "; if it comes from a plug-in, add --plugin PATH"
             raise InputError(message, file=machine.source, field=f"[controllers.{controller}]")
-    active_effects(machine)
+        if not shipped:
+            CONTROLLERS[controller].read_settings(machine)
+    if machine.effects:
+        effects.active_effects(machine)
     return machine
 
 
@@ -73,10 +82,14 @@ def controller_option(*, multiple: bool = False) -> Callable[[Command], Command]
 @contextmanager
 def mapper(workers: int, cluster: str | None) -> Iterator[Map]:
     """Yield a ``map`` over so many processes of this machine, or over a cluster; ``map`` itself for one."""
-    found = opened_workers(workers, cluster)
-    if found is None:
+    if workers == 1 and cluster is None:
         yield map
         return
+    from compgen.kinematics.parallel import opened_workers, spread
+    from compgen.plugins import with_plugins
+
+    found = opened_workers(workers, cluster)
+    assert found is not None  # true for several workers, and for a cluster
 
     def spread_out(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
         return spread(found, with_plugins(function), items)
@@ -323,6 +336,8 @@ def active_options(*names: str) -> Callable[[Command], Command]:
             target = options.get("controller")
             tables = _active(machine, active, active_controller, target)
             if tables is not None:
+                from compgen.tables.active import keeping_others
+
                 machine = keeping_others(machine, _names(target), tables)
             return command(*args, machine=machine, active=tables, **options)
 
@@ -348,6 +363,8 @@ def _active(machine: Machine, paths: tuple[Path, ...], name: str | None, target:
         if name is not None:
             raise InputError("--active-controller needs --active FILE")
         return None
+    from compgen.tables.active import read_active
+
     targets = _names(target)
     if name is None and len(targets) != 1:
         raise InputError("--active: which control do the tables belong to? Add --active-controller NAME")

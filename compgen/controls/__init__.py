@@ -2,48 +2,69 @@
 
 from __future__ import annotations
 
-from compgen.controls.etalon_exchange import EtalonExchange
-from compgen.controls.fanuc_3d import Fanuc3d
-from compgen.controls.fanuc_pitch import FanucPitch
-from compgen.controls.fanuc_straightness import FanucStraightness
-from compgen.controls.heidenhain_com import HeidenhainCom
-from compgen.controls.heidenhain_kinematics import HeidenhainKinematics
-from compgen.controls.isg_csv import IsgCsv
-from compgen.controls.linuxcnc_comp import LinuxcncComp
-from compgen.controls.linuxcnc_volumetric import LinuxcncVolumetric
-from compgen.controls.mitsubishi import Mitsubishi
-from compgen.controls.neutral import Neutral
-from compgen.controls.pmac import Pmac
+from collections.abc import Iterator, Mapping, MutableMapping
+from importlib import import_module
+
 from compgen.controls.shared.base import AnyController, Controller, Monomial, SourceFile, Term
-from compgen.controls.siemens_cec import SiemensCec
-from compgen.controls.siemens_cec_eec import SiemensCecEec
-from compgen.controls.siemens_eec import SiemensEec
-from compgen.controls.twincat_lists import TwincatLists
 from compgen.data.files import read_text
 from compgen.data.messages import nearest
-from compgen.data.registry import why_missing
 from compgen.errors import InputError
 from compgen.resources import data_folder
 
+
+class Controls(MutableMapping[str, type[AnyController]]):
+    """The class of every control by its name; the module of a built-in one is imported when its class is asked for."""
+
+    def __init__(self, built_in: Mapping[str, str]) -> None:
+        self._classes: dict[str, str | type[AnyController]] = dict(built_in)
+
+    def __getitem__(self, name: str) -> type[AnyController]:
+        found = self._classes[name]
+        if isinstance(found, str):
+            module, _, kind = found.partition(".")
+            found = self._classes[name] = getattr(import_module(f"compgen.controls.{module}"), kind)
+        return found
+
+    def __setitem__(self, name: str, control: type[AnyController]) -> None:
+        self._classes[name] = control
+
+    def __delitem__(self, name: str) -> None:
+        del self._classes[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._classes
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._classes)
+
+    def __len__(self) -> int:
+        return len(self._classes)
+
+    def __repr__(self) -> str:
+        return f"<Controls: {', '.join(self)}>"
+
+
 #: The class of every control by its name on the command line; ``CONTROLLERS["pmac"](machine)`` is that of a machine.
-CONTROLLERS: dict[str, type[AnyController]] = {
-    "isg-csv": IsgCsv,
-    "etalon-exchange": EtalonExchange,
-    "fanuc-pitch": FanucPitch,
-    "fanuc-3d": Fanuc3d,
-    "fanuc-straightness": FanucStraightness,
-    "heidenhain-com": HeidenhainCom,
-    "heidenhain-kinematics": HeidenhainKinematics,
-    "mitsubishi": Mitsubishi,
-    "siemens-cec": SiemensCec,
-    "siemens-cec-eec": SiemensCecEec,
-    "siemens-eec": SiemensEec,
-    "linuxcnc-comp": LinuxcncComp,
-    "linuxcnc-volumetric": LinuxcncVolumetric,
-    "twincat-lists": TwincatLists,
-    "pmac": Pmac,
-    "neutral": Neutral,
-}
+CONTROLLERS = Controls(
+    {
+        "isg-csv": "isg_csv.IsgCsv",
+        "etalon-exchange": "etalon_exchange.EtalonExchange",
+        "fanuc-pitch": "fanuc_pitch.FanucPitch",
+        "fanuc-3d": "fanuc_3d.Fanuc3d",
+        "fanuc-straightness": "fanuc_straightness.FanucStraightness",
+        "heidenhain-com": "heidenhain_com.HeidenhainCom",
+        "heidenhain-kinematics": "heidenhain_kinematics.HeidenhainKinematics",
+        "mitsubishi": "mitsubishi.Mitsubishi",
+        "siemens-cec": "siemens_cec.SiemensCec",
+        "siemens-cec-eec": "siemens_cec_eec.SiemensCecEec",
+        "siemens-eec": "siemens_eec.SiemensEec",
+        "linuxcnc-comp": "linuxcnc_comp.LinuxcncComp",
+        "linuxcnc-volumetric": "linuxcnc_volumetric.LinuxcncVolumetric",
+        "twincat-lists": "twincat_lists.TwincatLists",
+        "pmac": "pmac.Pmac",
+        "neutral": "neutral.Neutral",
+    }
+)
 
 
 #: Controls that are asked for and whose file format no public document describes: what there is instead.
@@ -58,6 +79,8 @@ def controller_named(name: str) -> type[AnyController]:
     if name in NOT_PUBLIC and name not in CONTROLLERS:
         raise InputError(f"no controller is named {name!r}: {NOT_PUBLIC[name]}")
     if name not in CONTROLLERS:
+        from compgen.data.registry import why_missing
+
         raise InputError(f"no controller is named {name!r}; {_hint(name)}{why_missing('control', name)}")
     return CONTROLLERS[name]
 

@@ -136,6 +136,13 @@ def directions(table: CsvTable, column: str) -> np.ndarray[Any, np.dtype[np.int6
     return values.astype(np.int64)
 
 
+def approach_of(moves: FloatArray) -> FloatArray:
+    """Last direction of travel of each axis after moves (n, 3): +1, -1, or 0 while it has not moved yet; (n, 3)."""
+    moving = moves != 0
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(moves))[:, None], 0), axis=0)
+    return np.sign(np.take_along_axis(moves, last, axis=0))
+
+
 #: Deviations in um; one beyond 100 mm is taken for a slip of unit.
 deviations_um = within(LARGEST_DEVIATION_UM, "um", "more than 100 mm; is the unit um?")
 

@@ -14,7 +14,7 @@ import re
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec
@@ -50,7 +50,7 @@ class Kind:
     word : its name in messages, e.g. ``"control"``.
     attribute : name of the dict in a plug-in's file, e.g. ``"CONTROLLERS"``.
     group : group of entry points, e.g. ``"compgen.controllers"``.
-    registry : the dict that receives it, by name.
+    registry : what receives it, by name.
     check : takes name and thing, returns the thing to register and everything that is wrong with it, in words.
     origins : where each thing of a plug-in came from, by name.
     """
@@ -58,7 +58,7 @@ class Kind:
     word: str
     attribute: str
     group: str
-    registry: dict[str, Any]
+    registry: MutableMapping[str, Any]
     check: Callable[[str, Any], tuple[Any, list[str]]]
     origins: dict[str, str] = field(default_factory=dict)
 
@@ -195,14 +195,14 @@ def _origin(entry: EntryPoint) -> str:
 
 @contextmanager
 def restored(kinds: Sequence[Kind], *, only_after_errors: bool = False) -> Iterator[None]:
-    """Put the registries back to what they were before, always or only if an error leaves the block."""
-    before = [(item, dict(item)) for kind in kinds for item in (kind.registry, kind.origins)]
+    """Take out of the registries what the block added, always or only if an error leaves it."""
+    before = [(item, set(item)) for kind in kinds for item in (kind.registry, kind.origins)]
     failed = True
     try:
         yield
         failed = False
     finally:
         if failed or not only_after_errors:
-            for item, contents in before:
-                item.clear()
-                item.update(contents)
+            for item, names in before:  # a name that is taken is never replaced
+                for added in set(item) - names:
+                    del item[added]

@@ -34,7 +34,7 @@ from compgen.diagnose.groups import fit_smooth
 from compgen.diagnose.observed import Measurement, Observed, ObservedDeviations, ObservedLengths
 from compgen.diagnose.verdict import advice_of, compared, verdict_of
 from compgen.effects import catalogue
-from compgen.effects.catalogue import active_effects
+from compgen.effects.active import active_effects
 from compgen.errors import InputError
 from compgen.instruments.sixdof_health import Suspicion, sixdof_health
 from compgen.instruments.sixdof_instrument import SixDofInstrument

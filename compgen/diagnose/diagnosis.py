@@ -22,7 +22,8 @@ from compgen.diagnose.noise_model import TAU, Noise, difference_matrix
 from compgen.diagnose.search import Design
 from compgen.diagnose.verdict import DisplayedDiagnosis, Named, Unknown, Verdict
 from compgen.effects import Card, Effect, Readings, catalogue
-from compgen.effects.catalogue import section_text, what_to_do
+from compgen.effects.active import section_text
+from compgen.effects.catalogue import what_to_do
 
 # The full nonlinear model with the effects inside: their parameters with uncertainty, and the extended machine file.
 

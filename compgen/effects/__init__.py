@@ -1,33 +1,36 @@
 """The catalogue of effects beyond the 21 geometric errors: one file per family, one explicit registry."""
 
-from compgen.effects.base import (
-    ANY_STATION,
-    AllStations,
-    Card,
-    DisplacementEffect,
-    Effect,
-    Family,
-    Parameter,
-    PerAxis,
-    PerName,
-    PerStation,
-    Setting,
-    Single,
-    along,
-)
-from compgen.effects.catalogue import (
-    FAMILIES,
-    ActiveEffect,
-    active_effects,
-    advice_of_effects,
-    catalogue,
-    displacement_of,
-    effects_reversal,
-    listed,
-    section_text,
-    with_effects_reversal,
-)
-from compgen.effects.readings import Readings, readings_of_deviations, readings_of_lengths, readings_of_points
+from typing import TYPE_CHECKING
+
+from compgen.resources import load_on_first_use
+
+if TYPE_CHECKING:
+    from compgen.effects.active import (
+        ActiveEffect,
+        active_effects,
+        advice_of_effects,
+        displacement_of,
+        effects_reversal,
+        section_text,
+        with_effects_reversal,
+    )
+    from compgen.effects.base import (
+        ANY_STATION,
+        AllStations,
+        Card,
+        DisplacementEffect,
+        Effect,
+        Family,
+        Parameter,
+        PerAxis,
+        PerName,
+        PerStation,
+        Setting,
+        Single,
+        along,
+    )
+    from compgen.effects.catalogue import FAMILIES, catalogue, listed
+    from compgen.effects.readings import Readings, readings_of_deviations, readings_of_lengths, readings_of_points
 
 __all__ = [
     "ANY_STATION",
@@ -58,3 +61,5 @@ __all__ = [
     "section_text",
     "with_effects_reversal",
 ]
+
+load_on_first_use(__name__, __all__)

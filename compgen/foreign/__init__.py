@@ -1,8 +1,13 @@
 """Files of instruments and other programs, as objects of the project."""
 
-from compgen.foreign.detect import form_of, import_file, native_format
-from compgen.foreign.findings import Imported, ImportOptions
-from compgen.foreign.opening import describe_native, given_errors, open_errors, open_measurement
+from typing import TYPE_CHECKING
+
+from compgen.resources import load_on_first_use
+
+if TYPE_CHECKING:
+    from compgen.foreign.detect import form_of, import_file, native_format
+    from compgen.foreign.findings import Imported, ImportOptions
+    from compgen.foreign.opening import describe_native, given_errors, open_errors, open_measurement
 
 __all__ = [
     "ImportOptions",
@@ -15,3 +20,5 @@ __all__ = [
     "open_measurement",
     "native_format",
 ]
+
+load_on_first_use(__name__, __all__)

@@ -1,14 +1,19 @@
 """From tracer lengths to error curves, stations and their uncertainty."""
 
-from compgen.identify.adjust.propagation import SystematicInputs
-from compgen.identify.any_measurement import describe, identify_measurement, read_measurement
-from compgen.identify.covariance import Covariance, joint_covariance, predict_uncertainty, read_covariance
-from compgen.identify.identification import Identification, StationResult
-from compgen.identify.monte_carlo import SelfCheck, sample_errors, self_check
-from compgen.identify.options import IdentifyOptions, KnownStations, locate_stations, read_stations
-from compgen.identify.positions import identify_deviations
-from compgen.identify.six_dof import SixDofMeasurement, identify_sixdof
-from compgen.identify.tracer_lengths import identify
+from typing import TYPE_CHECKING
+
+from compgen.resources import load_on_first_use
+
+if TYPE_CHECKING:
+    from compgen.identify.adjust.propagation import SystematicInputs
+    from compgen.identify.any_measurement import describe, identify_measurement, read_measurement
+    from compgen.identify.covariance import Covariance, joint_covariance, predict_uncertainty, read_covariance
+    from compgen.identify.identification import Identification, StationResult
+    from compgen.identify.monte_carlo import SelfCheck, sample_errors, self_check
+    from compgen.identify.options import IdentifyOptions, KnownStations, locate_stations, read_stations
+    from compgen.identify.positions import identify_deviations
+    from compgen.identify.six_dof import SixDofMeasurement, identify_sixdof
+    from compgen.identify.tracer_lengths import identify
 
 __all__ = [
     "Covariance",
@@ -33,3 +38,5 @@ __all__ = [
     "sample_errors",
     "self_check",
 ]
+
+load_on_first_use(__name__, __all__)

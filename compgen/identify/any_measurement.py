@@ -1,232 +1,33 @@
-"""Read and identify a measurement of any kind, detected by its columns; merge the results of two instruments."""
+"""Read and identify a measurement of any kind, detected by its columns: lengths, positions, axis runs, six-DOF readings.
+
+What reads and identifies a kind is imported when a file of that kind is there.
+"""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
+from typing import TYPE_CHECKING, TypeAlias, overload
 
 import numpy as np
-from scipy.special import stdtrit
 
-from compgen.data.axis_runs import AxisRuns, read_axis_runs
 from compgen.data.csv_files import FloatArray, format_csv
-from compgen.data.deviations import PART, Deviations, read_deviations, read_parts
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Lengths, read_lengths
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, MM_PER_UM, error_named
+from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import detect_format
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import InputError
 from compgen.identify.adjust.propagation import SystematicInputs
-from compgen.identify.adjust.unknowns import ErrorParameters
-from compgen.identify.covariance import error_design, error_values, joint_covariance, normalized_error, values_at_nodes
-from compgen.identify.identification import Identification, table_of_values, worst_uncertainty
+from compgen.identify.identification import Identification
 from compgen.identify.options import IdentifyOptions
-from compgen.identify.positions import identify_deviations
-from compgen.identify.single_axes import identify_axis_runs
-from compgen.identify.six_dof import SixDofMeasurement, identify_sixdof
 from compgen.identify.tracer_lengths import identify
-from compgen.instruments.sixdof_instrument import read_instrument
-from compgen.instruments.sixdof_readings import read_sixdof
-from compgen.kinematics.first_order import c_matrix, tool_of
-from compgen.kinematics.gauge import rigid_fields
 
-# Errors of one machine from two instruments: brought to the same gauge, compared, and averaged where they agree.
-#
-# The six-DOF instrument measures all 21 errors, a tracer (or a set of measured positions) those that its chain and tool
-# show, each with the gauge of its own. So the six-DOF errors are projected: least squares finds the errors of the other
-# identification's layout, plus a rigid motion, that move the tool in the same way. That folds what this layout cannot
-# tell apart (:func:`compgen.kinematics.gauge.align` gives the same where nothing has to be folded), and carries the
-# covariance along. Then every value is compared and averaged with the inverse variances as weights.
-
-
-#: Probability with which two true measurements are said to disagree somewhere.
-FALSE_ALARM = 0.05
-#: Degrees of freedom where the scatter is stated, not estimated.
-MANY = 1e6
-#: Levels of the other axes at which the motion of the tool is compared.
-LEVELS = 3
-
-
-@dataclass(frozen=True)
-class InstrumentAgreement:
-    """How two identifications compare, by error.
-
-    Parameters
-    ----------
-    en : largest |difference| / (k u(difference)) over the positions of each error; above 1 they disagree.
-    coverage_factor : k of Student's distribution, chosen so that ``FALSE_ALARM`` holds for all values together.
-    not_expressed_mm : largest motion of the tool of the second one that the errors of the first cannot express.
-    """
-
-    en: dict[str, float]
-    coverage_factor: float
-    not_expressed_mm: float
-
-    @property
-    def disagree(self) -> list[str]:
-        """Names of the errors that disagree."""
-        return [name for name, value in self.en.items() if value > 1.0]
-
-
-def merge(machine: Machine, first: Identification, second: Identification) -> Identification:
-    """Merge the identification of lengths or deviations with that of six-DOF readings of the same machine.
-
-    Values that agree are averaged. An error that disagrees keeps the value of ``first``, with half of the difference
-    as additional uncertainty, and is named by a CompgenWarning.
-
-    Raises
-    ------
-    InputError
-        if the six-DOF readings do not cover all three axes, or one of the two has no uncertainties.
-    """
-    _check(machine, first, second)
-    own = joint_covariance(first)
-    names, positions, turned, factor, left = projected(machine, first.layout, second)
-    values = values_at_nodes(first.errors, names, positions)
-    freedom = float(second.details.get("repeatability_freedom") or MANY)
-    agreement, u1, u2 = _compare(names, (values, own.errors_factor), (turned, factor), left, freedom)
-    merged, roots = _average(names, agreement, (values, own.errors_factor, u1), (turned, factor, u2))
-    errors = _table(first.errors, names, positions, merged, roots)
-    texts = _texts(agreement)
-    for text in texts:
-        warnings.warn(text, CompgenWarning, stacklevel=3)
-    details = {
-        "en": agreement.en,
-        "coverage_factor": agreement.coverage_factor,
-        "disagree": agreement.disagree,
-        "not_expressed_um": agreement.not_expressed_mm / MM_PER_UM,
-        "first": first.method,
-        "sixdof": dict(second.details),
-    }
-    return replace(
-        first,
-        errors=errors,
-        method="merged",
-        adjustment=None,
-        values_factor=roots,
-        worst_u=worst_uncertainty(errors),
-        reversal_curves=second.reversal_curves,
-        corrections={**first.corrections, **({"sixdof": dict(second.corrections)} if second.corrections else {})},
-        details=details,
-        objections=(*first.objections, *second.objections, *texts),
-    )
-
-
-def _check(machine: Machine, first: Identification, second: Identification) -> None:
-    missing = [axis for axis in AXES if f"E{axis}{axis}" not in second.errors.curves]
-    if missing:
-        message = f"the six-DOF readings lack {', '.join(missing)}; merging needs all three axes"
-        raise InputError(message + "; otherwise identify the files separately")
-    if not first.has_covariance or not second.has_covariance:
-        raise InputError("one of the measurements has no uncertainties, so that they cannot be compared or averaged")
-
-
-def _points(machine: Machine) -> FloatArray:
-    """Positions (m, 3): every axis at its nodes, the others at a few levels."""
-    levels = [np.linspace(*axis.range_mm, LEVELS) for axis in machine.axes]
-    parts = []
-    for k, axis in enumerate(machine.axes):
-        lists = [axis.nodes_mm if j == k else levels[j] for j in range(3)]
-        parts.append(np.stack(np.meshgrid(*lists, indexing="ij"), axis=-1).reshape(-1, 3))
-    return np.vstack(parts)
-
-
-Rows = tuple[list[str], FloatArray, FloatArray, FloatArray, float]
-
-
-def projected(machine: Machine, layout: ErrorParameters, second: Identification) -> Rows:
-    """Six-DOF errors in the layout of another identification.
-
-    Returns name and position of each value (k,), the values (k,), their factor (k, r), and the largest motion of the
-    tool that the layout cannot express, mm.
-    """
-    position = _points(machine)
-    tip = position + tool_of(machine, None)
-    bases = [layout.basis(axis, position[:, axis]) for axis in range(3)]
-    design = layout.design(c_matrix(machine, position, None), bases).reshape(-1, layout.size)
-    design = np.hstack([design, rigid_fields(tip)])
-    covariance = joint_covariance(second)
-    target = error_design(machine, covariance, position).reshape(len(design), -1)
-    scale = np.linalg.norm(design, axis=0)
-    found = np.linalg.lstsq(design / scale, target, rcond=1e-11)[0] / scale[:, None]
-    values = values_at_nodes(second.errors, list(covariance.error), covariance.position_mm)
-    left = float(np.abs((design @ found - target) @ values).max())
-    names, positions, rows = [], [], []
-    for name, at, columns, matrix in error_values(layout):
-        names += [name] * len(at)
-        positions.append(at)
-        rows.append(matrix @ found[columns])
-    change = np.vstack(rows)
-    return names, np.concatenate(positions), change @ values, change @ covariance.errors_factor, left
-
-
-def _compare(
-    names: Sequence[str],
-    first: tuple[FloatArray, FloatArray],
-    second: tuple[FloatArray, FloatArray],
-    left_mm: float,
-    freedom: float,
-) -> tuple[InstrumentAgreement, FloatArray, FloatArray]:
-    (one, root1), (other, root2) = first, second
-    u1, u2 = (np.sqrt(np.einsum("ij,ij->i", root, root)) for root in (root1, root2))
-    u = np.hypot(u1, u2)
-    known = u > 1e-15
-    k = -float(stdtrit(freedom, FALSE_ALARM / 2.0 / max(int(known.sum()), 1)))
-    ratio = np.where(known, normalized_error(one - other, k * u), 0.0)
-    label = np.array(names)
-    en = {name: float(ratio[label == name].max()) for name in dict.fromkeys(names)}
-    return InstrumentAgreement(en, k, left_mm), u1, u2
-
-
-Part = tuple[FloatArray, FloatArray, FloatArray]
-
-
-def _average(
-    names: Sequence[str], agreement: InstrumentAgreement, first: Part, second: Part
-) -> tuple[FloatArray, FloatArray]:
-    """Weighted means (k,) and a factor of their covariance; disagreeing errors keep the first value."""
-    (one, root1, u1), (other, root2, u2) = first, second
-    square = u1**2 + u2**2
-    share = np.where(square > 0, u1**2 / np.where(square > 0, square, 1.0), 0.0)
-    label = np.array(names)
-    odd = np.zeros((len(names), len(agreement.disagree)))
-    for column, name in enumerate(agreement.disagree):
-        rows = label == name
-        share[rows] = 0.0
-        odd[rows, column] = 0.5 * (other - one)[rows]
-    merged = (1.0 - share) * one + share * other
-    return merged, np.hstack([(1.0 - share)[:, None] * root1, share[:, None] * root2, odd])
-
-
-def _table(
-    errors: ErrorTable, names: Sequence[str], positions: FloatArray, values: FloatArray, root: FloatArray
-) -> ErrorTable:
-    u = np.sqrt(np.einsum("ij,ij->i", root, root))
-    label = np.array(names)
-    rows = {name: label == name for name in dict.fromkeys(names)}
-    found = table_of_values((name, positions[at], values[at], u[at]) for name, at in rows.items())
-    return errors.replace(curves=found.curves, squareness=found.squareness)
-
-
-def _texts(agreement: InstrumentAgreement) -> tuple[str, ...]:
-    """What has to be said; empty if everything agrees."""
-    if not agreement.disagree:
-        return ()
-    listed = ", ".join(f"{name} ({agreement.en[name]:.1f})" for name in agreement.disagree)
-    kinds = {error_named(name).kind for name in agreement.disagree}
-    return (
-        f"the two instruments disagree beyond their uncertainty in {listed} (En, 1 is the limit): these "
-        f"{'angles and lengths' if len(kinds) > 1 else 'errors'} keep the value of the first one with half of the "
-        "difference as uncertainty; look at calibration, set-up and time between the measurements",
-    )
-
-
-# All kinds of measurement, detected by their columns: lengths, positions, axis runs, six-DOF readings.
-
+if TYPE_CHECKING:
+    from compgen.data.axis_runs import AxisRuns
+    from compgen.data.deviations import Deviations
+    from compgen.identify.six_dof import SixDofMeasurement
 
 #: Deviations that are all smaller than this are refused: 100 um in the wrong unit, mm for um.
 SMALLEST_UM = 0.1
@@ -240,7 +41,7 @@ class MixedMeasurement:
     sixdof: SixDofMeasurement
 
 
-Measurement = Lengths | Deviations | AxisRuns | SixDofMeasurement | MixedMeasurement
+Measurement: TypeAlias = "Lengths | Deviations | AxisRuns | SixDofMeasurement | MixedMeasurement"
 
 
 @overload
@@ -274,11 +75,17 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
         )
     if not posed:
         return _read_others(others)
+    from compgen.identify.six_dof import SixDofMeasurement
+    from compgen.instruments.sixdof_instrument import read_instrument
+    from compgen.instruments.sixdof_readings import read_sixdof
+
     sixdof = SixDofMeasurement(read_sixdof(posed), read_instrument(str(instrument)))
     if not others:
         return sixdof
+    from compgen.data.deviations import Deviations
+
     other = _read_others(others)
-    if isinstance(other, AxisRuns):
+    if not isinstance(other, Lengths | Deviations):
         raise InputError("contains axis runs, and another file six-DOF readings; give only one of them", file=others[0])
     return MixedMeasurement(other, sixdof)
 
@@ -288,42 +95,41 @@ def _read_others(paths: Sequence[str | Path]) -> Lengths | Deviations | AxisRuns
     if "diagonals" in kinds:
         text = "contains measured diagonals, from which no errors can be identified; use accuracy or compare"
         raise InputError(text, file=paths[kinds.index("diagonals")])
-    for kind, read, other in _SINGLE_KINDS:
-        if kind in kinds:
-            if set(kinds) != {kind}:
-                odd = next(path for path, found in zip(paths, kinds, strict=True) if found != kind)
-                raise InputError(f"contains {other}, but another file does; identify them separately", file=odd)
-            return read(paths)
-    if "deviations" not in kinds:
+    if not {"part", "axis", "deviations"} & set(kinds):
         return read_lengths(paths)
-    if set(kinds) != {"deviations"}:
-        odd = next(path for path, found in zip(paths, kinds, strict=True) if found != "deviations")
-        message = "contains tracer lengths, and another file deviations; identify them separately"
-        raise InputError(message, file=odd)
-    return read_deviations(paths)
+    from compgen.data.axis_runs import read_axis_runs
+    from compgen.data.deviations import read_deviations, read_parts
 
-
-#: Kinds that only files of the same kind are read with: format, reader, what another file lacks.
-_SINGLE_KINDS: tuple[tuple[str, Callable[[Sequence[str | Path]], Deviations | AxisRuns], str], ...] = (
-    ("part", read_parts, "no features of a part"),
-    ("axis", read_axis_runs, "no axis runs"),
-)
+    # format, what another file lacks or has, reader
+    known: tuple[tuple[str, str, Callable[[Sequence[str | Path]], Deviations | AxisRuns]], ...] = (
+        ("part", "contains no features of a part, but another file does", read_parts),
+        ("axis", "contains no axis runs, but another file does", read_axis_runs),
+        ("deviations", "contains tracer lengths, and another file deviations", read_deviations),
+    )
+    kind, contrast, read = next(item for item in known if item[0] in kinds)
+    if set(kinds) != {kind}:
+        odd = next(path for path, found in zip(paths, kinds, strict=True) if found != kind)
+        raise InputError(f"{contrast}; identify them separately", file=odd)
+    return read(paths)
 
 
 def describe(measurement: Measurement | ErrorTable) -> str:
     """Say in words what was measured."""
+    if isinstance(measurement, Lengths):
+        return f"{len(measurement)} lengths of {len(measurement.stations)} stations"
     if isinstance(measurement, ErrorTable):
         return f"{len(measurement.names)} errors of another program"
     if isinstance(measurement, MixedMeasurement):
         return f"{describe(measurement.other)}, {describe(measurement.sixdof)}"
-    if isinstance(measurement, SixDofMeasurement):
-        return f"{len(measurement)} six-DOF readings in {len(measurement.readings.runs())} runs"
+    from compgen.data.axis_runs import AxisRuns
+    from compgen.data.deviations import PART, Deviations
+
     if isinstance(measurement, Deviations):
         what = "features of parts" if measurement.metadata.get("measured") == PART else "measured positions"
         return f"{len(measurement)} {what}"
     if isinstance(measurement, AxisRuns):
         return f"{len(measurement)} readings along {', '.join(AXES[axis] for axis in measurement.axes)}"
-    return f"{len(measurement)} lengths of {len(measurement.stations)} stations"
+    return f"{len(measurement)} six-DOF readings in {len(measurement.readings.runs())} runs"
 
 
 def identify_measurement(
@@ -331,25 +137,32 @@ def identify_measurement(
 ) -> Identification:
     """Identify from any kind; InputError for options that belong to another kind."""
     chosen = options or IdentifyOptions()
-    if isinstance(measurement, MixedMeasurement):
-        first = identify_measurement(machine, measurement.other, chosen)
-        return merge(machine, first, identify_sixdof(machine, measurement.sixdof))
     if isinstance(measurement, Lengths):
         if chosen.u_deviation_um is not None:
             raise InputError("an uncertainty of deviations (--u-deviation-um) was given, but the files contain lengths")
         return identify(machine, measurement, chosen)
+    from compgen.data.axis_runs import AxisRuns
+    from compgen.data.deviations import Deviations
+    from compgen.identify.merging import merge
+    from compgen.identify.positions import identify_deviations
+    from compgen.identify.single_axes import identify_axis_runs
+    from compgen.identify.six_dof import identify_sixdof
+
+    if isinstance(measurement, MixedMeasurement):
+        first = identify_measurement(machine, measurement.other, chosen)
+        return merge(machine, first, identify_sixdof(machine, measurement.sixdof))
     if isinstance(measurement, Deviations | AxisRuns) and not chosen.small_deviations:
         _check_size(measurement)
     stated = chosen.u_length_um is not None or chosen.u_length_um_per_m is not None
     other = stated or chosen.method != "joint" or chosen.stations is not None
     other = other or chosen.systematic != SystematicInputs()
-    if isinstance(measurement, SixDofMeasurement):
-        if other or chosen.u_deviation_um is not None:
+    if isinstance(measurement, Deviations):
+        if other:
             raise InputError(
-                "--method, --stations, --u-... apply to tracer lengths and deviations; the files contain six-DOF readings, "
-                "whose uncertainties the instrument file gives ([noise], [u_constants], [u_systematics])"
+                "--method, --stations, --u-length-... and the systematic inputs apply to tracer lengths; the files contain "
+                "deviations, which take --u-deviation-um"
             )
-        return identify_sixdof(machine, measurement)
+        return identify_deviations(machine, measurement, chosen)
     if isinstance(measurement, AxisRuns):
         if other or chosen.u_deviation_um is not None:
             raise InputError(
@@ -357,12 +170,12 @@ def identify_measurement(
                 "uncertainty is that of their scatter"
             )
         return identify_axis_runs(machine, measurement)
-    if other:
+    if other or chosen.u_deviation_um is not None:
         raise InputError(
-            "--method, --stations, --u-length-... and the systematic inputs apply to tracer lengths; the files contain "
-            "deviations, which take --u-deviation-um"
+            "--method, --stations, --u-... apply to tracer lengths and deviations; the files contain six-DOF readings, "
+            "whose uncertainties the instrument file gives ([noise], [u_constants], [u_systematics])"
         )
-    return identify_deviations(machine, measurement, chosen)
+    return identify_sixdof(machine, measurement)
 
 
 def _check_size(measurement: Deviations | AxisRuns) -> None:

@@ -9,20 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from compgen import effects as catalogue
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
-from compgen.effects import (
-    ActiveEffect,
-    DisplacementEffect,
-    Readings,
-    active_effects,
-    displacement_of,
-    readings_of_deviations,
-    readings_of_lengths,
-)
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify.adjust.propagation import Adjustment
 from compgen.identify.adjust.residual_tests import (
@@ -56,16 +48,18 @@ from compgen.kinematics.first_order import tool_of
 FAR_MM = (0.0, 0.0, 1e5)
 
 
-def effects_of_lengths(machine: Machine, lengths: Lengths) -> tuple[ActiveEffect, ...]:
+def effects_of_lengths(machine: Machine, lengths: Lengths) -> tuple[catalogue.ActiveEffect, ...]:
     """Return the effects of the machine file that act on these lengths; warns of columns that they lack."""
-    effects = active_effects(machine)
-    if not effects:
+    if not machine.effects:
         return ()
+    effects = catalogue.active_effects(machine)
     tip_mm = lengths.position_mm + tool_of(machine, lengths.tool_mm)
-    return _usable(effects, readings_of_lengths(machine, lengths, tip_mm - np.array(FAR_MM), tip_mm))
+    return _usable(effects, catalogue.readings_of_lengths(machine, lengths, tip_mm - np.array(FAR_MM), tip_mm))
 
 
-def _usable(effects: Sequence[ActiveEffect], readings: Readings) -> tuple[ActiveEffect, ...]:
+def _usable(
+    effects: Sequence[catalogue.ActiveEffect], readings: catalogue.Readings
+) -> tuple[catalogue.ActiveEffect, ...]:
     usable = []
     for active in effects:
         card = active.effect.card
@@ -79,38 +73,40 @@ def _usable(effects: Sequence[ActiveEffect], readings: Readings) -> tuple[Active
     return tuple(usable)
 
 
-def _settled(active: ActiveEffect, readings: Readings) -> ActiveEffect:
+def _settled(active: catalogue.ActiveEffect, readings: catalogue.Readings) -> catalogue.ActiveEffect:
     """The effect with what its settings are for these readings, so that a part of them means the same."""
     return replace(active, effect=active.effect.with_settings(active.effect.used(readings)))
 
 
-def moved_by(effects: Sequence[ActiveEffect], readings: Readings) -> tuple[FloatArray, FloatArray]:
+def moved_by(effects: Sequence[catalogue.ActiveEffect], readings: catalogue.Readings) -> tuple[FloatArray, FloatArray]:
     """Return how effects move the tip (n, 3), and what the others add to the readings (n,), mm."""
-    moved, _ = displacement_of(effects, readings)
+    moved, _ = catalogue.displacement_of(effects, readings)
     lengthened = np.zeros(len(readings))
     for active in effects:
-        if not isinstance(active.effect, DisplacementEffect):
+        if not isinstance(active.effect, catalogue.DisplacementEffect):
             change = active.change_mm(readings)
             lengthened += 0.0 if change is None else change
     return moved, lengthened
 
 
-def notes_of(effects: Sequence[ActiveEffect]) -> dict[str, Any]:
+def notes_of(effects: Sequence[catalogue.ActiveEffect]) -> dict[str, Any]:
     """Return the object ``effects`` of ``identify.json``: parameters and settings by the name of the effect."""
     return {active.name: active.summary() for active in effects}
 
 
 def without_effects(machine: Machine, deviations: Deviations) -> tuple[Deviations, dict[str, Any]]:
     """Return deviations without what the machine file's effects add, and what was taken out."""
-    readings = readings_of_deviations(machine, deviations)
-    effects = _usable(active_effects(machine), readings)
+    if not machine.effects:
+        return deviations, {}
+    readings = catalogue.readings_of_deviations(machine, deviations)
+    effects = _usable(catalogue.active_effects(machine), readings)
     moved, lengthened = moved_by(effects, readings)
     moved_mm = np.zeros((3, len(deviations)))  # readings are all dX, then all dY, then all dZ
     moved_mm[~np.isnan(deviations.deviation_mm.T)] = np.sum(readings.direction * moved, axis=1) + lengthened
     return replace(deviations, deviation_mm=deviations.deviation_mm - moved_mm.T), notes_of(effects)
 
 
-# Readings brought to reference conditions: machine scales at 20 degC, the wavelength of the air that was there.
+# catalogue.Readings brought to reference conditions: machine scales at 20 degC, the wavelength of the air that was there.
 #
 # * **Scales.** At the temperature T of an axis its scale has grown about the reference point: at the command q the
 #   carriage stands at q + alpha (T - 20 degC)(q - q_ref), along the (leaning) axis. What this does to a length, with the
@@ -148,7 +144,7 @@ class Conditions:
     growth_mm: FloatArray
     dead_share: FloatArray
     notes: Mapping[str, Any]
-    effects: tuple[ActiveEffect, ...] = ()
+    effects: tuple[catalogue.ActiveEffect, ...] = ()
 
     @property
     def needs_geometry(self) -> bool:
@@ -178,7 +174,7 @@ class Conditions:
         """Displacement of the tips (n, 3) and change of the lengths (n,) by the effects."""
         if not self.effects:
             return np.zeros_like(tip), np.zeros(len(tip))
-        return moved_by(self.effects, readings_of_lengths(self.machine, lengths, station, tip))
+        return moved_by(self.effects, catalogue.readings_of_lengths(self.machine, lengths, station, tip))
 
 
 def reading_conditions(machine: Machine, lengths: Lengths, *, temperature: bool = True) -> tuple[Lengths, Conditions]:

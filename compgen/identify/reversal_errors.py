@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.records import approach_of
 from compgen.identify.adjust.levels import levels_of
 from compgen.identify.adjust.robust import time_order
 from compgen.identify.adjust.unknowns import IntArray
-from compgen.simulate.trajectory import approach_of
 
 #: A reversal smaller than this many standard uncertainties is not taken out of the readings.
 SIGNIFICANT = 5.0

@@ -16,6 +16,7 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Lengths, Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
+from compgen.data.records import approach_of
 from compgen.effects import Card, Effect, Readings, catalogue
 from compgen.effects.catalogue import INVISIBLE, Pair, VisiblePart, alike_pairs, separating, visible_parts
 from compgen.effects.structure import SignError, Squareness
@@ -31,7 +32,6 @@ from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.kinematics.volume_grid import volume_grid
 from compgen.plan.stations import PlannedStations
-from compgen.simulate.trajectory import approach_of
 
 # The least-squares problem of a measurement that has not been made: its normal matrix, and what follows from it.
 

@@ -18,6 +18,7 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine, Vector3
 from compgen.data.names import AXES, SECONDS_PER_HOUR, SECONDS_PER_MIN
+from compgen.data.records import approach_of
 from compgen.data.toml_files import setting
 from compgen.errors import InputError
 from compgen.simulate.truth import counts
@@ -260,13 +261,6 @@ def _times(moves: FloatArray, trajectory: Trajectory) -> FloatArray:
     travel_s = np.linalg.norm(moves, axis=1) / trajectory.feed_mm_min * SECONDS_PER_MIN
     travel_s[0] = 0.0  # the clock starts at the first stop
     return np.cumsum(travel_s + trajectory.dwell_s)
-
-
-def approach_of(moves: FloatArray) -> FloatArray:
-    """Last direction of travel of each axis after moves (n, 3): +1, -1, or 0 while it has not moved yet; (n, 3)."""
-    moving = moves != 0
-    last = np.maximum.accumulate(np.where(moving, np.arange(len(moves))[:, None], 0), axis=0)
-    return np.sign(np.take_along_axis(moves, last, axis=0))
 
 
 # A measurement session of runs: every line at several loads and feeds, repeated, in random order, with temperatures.

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from compgen import effects
 from compgen.controls import CONTROLLERS, AnyController, SourceFile, controller_named
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview, shortened
@@ -17,7 +18,6 @@ from compgen.data.files import OutputFolder, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
-from compgen.effects import advice_of_effects
 from compgen.errors import CompgenWarning, InputError
 from compgen.resources import program_version
 from compgen.tables.render import Format, companion_files, errors_context, load_format, render, render_files
@@ -277,7 +277,7 @@ def export(
         tables = control.with_reversal(tables, in_tables) if in_tables.curves else tables
     own = _with_backlash(control, control.context(tables), rest)
     said = [*control.reservations(tables), *control.left_out(errors)]
-    said += [*machine.emphasis.notes, *advice_of_effects(machine)]
+    said += [*machine.emphasis.notes, *(effects.advice_of_effects(machine) if machine.effects else [])]
     own = {**own, "warnings": [*own["warnings"], *said]}
     common = export_context(machine, errors, controller, provenance or Provenance(), reversal)
     files = render_files(card, {**common, **own}, templates)

@@ -18,7 +18,8 @@ from compgen.identify.adjust.residual_tests import check_whiteness
 from compgen.instruments.interferometer import refractive_index
 from compgen.kinematics import modelled_errors
 from compgen.kinematics.exact_chain import tip_position
-from compgen.simulate.trajectory import approach_of, serpentine
+from compgen.data.records import approach_of
+from compgen.simulate.trajectory import serpentine
 
 NANOMETRE = 1e-6  # mm
 MICROMETRE = 1e-3

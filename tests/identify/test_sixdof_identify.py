@@ -15,7 +15,7 @@ from compgen.data.machine import load_machine
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import identify_measurement, joint_covariance, read_measurement
 from compgen.identify.adjust.unknowns import error_parameters
-from compgen.identify.any_measurement import projected
+from compgen.identify.merging import projected
 from compgen.identify.six_dof import SixDofMeasurement, identify_sixdof
 from compgen.instruments.sixdof_instrument import read_instrument
 from compgen.instruments.sixdof_readings import format_sixdof, read_sixdof

@@ -27,7 +27,7 @@ from compgen.simulate import (
     trajectory_points,
     write_simulation,
 )
-from compgen.simulate.trajectory import approach_of
+from compgen.data.records import approach_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LENGTH_TOLERANCE_MM = 1e-9
