@@ -267,9 +267,11 @@ def verified_export(
     What the export itself could not hold (a limit that binds) is a reason too.
     """
     with working_folder() as staging:
-        written = exported.write(staging, accepted=True)
+        output = OutputFolder(staging)
+        names = exported.add_to(output, accepted=True)
+        paths = output.commit()
         try:
-            tables = read_tables(machine, written, exported.controller)
+            tables = read_tables(machine, [paths[name] for name in names], exported.controller)
         except InputError as error:
             name = Path(error.file).name if error.file else None
             message = f"the rendered file cannot be read back, so its template is wrong: {error.message}"
@@ -301,7 +303,7 @@ def identify_bare(
     if active is None and not isinstance(measurement, ErrorTable):
         return identify_measurement(machine, measurement, options)
     from compgen.data.deviations import Deviations
-    from compgen.foreign.given import given_errors
+    from compgen.foreign.converted import given_errors
     from compgen.tables.active import without_active
 
     if active is None and isinstance(measurement, ErrorTable):

@@ -2,19 +2,100 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from compgen.controls import CONTROLLERS
-from compgen.data.registry import PATH_ORIGIN, Kind, load_entry_points, load_file
+from compgen.controls import CONTROLLERS, Controller
+from compgen.data.registry import PATH_ORIGIN, Kind, call_problem, load_entry_points, load_file
 from compgen.effects import FAMILIES
 from compgen.effects.catalogue import check_family
+from compgen.errors import InputError
 from compgen.simulate import EFFECTS, INSTRUMENTS
 from compgen.simulate.run import check_effect, check_instrument
-from compgen.tables.render import check_control
+from compgen.tables.render import check_templates
+
+
+def check_control(name: str, thing: Any) -> tuple[Any, list[str]]:
+    """Return the class of the control and what is wrong with it; one of the former interface gets its adapter."""
+    code: Any = thing if inspect.isclass(thing) else type(thing)
+    former = next((item for item in code.__mro__ if "bound_form" in vars(item)), None)
+    interface = former or Controller
+    if not issubclass(code, interface):
+        return thing, ["it is not a subclass of compgen.controls.Controller"]
+    problems = _method_problems(code, interface)
+    if former and not problems:
+        try:
+            thing = code() if thing is code else thing
+        except Exception as error:  # code of a third party
+            return code, [f"{code.__name__}() fails: {type(error).__name__}: {error}"]
+    problems += _attribute_problems(name, code, interface)
+    if problems:
+        return code, problems
+    control = thing.bound_form() if former else code
+    if control.templates is None:
+        file = inspect.getsourcefile(code)
+        control.templates = Path(file).resolve().parent / "templates" if file else None
+    problems = _template_problems(name, control.templates)
+    return code if problems else control, problems
+
+
+def _method_problems(code: type, interface: type) -> list[str]:
+    """Methods that the class lacks or that cannot be called as those of the interface."""
+    problems = []
+    abstract: frozenset[str] = getattr(code, "__abstractmethods__", frozenset())
+    missing = [item for item in vars(interface) if item in abstract]
+    if missing:
+        texts = [f"{item}({', '.join(_arguments(interface, item))})" for item in missing]
+        problems.append(f"{code.__name__} has no {', '.join(texts)}")
+    for item in vars(interface):
+        method = getattr(code, item, None)
+        if item not in missing and item[0] != "_" and callable(getattr(interface, item)):
+            bound = method.__get__(object()) if inspect.isfunction(method) else method
+            problems += call_problem(bound, _arguments(interface, item), f"{code.__name__}.{item}")
+    if interface is Controller:
+        own = code.__mro__[: code.__mro__.index(Controller)]
+        if not hasattr(code, "settings_class") and not any("read_settings" in vars(item) for item in own):
+            problems.append(f"{code.__name__} has no settings_class, the dataclass of its settings")
+        problems += call_problem(code, _BINDING, code.__name__)
+    return problems
+
+
+#: What the class of a control is called with.
+_BINDING = ("machine", "settings")
+
+
+def _arguments(interface: type, method: str) -> list[str]:
+    return [key for key in inspect.signature(getattr(interface, method)).parameters if key != "self"]
+
+
+def _attribute_problems(name: str, code: Any, interface: Any) -> list[str]:
+    problems = []
+    own = getattr(code, "name", None)
+    if own != name:
+        problems.append(f"{code.__name__}.name has to be {name!r}, it is {'missing' if own is None else repr(own)}")
+    for item in ("anchored", "bidirectional"):
+        if not isinstance(getattr(code, item), bool):
+            problems.append(f"{code.__name__}.{item} has to be True or False")
+    if code.bidirectional is True and code.with_reversal is interface.with_reversal:
+        arguments = ", ".join(_arguments(interface, "with_reversal"))
+        problems.append(f"{code.__name__} is bidirectional, so it needs with_reversal({arguments})")
+    return problems
+
+
+def _template_problems(name: str, folder: Any) -> list[str]:
+    if not isinstance(folder, Path) or not (folder / name / "format.toml").is_file():
+        place = f"{folder}/{name}" if folder else f"templates/{name}"
+        return [f"its folder {place} with format.toml and the templates is missing"]
+    try:
+        check_templates(name, folder)
+    except InputError as error:
+        return [str(error)]
+    return []
+
 
 #: What plug-ins may add: word, name of the dict in a file, group of entry points, registry, check.
 KINDS = (

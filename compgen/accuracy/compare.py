@@ -16,7 +16,6 @@ from compgen.accuracy.evaluate import (
     LINES,
     MOST_IN_PAIRS,
     Accuracy,
-    accuracy_of_runs,
     groups_of_errors,
     narrowed,
     statements_of,
@@ -33,7 +32,7 @@ from compgen.accuracy.field import (
     volume_figures,
 )
 from compgen.accuracy.figure import ComparedFigure, Figure
-from compgen.accuracy.positioning import EDITIONS, LATEST, SAME_TARGET_MM, RunStatistics, SetupBudget
+from compgen.accuracy.positioning import EDITIONS, LATEST, SAME_TARGET_MM, RunStatistics, SetupBudget, accuracy_of_runs
 from compgen.data.csv_files import FloatArray
 from compgen.data.declared import option
 from compgen.data.deviations import Deviations

@@ -26,10 +26,10 @@ from compgen.accuracy.positioning import (
     positioning_test,
     run_statistics,
 )
-from compgen.data.axis_runs import BODY_DIAGONALS, Diagonals, along_mm
+from compgen.data.axis_runs import Diagonals, along_mm
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES
+from compgen.data.names import AXES, BODY_DIAGONALS, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES
 from compgen.errors import InputError
 from compgen.kinematics.first_order import c_matrix
 

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,19 +22,19 @@ from compgen.accuracy.field import (
     volume_figures,
 )
 from compgen.accuracy.figure import Figure
-from compgen.accuracy.positioning import LATEST, NO_BUDGET, RunStatistics, SetupBudget, positioning_test, vdi_3441
-from compgen.data.axis_runs import BODY_DIAGONALS
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Bars, Drawable, Overview, Panel, shortened
 from compgen.data.error_table import Curve, ReversalCurves, read_reversal
 from compgen.data.files import read_text
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.data.names import AXES, BODY_DIAGONALS, ERROR_INDEX, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.errors import InputError
-from compgen.identify import Identification
 from compgen.kinematics.curves import fitted_line, hat_matrix
 from compgen.kinematics.first_order import c_matrix
 from compgen.kinematics.volume_grid import volume_grid
+
+if TYPE_CHECKING:
+    from compgen.identify import Identification
 
 # Straightness against a stated reference line, and squareness of two reference lines (ISO 230-1).
 #
@@ -523,29 +523,6 @@ def statements_of(machine: Machine, field: ErrorField, line: str) -> tuple[str, 
         f"reference line of straightness and squareness: {line}",
         "checked against published formulas and worked examples, not certified",
     )
-
-
-def accuracy_of_runs(
-    statistics: Mapping[str, RunStatistics], edition: int = LATEST, budgets: Mapping[str, SetupBudget] | None = None
-) -> Accuracy:
-    """Return ISO 230-2 and, where the runs allow it, VDI/DGQ 3441 of every axis; groups are the axes' letters.
-
-    Parameters
-    ----------
-    statistics : by axis.
-    edition : of ISO 230-2.
-    budgets : what the set-up adds to the uncertainties, by axis.
-    """
-    groups: dict[str, dict[str, Figure]] = {}
-    targets = {}
-    for axis, item in statistics.items():
-        budget = (budgets or {}).get(axis, NO_BUDGET)
-        test = positioning_test(item, edition, budget)
-        groups[axis], targets[axis] = dict(test.figures), test.targets
-        if item.bidirectional and item.repeated:
-            groups[axis] |= {f"VDI {key}": figure for key, figure in vdi_3441(item, budget).items()}
-    statements = (f"ISO 230-2:{edition}", "checked against published formulas and worked examples, not certified")
-    return Accuracy(groups, statements, targets)
 
 
 def narrowed(machine: Machine, lower_mm: FloatArray, upper_mm: FloatArray) -> Machine:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import gammaln
 
+from compgen.accuracy.evaluate import Accuracy
 from compgen.accuracy.figure import Figure
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.csv_files import FloatArray
@@ -420,3 +421,26 @@ def vdi_3441(statistics: RunStatistics, budget: SetupBudget = NO_BUDGET) -> dict
         "U_mean": (mean(reversal), "mean reversal"),
     }
     return {key: figure(statistics, item, f"{text}, VDI/DGQ 3441", budget) for key, (item, text) in found.items()}
+
+
+def accuracy_of_runs(
+    statistics: Mapping[str, RunStatistics], edition: int = LATEST, budgets: Mapping[str, SetupBudget] | None = None
+) -> Accuracy:
+    """Return ISO 230-2 and, where the runs allow it, VDI/DGQ 3441 of every axis; groups are the axes' letters.
+
+    Parameters
+    ----------
+    statistics : by axis.
+    edition : of ISO 230-2.
+    budgets : what the set-up adds to the uncertainties, by axis.
+    """
+    groups: dict[str, dict[str, Figure]] = {}
+    targets = {}
+    for axis, item in statistics.items():
+        budget = (budgets or {}).get(axis, NO_BUDGET)
+        test = positioning_test(item, edition, budget)
+        groups[axis], targets[axis] = dict(test.figures), test.targets
+        if item.bidirectional and item.repeated:
+            groups[axis] |= {f"VDI {key}": figure for key, figure in vdi_3441(item, budget).items()}
+    statements = (f"ISO 230-2:{edition}", "checked against published formulas and worked examples, not certified")
+    return Accuracy(groups, statements, targets)

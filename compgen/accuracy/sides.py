@@ -53,7 +53,7 @@ from compgen.tables import ReadTables
 #: Bytes that tell what a file is.
 _LOOKED_AT = 1_000_000
 #: Reads the files of one measurement, with the constants of a six-DOF instrument.
-Reader = Callable[[Sequence[str | Path], Path | None], Measurement | ErrorTable]
+Reader = Callable[[Sequence[str | Path], Path | None], "Measurement | ErrorTable"]
 PREDICTED_COLUMNS = ("ex_um", "ey_um", "ez_um")
 
 

@@ -15,8 +15,8 @@ from rich.console import Console, RenderableType
 
 from compgen.accuracy.compare import CompareOptions, Comparison
 from compgen.accuracy.diagonals import accuracy_of_diagonals
-from compgen.accuracy.evaluate import accuracy_of_errors, accuracy_of_runs
-from compgen.accuracy.positioning import SetupBudget
+from compgen.accuracy.evaluate import accuracy_of_errors
+from compgen.accuracy.positioning import SetupBudget, accuracy_of_runs
 from compgen.accuracy.sides import Reader, compare_prediction, compare_sides, read_side, with_prediction
 from compgen.cli.common import NUMBER, PATH, Command, json_option, out_option
 from compgen.cli.shared_options import instrument_option, machine_argument, options_of

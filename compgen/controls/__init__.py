@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, MutableMapping
 from importlib import import_module
+from pathlib import Path
 
 from compgen.controls.shared.base import AnyController, Controller, Monomial, SourceFile, Term
 from compgen.data.files import read_text
@@ -39,6 +40,11 @@ class Controls(MutableMapping[str, type[AnyController]]):
 
     def __len__(self) -> int:
         return len(self._classes)
+
+    def templates(self, name: str) -> Path | None:
+        """Return the folder with the templates of a plug-in's control; None for a built-in one, which stays unloaded."""
+        control = self._classes.get(name)
+        return None if control is None or isinstance(control, str) else control.templates
 
     def __repr__(self) -> str:
         return f"<Controls: {', '.join(self)}>"
@@ -87,8 +93,8 @@ def controller_named(name: str) -> type[AnyController]:
 
 def _hint(name: str) -> str:
     """What was probably meant: the controls with it in their name, in the title of their card, anywhere in the card."""
-    folders = {known: control.templates or data_folder("templates") for known, control in CONTROLLERS.items()}
-    cards = {known: folder / known / "format.toml" for known, folder in folders.items()}
+    shipped = data_folder("templates")
+    cards = {known: (CONTROLLERS.templates(known) or shipped) / known / "format.toml" for known in CONTROLLERS}
     texts = {known: read_text(path) for known, path in cards.items() if path.is_file()}
     titles = {
         known: next((line for line in text.splitlines() if line.startswith("title")), "")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray
 from compgen.data.messages import repeated
-from compgen.data.names import AXES
+from compgen.data.names import AXES, BODY_DIAGONALS
 from compgen.data.records import AXIS, DIRECTION, POSITION, RUN, RUN_DEVIATION, Field, Schema, fail_at
 from compgen.errors import InputError
 
@@ -110,8 +110,7 @@ def format_axis_runs(runs: AxisRuns) -> str:
 # Measured diagonals of the working volume (ISO 230-6): ``*.diagonals.csv``.
 
 
-#: Body diagonals, and face diagonals with 0 for the axis that stands: directions of X, Y, Z from start to end.
-BODY_DIAGONALS = {"PPP": (1, 1, 1), "NPP": (-1, 1, 1), "PNP": (1, -1, 1), "NNP": (-1, -1, 1)}
+#: Face diagonals, with 0 for the axis that stands.
 FACE_DIAGONALS = {
     "PP0": (1, 1, 0),
     "NP0": (-1, 1, 0),

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 AXES = ("X", "Y", "Z")
+#: Body diagonals: directions of X, Y, Z from start to end.
+BODY_DIAGONALS = {"PPP": (1, 1, 1), "NPP": (-1, 1, 1), "PNP": (1, -1, 1), "NNP": (-1, -1, 1)}
 Kind = Literal["linear", "angular", "squareness"]
 
 #: Sizes of numbers that anybody gives, whatever their unit, but for zero: squares and quotients of them are numbers too.

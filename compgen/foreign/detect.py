@@ -1,6 +1,6 @@
 """What a file is, by its first bytes, and the import of each foreign format.
 
-:func:`native_format` and :func:`form_of` look at the head of a file; :func:`import_file` calls the reader of its format and
+:func:`form_of` looks at the head of a file; :func:`import_file` calls the reader of its format and
 turns units, sign and axis into those of the project. What the file leaves open becomes a doubt.
 """
 
@@ -15,11 +15,9 @@ import numpy as np
 
 from compgen.controls.etalon_exchange import errors_from_etalon, is_exchange_text
 from compgen.data.axis_runs import AxisRuns
-from compgen.data.csv_files import names_in_header
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable
 from compgen.data.names import AXES, MM_PER_UM, error_named
-from compgen.data.records import format_of_columns
 from compgen.errors import CompgenError, InputError
 from compgen.foreign.cells import chosen_sheet, grid_of_text, holds_readings, read_sheets
 from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, check_field, known_unit
@@ -33,7 +31,6 @@ from compgen.foreign.findings import (
     unit_of_deviations,
     usual_deviation_mm,
 )
-from compgen.foreign.laser_files import MOST_CAPTURE_BYTES as MOST_CAPTURE
 from compgen.foreign.laser_files import (
     REFUSED,
     UNITS,
@@ -49,7 +46,7 @@ from compgen.foreign.laser_files import (
 from compgen.foreign.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion, remarks
 from compgen.foreign.source import (
     MOST_BYTES,
-    MOST_OWN_BYTES,
+    MOST_CAPTURE_BYTES,
     check_size,
     decode_head,
     header_date,
@@ -332,21 +329,9 @@ _TAKES: dict[str, tuple[str, ...]] = {
 }
 
 
-def native_format(path: Path) -> str | None:
-    """Return the kind of a native file, None for a foreign one; InputError for what is not data."""
-    check_size(path, MOST_CAPTURE)
-    head = read_head(path)
-    if head.startswith((b"PK\x03\x04", b"HEADER::", b"\xff\xfe", b"\xfe\xff")):
-        return None
-    kind = format_of_columns(names_in_header(decode_head(head).lstrip("\ufeff")), complete=True)
-    if kind not in (None, "sixdof", "part"):
-        check_size(path, MOST_OWN_BYTES)
-    return kind
-
-
 def form_of(path: Path) -> str:
     """Return the name of a foreign file's format."""
-    check_size(path, MOST_CAPTURE)
+    check_size(path, MOST_CAPTURE_BYTES)
     head = read_head(path)
     if head.startswith(b"PK\x03\x04"):
         return "xlsx"

@@ -17,7 +17,16 @@ from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.files import read_bytes
 from compgen.errors import InputError
 from compgen.foreign.one_axis import IntArray, OneAxis, cycles, motion
-from compgen.foreign.source import ENCODINGS_EAST, HEAD_BYTES, Text, check_size, parse_number, read_source, shown
+from compgen.foreign.source import (
+    ENCODINGS_EAST,
+    HEAD_BYTES,
+    MOST_CAPTURE_BYTES,
+    Text,
+    check_size,
+    parse_number,
+    read_source,
+    shown,
+)
 
 # Renishaw laser files in text form: .rtl (linear, um), .rta (angular, mrad), .rts (straightness, um).
 #
@@ -382,7 +391,6 @@ def _check_complete(
 _START, _DATA = b"HEADER::\r\n", b"\nData:\r\n"
 #: The end mark is looked for in so many bytes behind the samples.
 _TRAILER_BYTES, _SAMPLE_BYTES = 16, 8
-MOST_CAPTURE_BYTES = 4_000_000_000
 #: More samples than this are not written as text.
 MOST_ROWS = 2_000_000
 

@@ -22,6 +22,9 @@ MEGABYTE = 1_000_000
 MOST_BYTES = 128 * MEGABYTE
 #: The project's own files are read faster, but they too fit into the memory of a workstation.
 MOST_OWN_BYTES = 256 * MEGABYTE
+
+#: Captures over time are read piece by piece.
+MOST_CAPTURE_BYTES = 4_000_000_000
 #: Larger numbers are none (a number of 400 digits becomes infinite).
 LARGEST = 1e300
 #: So much of a file says what it is.

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Deviations
 from compgen.data.display import Drawable, Overview, Panel, PlottedLine
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
@@ -22,6 +21,9 @@ from compgen.identify.adjust.robust import Rejected, Segment
 from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.reversal_errors import Reversal
 from compgen.kinematics.first_order import observable_errors
+
+if TYPE_CHECKING:
+    from compgen.data.deviations import Deviations
 
 # What an identification returns, and the contents of ``identify.json``.
 

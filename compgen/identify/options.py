@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from compgen.data.csv_files import FloatArray, read_csv
 from compgen.data.declared import option
-from compgen.data.deviations import Deviations
 from compgen.data.lengths import POSITION_COLUMNS, Lengths
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest
@@ -23,6 +22,9 @@ from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.adjust.starts import station_start
 from compgen.identify.adjust.unknowns import IntArray, KnownPositions, State
 from compgen.kinematics.first_order import tool_of
+
+if TYPE_CHECKING:
+    from compgen.data.deviations import Deviations
 
 # Stations whose machine coordinates are known beforehand: from a file, or located with the machine taken as perfect.
 #

@@ -5,13 +5,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from compgen import effects as catalogue
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
@@ -40,6 +39,9 @@ from compgen.instruments.interferometer import (
 )
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.first_order import tool_of
+
+if TYPE_CHECKING:
+    from compgen.data.deviations import Deviations
 
 # Effects that the machine file switches on, taken out of the readings before errors are identified.
 

@@ -60,7 +60,6 @@ from compgen.identify.options import (
     with_known_start,
 )
 from compgen.identify.reference_conditions import identify_at_reference
-from compgen.identify.two_step import TracerReadings, solve_in_two_steps
 from compgen.kinematics.kernel_switch import one_thread
 
 # The readings of an identification with the problem that they pose, and start values in closed form.
@@ -515,6 +514,8 @@ def _two_step_result(
     """Identify by self-calibration, transformation and separation (Zha & Zhang 2024, sections 4 and 5)."""
     if options.stations is not None:
         raise InputError("known stations need the joint method; in the two-step method the tracers locate themselves")
+    from compgen.identify.two_step import TracerReadings, solve_in_two_steps
+
     readings = TracerReadings(task.lengths, task.problem.parameters, task.group, sigma_mm, start)
     found = solve_in_two_steps(readings, reject=options.reject)
     residual = task.problem.residuals(found.solution.state)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,8 +12,10 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import InputError
-from compgen.instruments.sixdof_instrument import SixDofInstrument
-from compgen.instruments.sixdof_readings import SixDof
+
+if TYPE_CHECKING:
+    from compgen.instruments.sixdof_instrument import SixDofInstrument
+    from compgen.instruments.sixdof_readings import SixDof
 
 # Refractive index of air, for interferometers that did not compensate the wavelength.
 

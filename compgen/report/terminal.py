@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
@@ -12,21 +12,22 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from compgen.accuracy.compare import Comparison
-from compgen.accuracy.evaluate import Accuracy
-from compgen.accuracy.figure import ComparedFigure, Figure
 from compgen.data.csv_files import FloatArray
 from compgen.data.messages import number_text, one_line, um_text
 from compgen.data.names import COVERAGE, error_named
-from compgen.effects.catalogue import separating
 from compgen.fit import FitResult
 from compgen.identify import Identification
 from compgen.pipeline import RunResult
-from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate
 from compgen.tables import Residuals, Verification
-from compgen.tables.active import MergeReport
-from compgen.tables.diff import TableDifference
 from compgen.tables.signs import ACCEPTED, REJECTED, SAME, CrashTest
+
+if TYPE_CHECKING:
+    from compgen.accuracy.compare import Comparison
+    from compgen.accuracy.evaluate import Accuracy
+    from compgen.accuracy.figure import ComparedFigure, Figure
+    from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate
+    from compgen.tables.active import MergeReport
+    from compgen.tables.diff import TableDifference
 
 # Readable summaries for the terminal, and the JSON of ``volcomp run``.
 
@@ -506,6 +507,8 @@ def trajectory_table(
 
 def visibility_table(visible: PlanVisibility) -> Group:
     """Return what the plan can never see of the effects other than geometric errors, and which look alike."""
+    from compgen.effects.catalogue import separating
+
     never = Table("what this plan can never see", "why", "measure in addition", box=box.SIMPLE)
     for (reason, breaker), names in _grouped(visible).items():
         never.add_row(", ".join(names), reason, breaker)

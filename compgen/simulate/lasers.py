@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data import toml_files
-from compgen.data.axis_runs import BODY_DIAGONALS, DIAGONALS, AxisRuns, Diagonals
+from compgen.data.axis_runs import DIAGONALS, AxisRuns, Diagonals
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine, Vector3
-from compgen.data.names import AXES, MM_PER_UM, SECONDS_PER_MIN
+from compgen.data.names import AXES, BODY_DIAGONALS, MM_PER_UM, SECONDS_PER_MIN
 from compgen.data.toml_files import setting
 from compgen.errors import InputError
 from compgen.simulate.effects import LengthEffect, RunEffect, SimulatedEffect

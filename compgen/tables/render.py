@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import inspect
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,14 +17,13 @@ from jinja2 import ChoiceLoader, FileSystemLoader, StrictUndefined, TemplateErro
 from jinja2.runtime import Context
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
-from compgen.controls import CONTROLLERS, Controller
+from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.csv_files import fixed
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.messages import one_line
 from compgen.data.names import AXES, ERRORS
-from compgen.data.registry import call_problem
 from compgen.errors import InputError
 from compgen.resources import data_folder
 
@@ -110,7 +108,7 @@ def _prose(value: Any) -> str:
 
 def template_folders(name: str, folder: Path | None = None) -> list[Path]:
     """Return where the templates of control ``name`` are looked for: the user's, a plug-in's own, the shipped ones."""
-    own = CONTROLLERS[name].templates if name in CONTROLLERS else None
+    own = CONTROLLERS.templates(name)
     return [*([folder] if folder else []), *([own] if own else []), data_folder("templates")]
 
 
@@ -392,84 +390,3 @@ def companion_files(
         text = render(card, f"{FOLDER}/{path.name}", context, folder)
         found[name] = text.replace("\n", "\r\n") if crlf else text
     return found
-
-
-# What a control of a plug-in must have; everything that is missing is reported at once, when it is registered.
-
-
-def check_control(name: str, thing: Any) -> tuple[Any, list[str]]:
-    """Return the class of the control and what is wrong with it; one of the former interface gets its adapter."""
-    code: Any = thing if inspect.isclass(thing) else type(thing)
-    former = next((item for item in code.__mro__ if "bound_form" in vars(item)), None)
-    interface = former or Controller
-    if not issubclass(code, interface):
-        return thing, ["it is not a subclass of compgen.controls.Controller"]
-    problems = _method_problems(code, interface)
-    if former and not problems:
-        try:
-            thing = code() if thing is code else thing
-        except Exception as error:  # code of a third party
-            return code, [f"{code.__name__}() fails: {type(error).__name__}: {error}"]
-    problems += _attribute_problems(name, code, interface)
-    if problems:
-        return code, problems
-    control = thing.bound_form() if former else code
-    if control.templates is None:
-        file = inspect.getsourcefile(code)
-        control.templates = Path(file).resolve().parent / "templates" if file else None
-    problems = _template_problems(name, control.templates)
-    return code if problems else control, problems
-
-
-def _method_problems(code: type, interface: type) -> list[str]:
-    """Methods that the class lacks or that cannot be called as those of the interface."""
-    problems = []
-    abstract: frozenset[str] = getattr(code, "__abstractmethods__", frozenset())
-    missing = [item for item in vars(interface) if item in abstract]
-    if missing:
-        texts = [f"{item}({', '.join(_arguments(interface, item))})" for item in missing]
-        problems.append(f"{code.__name__} has no {', '.join(texts)}")
-    for item in vars(interface):
-        method = getattr(code, item, None)
-        if item not in missing and item[0] != "_" and callable(getattr(interface, item)):
-            bound = method.__get__(object()) if inspect.isfunction(method) else method
-            problems += call_problem(bound, _arguments(interface, item), f"{code.__name__}.{item}")
-    if interface is Controller:
-        own = code.__mro__[: code.__mro__.index(Controller)]
-        if not hasattr(code, "settings_class") and not any("read_settings" in vars(item) for item in own):
-            problems.append(f"{code.__name__} has no settings_class, the dataclass of its settings")
-        problems += call_problem(code, _BINDING, code.__name__)
-    return problems
-
-
-#: What the class of a control is called with.
-_BINDING = ("machine", "settings")
-
-
-def _arguments(interface: type, method: str) -> list[str]:
-    return [key for key in inspect.signature(getattr(interface, method)).parameters if key != "self"]
-
-
-def _attribute_problems(name: str, code: Any, interface: Any) -> list[str]:
-    problems = []
-    own = getattr(code, "name", None)
-    if own != name:
-        problems.append(f"{code.__name__}.name has to be {name!r}, it is {'missing' if own is None else repr(own)}")
-    for item in ("anchored", "bidirectional"):
-        if not isinstance(getattr(code, item), bool):
-            problems.append(f"{code.__name__}.{item} has to be True or False")
-    if code.bidirectional is True and code.with_reversal is interface.with_reversal:
-        arguments = ", ".join(_arguments(interface, "with_reversal"))
-        problems.append(f"{code.__name__} is bidirectional, so it needs with_reversal({arguments})")
-    return problems
-
-
-def _template_problems(name: str, folder: Any) -> list[str]:
-    if not isinstance(folder, Path) or not (folder / name / "format.toml").is_file():
-        place = f"{folder}/{name}" if folder else f"templates/{name}"
-        return [f"its folder {place} with format.toml and the templates is missing"]
-    try:
-        check_templates(name, folder)
-    except InputError as error:
-        return [str(error)]
-    return []

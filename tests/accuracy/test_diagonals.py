@@ -13,9 +13,10 @@ from compgen.accuracy.diagonals import accuracy_of_diagonals, diagonal_runs
 from compgen.accuracy.evaluate import KnownReversal
 from compgen.cli import cli
 from compgen.cli.common import run_command
-from compgen.data.axis_runs import BODY_DIAGONALS, DIAGONALS, Diagonals, format_diagonals, read_diagonals
+from compgen.data.axis_runs import DIAGONALS, Diagonals, format_diagonals, read_diagonals
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves, format_errors, format_reversal
 from compgen.data.machine import read_machine
+from compgen.data.names import BODY_DIAGONALS
 from compgen.errors import InputError
 from compgen.kinematics import volumetric_error
 from compgen.simulate import read_scenario, simulate_axis_runs

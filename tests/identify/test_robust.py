@@ -12,13 +12,13 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Lengths, format_lengths, read_lengths
 from compgen.data.machine import Chain
 from compgen.data.names import SQUARENESS_NAMES, error_named
+from compgen.data.records import approach_of
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify import IdentifyOptions, identify
 from compgen.identify.adjust.residual_tests import check_whiteness
 from compgen.instruments.interferometer import refractive_index
 from compgen.kinematics import modelled_errors
 from compgen.kinematics.exact_chain import tip_position
-from compgen.data.records import approach_of
 from compgen.simulate.trajectory import serpentine
 
 NANOMETRE = 1e-6  # mm

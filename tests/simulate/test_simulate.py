@@ -13,6 +13,7 @@ from compgen.data.error_table import read_errors
 from compgen.data.lengths import read_lengths
 from compgen.data.machine import Machine, load_machine
 from compgen.data.names import error_named
+from compgen.data.records import approach_of
 from compgen.errors import CompgenWarning, InputError
 from compgen.kinematics import modelled_errors, volumetric_error
 from compgen.simulate import (
@@ -27,7 +28,6 @@ from compgen.simulate import (
     trajectory_points,
     write_simulation,
 )
-from compgen.data.records import approach_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 LENGTH_TOLERANCE_MM = 1e-9

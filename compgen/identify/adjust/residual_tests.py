@@ -6,14 +6,13 @@ import itertools
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
@@ -23,6 +22,9 @@ from compgen.identify.adjust.levels import levels_of
 from compgen.identify.adjust.robust import time_order
 from compgen.identify.adjust.unknowns import IntArray
 from compgen.kinematics.first_order import c_matrix
+
+if TYPE_CHECKING:
+    from compgen.data.deviations import Deviations
 
 # Whether the residuals are larger than their uncertainty allows, and whether a step or a drift explains most of them.
 #

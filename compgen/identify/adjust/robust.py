@@ -6,21 +6,24 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import DEVIATION_COLUMNS, Deviations
 from compgen.data.lengths import Lengths
 from compgen.data.names import MM_PER_UM
+from compgen.data.records import DEVIATION_COLUMNS
 from compgen.errors import CompgenWarning, ConvergenceError
 from compgen.identify.adjust.solver import Factor, LeastSquaresSolution, solve
 from compgen.identify.adjust.starts import robust_spread
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, LeastSquaresProblem, State
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.first_order import tool_of
+
+if TYPE_CHECKING:
+    from compgen.data.deviations import Deviations
 
 # Beam breaks: runs of consecutive readings of one station that are off by one amount, seen as a step in time.
 

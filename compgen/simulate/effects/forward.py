@@ -17,7 +17,7 @@ from compgen.data.messages import nearest
 from compgen.data.names import AXES, ERROR_INDEX, SECONDS_PER_MIN, error_named
 from compgen.data.registry import call_problem, why_missing
 from compgen.effects import DisplacementEffect, Effect, catalogue, listed, readings_of_points
-from compgen.effects.catalogue import STATION_NAME, dead_path_stations, read_values
+from compgen.effects.active import STATION_NAME, dead_path_stations, read_values
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import tip_position
 from compgen.simulate.trajectory import Stops
