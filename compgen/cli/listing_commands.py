@@ -178,7 +178,7 @@ def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
     listing = {}
     for name, path in sorted(files.items()):
         try:
-            machine = open_machine(str(path))
+            machine = open_machine(str(path), whole=True)
         except InputError as error:  # the others are listed all the same
             warnings.warn(f"left out of the machines: {error}", CompgenWarning, stacklevel=1)
             continue

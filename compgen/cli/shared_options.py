@@ -37,11 +37,11 @@ def path_option(name: str, text: str, *, metavar: str | None = "FILE", **how: An
     return click.option(name, metavar=metavar, type=PATH, help=text, **how)
 
 
-def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:
+def open_machine(name: str, machines: Sequence[Path] = (), *, whole: bool = False) -> Machine:
     """Load a machine and check the settings of every control and the effects that its file names.
 
-    A shipped machine file is known to be right (a test reads all of it): of its controls those that the command uses
-    are read, and no other is loaded.
+    A shipped machine file is known to be right (a test reads all of it): unless the ``whole`` file is to be read, those
+    of its controls that the command does not use are not even imported.
     """
     machine = load_machine(name, tuple(machines))
     shipped = machine.source is not None and machine.source.resolve().parent == data_folder("machines")
@@ -52,7 +52,7 @@ def open_machine(name: str, machines: Sequence[Path] = ()) -> Machine:
             message = f"is not a controller; {nearest(controller, CONTROLLERS)}"
             message += why_missing("control", controller) or "; if it comes from a plug-in, add --plugin PATH"
             raise InputError(message, file=machine.source, field=f"[controllers.{controller}]")
-        if not shipped:
+        if whole or not shipped:
             CONTROLLERS[controller].read_settings(machine)
     if machine.effects:
         effects.active_effects(machine)

@@ -103,3 +103,22 @@ def test_a_command_loads_its_own_module_and_no_library_that_it_does_not_need(tmp
     libraries, commands, _ = loaded(tmp_path, PROGRAM.format([files.get(word, word) for word in words]))
     assert commands == {module}
     assert libraries <= allowed
+
+
+def test_a_run_loads_the_control_in_use_and_no_room_that_it_does_not_need(tmp_path):
+    lengths = ROOT / "examples" / "zha-gantry.lengths.csv"
+    words = ["run", "zha-gantry", str(lengths), "--controller", "isg-csv", "--out", "o", "--no-report"]
+    listed = "import atexit, sys\natexit.register(lambda: open('modules.txt', 'w').write(' '.join(sys.modules)))\n"
+    loaded(tmp_path, listed + PROGRAM.format(words))
+    modules = {name.removeprefix("compgen.") for name in (tmp_path / "modules.txt").read_text().split()}
+    controls = {name for name in modules if name.startswith("controls.") and not name.startswith("controls.shared")}
+    assert controls == {"controls.isg_csv", "controls.isg_kernel", "controls.isg_parameters"}
+    rooms = {name.partition(".")[0] for name in modules}
+    assert not rooms & {"simulate", "plan", "diagnose", "fleet", "accuracy", "plugins"}
+    assert not modules & {
+        "effects.catalogue",
+        "foreign.detect",
+        "identify.positions",
+        "identify.six_dof",
+        "tables.active",
+    }

@@ -6,8 +6,10 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from compgen.controls import CONTROLLERS
 from compgen.data import machine as machine_module
 from compgen.data.machine import CHAINS, Chain, load_machine, machine_files, read_machine
+from compgen.effects import active_effects
 from compgen.errors import CompgenWarning, InputError
 from compgen.resources import data_folder
 
@@ -271,6 +273,15 @@ def test_every_shipped_machine_loads_under_its_name():
         machine = load_machine(name)
         assert machine.name == name
         assert np.all(machine.upper_mm > machine.lower_mm)
+
+
+def test_every_section_of_a_shipped_machine_file_is_right():
+    """Commands rely on it: of a shipped machine they read the controls in use only."""
+    for name in machine_files():
+        machine = load_machine(name)
+        for controller in machine.controllers:
+            CONTROLLERS[controller].read_settings(machine)
+        assert len(active_effects(machine)) == len(machine.effects)
 
 
 def test_a_copy_beside_its_original_is_a_second_machine_of_that_name(tmp_path):
