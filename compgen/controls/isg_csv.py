@@ -13,7 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controls.isg_kernel import ANGLE_DIGITS, LENGTH_DIGITS, POSITION_DIGITS, IsgTables, VolumetricController
+from compgen.controls.isg_kernel import (
+    ANGLE_DIGITS,
+    LENGTH_DIGITS,
+    POSITION_DIGITS,
+    IsgCsvSettings,
+    IsgTables,
+    VolumetricController,
+)
 from compgen.controls.isg_parameters import (
     ARGUMENTS,
     CONTROL_NAMES,
@@ -115,7 +122,7 @@ class IsgCsv(VolumetricController):
     name = "isg-csv"
     file_format = "ISG_CSV"
     parameter_file = "volcomp0.csv"
-    tool_position = True
+    settings_class = IsgCsvSettings
 
     def parse_parameters(self, source: SourceFile) -> ParameterFile:
         """Read one ISG_CSV file."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -25,47 +25,65 @@ from compgen.controls.isg_parameters import (
     parse_list,
 )
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
-from compgen.controls.shared.grids import ParameterGrid, take_loss_mm, uneven_nodes_mm
+from compgen.controls.shared.grids import ParameterGrid, loss_setting, uneven_nodes_mm
 from compgen.controls.shared.scanner import MOST_LINES
 from compgen.controls.shared.terms import error_terms
-from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
 from compgen.data.machine import Chain, Machine
 from compgen.data.names import AXES, ERROR_NAMES, error_named
+from compgen.data.toml_files import Section, axis_setting, choice, flag, setting, unless_stated, whole
 from compgen.errors import InputError
 from compgen.kinematics.first_order import coefficients, factor
 
 # What the machine file says to the ISG kernel's volumetric compensation, and what the control has loaded.
 
 
+def folder_of_control(value: object) -> str:
+    """A folder on the control, with a slash at its end; empty for none."""
+    if not isinstance(value, str) or len(value) > 200 or any(not "!" <= char <= "~" or char == "#" for char in value):
+        raise ValueError("a folder on the control is expected: printable ASCII without blanks and '#'")
+    if not value or value[-1] in "\\/":
+        return value
+    return value + ("\\" if "\\" in value or ":" in value else "/")
+
+
 @dataclass(frozen=True)
 class IsgSettings:
-    """``[controllers.isg-csv]`` or ``[controllers.etalon-exchange]`` of a machine file.
+    """``[controllers.etalon-exchange]`` of a machine file."""
 
-    Parameters
-    ----------
-    logical_axes : logical axis numbers of X, Y, Z in the control.
-    reversed_axes : axes where the sign check at the machine found that the control ADDS the error.
-    negate : axes that the list file negates; by default the reversed ones.
-    chain_direction : in which order the control reads ``chain``.
-    use_axis_offsets, max_records, path : as the control has them; ``path`` is the folder on the control.
-    write_tool_position : whether the CSV file gives the tool offset as P0X, P0Y, P0Z.
-    lever_mm : longest lever arm of an angle on this machine.
-    loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
-    """
+    logical_axes: tuple[int, int, int] = axis_setting(
+        whole(1, 65535),
+        (1, 2, 3),
+        differ="gives ({}) for X, Y, Z; three different numbers are needed",
+        meaning="logical axis numbers in the control",
+    )
+    reversed_axes: str = setting(
+        axis_letters,
+        "",
+        meaning='axes, e.g. "XZ", on which the check at the machine found that the control adds the error',
+    )
+    negate: str = setting(axis_letters, "", meaning="axes that the list file negates; if not given, reversed_axes")
+    chain_direction: Direction = setting(
+        choice("workpiece_to_tool", "tool_to_workpiece"), "workpiece_to_tool", meaning="how the control reads chain"
+    )
+    use_axis_offsets: int = setting(
+        whole(0, 1), 0, meaning="as the list file has it; 1 is a violation, because its effect is not documented"
+    )
+    max_records: int = setting(whole(1, MOST_LINES), 2000, meaning="vol_comp[0].max_records of the control")
+    path: str = setting(
+        folder_of_control, "", meaning="folder of the parameter file on the control, ASCII without blanks"
+    )
+    write_tool_position: bool = False
+    loss_mm: float = loss_setting()
 
-    logical_axes: tuple[int, int, int]
-    reversed_axes: str
-    negate: str
-    chain_direction: Direction
-    use_axis_offsets: int
-    max_records: int
-    path: str
-    write_tool_position: bool
-    lever_mm: float
-    loss_mm: float
+
+@dataclass(frozen=True)
+class IsgCsvSettings(IsgSettings):
+    """``[controllers.isg-csv]`` of a machine file: this format can carry the tool position."""
+
+    write_tool_position: bool = setting(flag, False, meaning="write the tool offset as P0X P0Y P0Z")
 
 
 @dataclass(frozen=True)
@@ -82,41 +100,6 @@ class IsgTables:
     files: tuple[str, ...]
     listing: ListFile | None = None
     remarks: tuple[str, ...] = ()
-
-
-def read_isg_settings(machine: Machine, name: str, tool_position: bool) -> IsgSettings:
-    """Check the settings of one of the two formats; ``tool_position``: the format may carry P0X, P0Y, P0Z."""
-    section = machine.controller_settings(name)
-    axes = section.section("logical_axes", required=False)
-    numbers = tuple(axes.take(letter, toml_files.whole(1, 65535), k + 1) for k, letter in enumerate(AXES))
-    axes.finish()
-    if len(set(numbers)) != 3:
-        raise section.fail("logical_axes", f"gives {numbers} for X, Y, Z; three different numbers are needed")
-    reversed_axes = section.take("reversed_axes", axis_letters, "")
-    directions = toml_files.choice("workpiece_to_tool", "tool_to_workpiece")
-    tool = np.abs(machine.tool_offset_mm)
-    settings = IsgSettings(
-        logical_axes=(numbers[0], numbers[1], numbers[2]),
-        reversed_axes=reversed_axes,
-        negate=section.take("negate", axis_letters, reversed_axes),
-        chain_direction=cast(Direction, section.take("chain_direction", directions, "workpiece_to_tool")),
-        use_axis_offsets=section.take("use_axis_offsets", toml_files.whole(0, 1), 0),
-        max_records=section.take("max_records", toml_files.whole(1, MOST_LINES), 2000),
-        path=section.take("path", _folder, ""),
-        write_tool_position=tool_position and section.take("write_tool_position", toml_files.flag, False),
-        lever_mm=float(np.max(np.maximum(np.abs(machine.lower_mm), np.abs(machine.upper_mm)) + tool)),
-        loss_mm=take_loss_mm(section),
-    )
-    section.finish()
-    return settings
-
-
-def _folder(value: object) -> str:
-    if not isinstance(value, str) or len(value) > 200 or any(not "!" <= char <= "~" or char == "#" for char in value):
-        raise ValueError("a folder on the control is expected: printable ASCII without blanks and '#'")
-    if not value or value[-1] in "\\/":
-        return value
-    return value + ("\\" if "\\" in value or ":" in value else "/")
 
 
 def disagreements(listing: ListFile, wanted: ListFile) -> list[str]:
@@ -191,7 +174,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
 
     file_format: str
     parameter_file: str
-    tool_position: bool = False
+    settings_class = IsgSettings
 
     @abstractmethod
     def parse_parameters(self, source: SourceFile) -> ParameterFile:
@@ -206,9 +189,9 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         """Return what the template of the parameter file needs."""
 
     @classmethod
-    def read_settings(cls, machine: Machine) -> IsgSettings:
-        """Check the settings of the machine file."""
-        return read_isg_settings(machine, cls.name, cls.tool_position)
+    def check_settings(cls, settings: IsgSettings, section: Section, machine: Machine) -> IsgSettings:
+        """Take the reversed axes as those that the list file negates, unless the machine file says which."""
+        return unless_stated(settings, section, negate=settings.reversed_axes)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
         """Return one term per error, with nodes where the curves need them; the control evaluates E = C P itself."""
@@ -317,7 +300,9 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
 
     def resolution_mm(self) -> float:
         """Half a digit of three lengths, and of six angles and two squareness errors at the longest lever."""
-        return 0.5 * (3 * 10.0**-LENGTH_DIGITS + 8 * 10.0**-ANGLE_DIGITS * self.settings.lever_mm)
+        machine = self.machine
+        lever_mm = np.maximum(np.abs(machine.lower_mm), np.abs(machine.upper_mm)) + np.abs(machine.tool_offset_mm)
+        return 0.5 * (3 * 10.0**-LENGTH_DIGITS + 8 * 10.0**-ANGLE_DIGITS * float(np.max(lever_mm)))
 
     def table_nodes_mm(self, tables: IsgTables) -> tuple[FloatArray, ...]:
         """Return the arguments of all parameters, by axis."""

@@ -46,10 +46,10 @@ from compgen.controls.siemens_machine_data import (
     cec_sign_statement,
     cec_usage,
     cec_warnings,
+    checked_cec_settings,
     largest_sums,
     set_violations,
     stated_limit_violations,
-    take_cec_settings,
 )
 from compgen.controls.siemens_text import (
     PROTECTING,
@@ -67,6 +67,7 @@ from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
+from compgen.data.toml_files import Section
 from compgen.errors import CompgenWarning
 
 #: Variables of the tables and their switches without ``$``, with the number of their indices (K3-2013, p. 245-249).
@@ -109,15 +110,13 @@ class SiemensCec(Controller[CecSettings, CecTables]):
     """SINUMERIK CEC: straightness, squareness, positioning, and angular errors as products of tables."""
 
     name = "siemens-cec"
+    settings_class = CecSettings
     bidirectional = True
 
     @classmethod
-    def read_settings(cls, machine: Machine) -> CecSettings:
-        """Check the settings; ``mult_mode`` is mandatory where products are stated."""
-        section = machine.controller_settings(cls.name)
-        settings = take_cec_settings(section, machine)
-        section.finish()
-        return settings
+    def check_settings(cls, settings: CecSettings, section: Section, machine: Machine) -> CecSettings:
+        """Fill in what follows from the model; ``mult_mode`` is mandatory where products are stated."""
+        return checked_cec_settings(settings, section, machine)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
         """Return nine tables output over axis, and the products with levers that count from the reference point.
@@ -209,8 +208,8 @@ class SiemensCec(Controller[CecSettings, CecTables]):
             "sign": settings.sign,
             "sign_stated": settings.sign_stated,
             "mult_mode": settings.mult_mode,
-            "container": settings.container.kind,
-            "program_enables": settings.container.enables,
+            "container": settings.container,
+            "program_enables": settings.program_enables,
             "outputs": [names[axis] for axis in sorted({entry.output_axis for entry in tables.tables.values()})],
             "has_products": any(entry.multiplier for entry in tables.tables.values()),
             "kept_tables": list(settings.kept_tables),

@@ -26,13 +26,14 @@ from compgen.controls.siemens_cec import (
 from compgen.controls.siemens_cec_tables import MULT_MODES, Choice, chosen_terms, term_names, terms_of_tables
 from compgen.controls.siemens_eec import VARIABLES as EEC_VARIABLES
 from compgen.controls.siemens_eec import EecTables, SiemensEec, eec_tables_from, eec_terms, foreign_eec_tables
-from compgen.controls.siemens_machine_data import CecSettings, EecSettings, take_cec_settings, take_eec_settings
+from compgen.controls.siemens_machine_data import CecEecSettings, checked_cec_settings, checked_encoder_settings
 from compgen.controls.siemens_text import ArchiveAssignments, ArchiveFindings, foreign_assignments, read_assignments
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
+from compgen.data.toml_files import Section
 
 #: Sections of the machine file that describe the same control: what the own section does not say is taken from them.
 OTHER_SECTIONS = ("siemens-cec", "siemens-eec")
@@ -42,14 +43,6 @@ PREFIX, OWN_KEYS = "eec_", ("max_points", "step_mm", "decimals")
 ROUNDING_MM = 2e-6
 
 _CROSS = [(output, axis) for output in range(3) for axis in range(3) if output != axis]
-
-
-@dataclass(frozen=True)
-class CecEecSettings:
-    """Settings ``[controllers.siemens-cec-eec]``: those of both kinds of tables."""
-
-    cec: CecSettings
-    eec: EecSettings
 
 
 @dataclass(frozen=True)
@@ -64,24 +57,27 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
     """SINUMERIK EEC and CEC together: positioning, straightness, squareness, angles as products of tables."""
 
     name = "siemens-cec-eec"
+    settings_class = CecEecSettings
     bidirectional = True
 
     def __init__(self, machine: Machine, settings: CecEecSettings | None = None) -> None:
         super().__init__(machine, settings)
-        self._cec, self._eec = SiemensCec(machine, self.settings.cec), SiemensEec(machine, self.settings.eec)
+        self._cec, self._eec = SiemensCec(machine, self.settings), SiemensEec(machine, self.settings.eec)
 
     @classmethod
-    def read_settings(cls, machine: Machine) -> CecEecSettings:
-        """Check the settings, here and in the sections of both kinds of tables."""
+    def settings_section(cls, machine: Machine) -> Section:
+        """Return the section with what it does not say from the sections of both kinds of tables."""
         section = machine.controller_settings(cls.name)
         for other in OTHER_SECTIONS:
             for key, value in machine.controller_settings(other).data.items():
                 own = PREFIX + key if other == "siemens-eec" and key in OWN_KEYS else key
                 section.data.setdefault(own, value)
-        cec = take_cec_settings(section, machine)
-        settings = CecEecSettings(cec, take_eec_settings(section, machine, PREFIX))
-        section.finish()
-        return settings
+        return section
+
+    @classmethod
+    def check_settings(cls, settings: CecEecSettings, section: Section, machine: Machine) -> CecEecSettings:
+        """Check the settings of both kinds of tables."""
+        return checked_encoder_settings(checked_cec_settings(settings, section, machine), section, machine, PREFIX)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
         """Return positioning over the axis itself, the six tables over another axis, and the products."""
@@ -89,7 +85,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
 
     def basis_of(self, errors: ErrorTable, tables: CecEecTables) -> list[Term]:
         """Return positioning, and the terms that the cross tables hold if no better set fits into the control."""
-        choice, mode = self._choice(errors), self.settings.cec.mult_mode
+        choice, mode = self._choice(errors), self.settings.mult_mode
         terms = self._cec.terms(errors, _CROSS)
         held = terms_of_tables(self.machine, errors, terms, mode, choice, term_names(tables.cec.tables))
         return self._pitch(errors) + held
@@ -107,9 +103,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
     def _choice(self, errors: ErrorTable) -> Choice:
         terms = self._cec.terms(errors, _CROSS)
         pitch = self._pitch(errors)
-        return chosen_terms(
-            self.machine, errors, terms, self.settings.cec.mult_mode, self.settings.cec.tables_usable, pitch
-        )
+        return chosen_terms(self.machine, errors, terms, self.settings.mult_mode, self.settings.tables_usable, pitch)
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> CecEecTables:
         """Return both kinds of tables, rounded as written."""
@@ -146,7 +140,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
             if not any(item.variable == array for item in found):
                 raise files[-1].fail(f"the files hold no {what} tables (${array}); give both AX_EEC and NC_CEC")
         return CecEecTables(
-            cec_tables_from(cec_items, files, self.settings.cec), eec_tables_from(eec_items, self.settings.eec)
+            cec_tables_from(cec_items, files, self.settings), eec_tables_from(eec_items, self.settings.eec)
         )
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CecEecTables, list[str]]:
@@ -160,7 +154,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         for part, array, what in ((cec_part, "AN_CEC", "cross"), (eec_part, "AA_ENC_COMP", "encoder")):
             if not any(item.variable == array for item in part.items):
                 raise files[-1].fail(f"the files hold no {what} tables (${array}); give all that the control holds")
-        cec = foreign_cec_tables(cec_part, self.machine, self.settings.cec, findings)
+        cec = foreign_cec_tables(cec_part, self.machine, self.settings, findings)
         eec = foreign_eec_tables(eec_part, self.machine, self.settings.eec, findings)
         return CecEecTables(cec, eec), findings.statements()
 
@@ -185,7 +179,8 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         """Return the other modes of products of the cross tables."""
         others = self._cec.other_readings(tables.cec)
         return {
-            words: type(self)(self.machine, replace(self.settings, cec=cec.settings)) for words, cec in others.items()
+            words: type(self)(self.machine, replace(self.settings, mult_mode=cec.settings.mult_mode))
+            for words, cec in others.items()
         }
 
     def table_nodes_mm(self, tables: CecEecTables) -> tuple[FloatArray, ...]:
@@ -211,13 +206,13 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
             self.machine,
             self.settings.eec,
             errors,
-            self.machine.reference_point_mm if self.settings.cec.products else None,
+            self.machine.reference_point_mm if self.settings.products else None,
         )
 
     def _double_positioning(self, tables: CecEecTables) -> list[str]:
         """Name axes whose CEC tables over themselves do not cancel (mean of both directions) beside an encoder table."""
         settings = self.settings
-        first_stays, multiplier_stays = MULT_MODES[settings.cec.mult_mode]
+        first_stays, multiplier_stays = MULT_MODES[settings.mult_mode]
         entries = tables.cec.tables
         multipliers = {entry.multiplier - 1 for entry in entries.values() if entry.multiplier}
         found = []
@@ -236,7 +231,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
             largest = float(np.max(np.abs(total)))
             if largest > ROUNDING_MM:
                 found.append(
-                    f"the positioning of {settings.cec.axis_names[axis]} stands in its encoder table and, with up to "
+                    f"the positioning of {settings.axis_names[axis]} stands in its encoder table and, with up to "
                     f"{largest / MM_PER_UM:.3f} um, in the CEC tables {sorted(own)} as well: it would be corrected twice"
                 )
         return found

@@ -18,7 +18,7 @@ from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, no
 from compgen.controls.shared.grids import equidistant_grid
 from compgen.controls.shared.terms import one_dimensional_terms
 from compgen.controls.siemens_cec_tables import plain_backlash_rows
-from compgen.controls.siemens_machine_data import PROFILES, EecSettings, take_eec_settings
+from compgen.controls.siemens_machine_data import PROFILES, EecSettings, checked_encoder_settings
 from compgen.controls.siemens_text import (
     SWITCHES,
     ArchiveAssignments,
@@ -37,6 +37,7 @@ from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
+from compgen.data.toml_files import Section
 
 #: Variables of the table without ``$``, with the number of their indices (K3-2013, p. 242).
 VARIABLES = {
@@ -61,15 +62,13 @@ class SiemensEec(Controller[EecSettings, EecTables]):
     """SINUMERIK measuring-system and leadscrew error compensation: positioning of X, Y, Z."""
 
     name = "siemens-eec"
+    settings_class = EecSettings
     anchored = True
 
     @classmethod
-    def read_settings(cls, machine: Machine) -> EecSettings:
-        """Check the settings; all have defaults."""
-        section = machine.controller_settings(cls.name)
-        settings = take_eec_settings(section, machine)
-        section.finish()
-        return settings
+    def check_settings(cls, settings: EecSettings, section: Section, machine: Machine) -> EecSettings:
+        """Fill in what follows from the model, and the measuring systems that the position control uses."""
+        return checked_encoder_settings(settings, section, machine)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
         """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node."""
@@ -95,8 +94,8 @@ class SiemensEec(Controller[EecSettings, EecTables]):
             "sign_statement": self._sign_statement(tables),
             "parameters": self._parameters(tables),
             "warnings": self._warnings(tables),
-            "container": settings.container.kind,
-            "program_enables": settings.container.enables,
+            "container": settings.container,
+            "program_enables": settings.program_enables,
             "active": [
                 f"{name}: {encoder + 1}" for name, encoder in zip(settings.axis_names, settings.active, strict=True)
             ],
@@ -175,7 +174,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
                     f"system {settings.active[axis] + 1}; it is right only if they were measured with either, or the "
                     "errors are those of the guideway"
                 )
-        if not settings.max_points_known:
+        if not settings.eec_nodes_known:
             found.append(
                 f"how many nodes this model holds is not documented; {settings.max_points} are taken as the limit, the "
                 "smallest number documented for any model: state max_points"

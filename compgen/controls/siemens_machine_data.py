@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from decimal import Decimal
+from dataclasses import dataclass, fields, replace
 from itertools import product
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from compgen.controls.shared.base import Usage
-from compgen.controls.shared.grids import take_loss_mm
+from compgen.controls.shared.grids import loss_setting
 from compgen.controls.siemens_cec_tables import MULT_MODES, CecMap, CecTable, sum_into_axes
 from compgen.controls.siemens_text import POSITION_QUANTUM_MM, table_violations
-from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
+from compgen.data.toml_files import (
+    Section,
+    axis_setting,
+    choice,
+    flag,
+    multiple_of,
+    positive,
+    setting,
+    unless_stated,
+    whole,
+)
 
 # What the SINUMERIK models can hold: numbers of tables and nodes, and the usual values of limiting machine data.
 #
@@ -67,25 +76,8 @@ _NOT_DOCUMENTED = (
 )
 
 
-def take_profile(section: toml_files.Section) -> Profile:
-    """Take ``profile``, the model of the control; the limits of an 840D sl count where it is not stated."""
-    return PROFILES[section.take("profile", toml_files.choice(*PROFILES), USUAL)]
-
-
-def take_cec_capacity(section: toml_files.Section, profile: Profile) -> tuple[int, int | None]:
-    """Take ``max_points`` and ``tables_available`` (None: not known); what is stated overrides the profile."""
-    own_axes = section.take("nc_axes", toml_files.whole(FEWEST_AXES, 93), None)
-    tables = profile.cec_tables
-    if profile.tables_per_axis and own_axes is not None:
-        tables = profile.tables_per_axis * own_axes
-    nodes = section.take("max_points", toml_files.whole(3, 100_000), profile.cec_nodes)
-    available = section.take("tables_available", toml_files.whole(1, 1000), tables)
-    if nodes is None or (available is None and not profile.tables_per_axis):
-        raise section.fail("profile", _NOT_DOCUMENTED)
-    return nodes, available
-
-
-# Settings of the SINUMERIK tables: names of the axes, node distances, measuring systems, capacity, container.
+# Settings of the SINUMERIK tables: names of the axes, node distances, measuring systems, capacity, and in which kind of
+# file tables are: "ini" (initialisation file with header, loaded as data) or "program" (sub-program that is run).
 
 
 _NAME = re.compile(r"[A-Z_][A-Z0-9_]{0,31}")
@@ -97,183 +89,8 @@ _MODE_MISSING = (
     'with constants of the preflight list (sum 0.56: "S1", 0.06: "S2", 0.26: "S3", 0.36: "S4") and write e.g. '
     'mult_mode = "S1", or write products = false'
 )
+_STEP, _STEP_MEANING = multiple_of(POSITION_QUANTUM_MM), "distance of the nodes, e.g. { X = 50.0 }; at most 6 decimals"
 Encoders = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
-
-
-@dataclass(frozen=True)
-class Container:
-    """In which kind of file tables stand.
-
-    Parameters
-    ----------
-    kind : ``"ini"`` (initialisation file with header, loaded as data) or ``"program"`` (sub-program that is run).
-    enables : whether a program also switches the function on behind the tables.
-    """
-
-    kind: str = "ini"
-    enables: bool = False
-
-
-@dataclass(frozen=True)
-class CecSettings:
-    """Settings ``[controllers.siemens-cec]``.
-
-    Parameters
-    ----------
-    sign : ``"error"`` (the control subtracts the sum) or ``"correction"`` (it adds it).
-    sign_stated : False where the machine file does not say it and the inferred one is taken.
-    mult_mode : S1 to S4, see :mod:`compgen.controls.siemens_cec_tables`.
-    mode_stated : False where the machine file does not say it: then no file with products is written or read.
-    products : whether angular errors are exported as products of tables.
-    axis_names : names of X, Y, Z on the control.
-    axis_style : ``"paren"`` writes (AX1), ``"quote"`` writes "AX1".
-    step_mm : node distances that the user asks for, or None.
-    loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
-    max_points : nodes that the control can hold per table.
-    tables_available : tables that the control has, or None if that is not known.
-    tables_reserved : tables of these that are kept free, e.g. for pairs of one direction.
-    kept_tables : indices of tables of other axes, which are never written.
-    max_sum_mm : MD32720 of X, Y, Z in mm, or None if that is not stated.
-    max_velo_percent : MD32730 of X, Y, Z in % of MD32000, or None if that is not stated.
-    max_speed_mm_min : MD32000 of X, Y, Z; only their ratio matters.
-    container : kind of file.
-    """
-
-    sign: str
-    sign_stated: bool
-    mult_mode: str
-    mode_stated: bool
-    products: bool
-    axis_names: tuple[str, str, str]
-    axis_style: str
-    step_mm: tuple[float | None, ...]
-    loss_mm: float
-    max_points: int
-    tables_available: int | None
-    tables_reserved: int
-    kept_tables: tuple[int, ...]
-    max_sum_mm: tuple[float, float, float] | None
-    max_velo_percent: tuple[float, float, float] | None
-    max_speed_mm_min: tuple[float, float, float]
-    container: Container
-
-    @property
-    def subtracts(self) -> bool:
-        """Whether the control subtracts the sum of the tables from the command."""
-        return self.sign == "error"
-
-    @property
-    def tables_usable(self) -> int | None:
-        """How many tables the errors may take, None if no number is known."""
-        if self.tables_available is None:
-            return None
-        kept = sum(1 for index in self.kept_tables if index < self.tables_available)
-        return max(self.tables_available - self.tables_reserved - kept, 1)
-
-
-@dataclass(frozen=True)
-class EecSettings:
-    """Settings ``[controllers.siemens-eec]``.
-
-    Parameters
-    ----------
-    encoders : for X, Y, Z the measuring systems that get a table: 0 is measuring system 1, 1 is measuring system 2.
-    active : for X, Y, Z the one that the position control uses.
-    axis_names : names of X, Y, Z on the control.
-    step_mm : node distances that the user asks for, or None.
-    loss_mm : loss by interpolation between nodes, as a displacement of the tool, that is worth no further node.
-    max_points : nodes that the control can hold per axis and measuring system.
-    max_points_known : False if that number is not documented for the model and not stated.
-    decimals : digits after the point of the values in mm.
-    container : kind of file.
-    """
-
-    encoders: Encoders
-    active: tuple[int, int, int]
-    axis_names: tuple[str, str, str]
-    step_mm: tuple[float | None, ...]
-    loss_mm: float
-    max_points: int
-    max_points_known: bool
-    decimals: int
-    container: Container
-
-
-def take_cec_settings(section: toml_files.Section, machine: Machine) -> CecSettings:
-    """Take the settings of CEC tables from a section; ``mult_mode`` is mandatory where ``products = true`` is stated.
-
-    Without ``mult_mode`` and ``products`` no products are written: a wrong mode is worse than a wrong sign.
-    """
-    mode = section.take("mult_mode", toml_files.choice(*MULT_MODES), None)
-    products = section.take("products", toml_files.flag, mode is not None)
-    if products and mode is None:
-        raise section.fail("mult_mode", _MODE_MISSING)
-    max_points, tables_available = take_cec_capacity(section, take_profile(section))
-    return CecSettings(
-        sign=section.take("sign", toml_files.choice("error", "correction"), INFERRED_SIGN),
-        sign_stated="sign" in section,
-        mult_mode=mode or next(iter(MULT_MODES)),
-        mode_stated=mode is not None,
-        products=products,
-        axis_names=take_axis_names(section),
-        axis_style=section.take("axis_style", toml_files.choice("paren", "quote"), "paren"),
-        step_mm=take_steps(section, machine, max_points),
-        loss_mm=take_loss_mm(section),
-        max_points=max_points,
-        tables_available=tables_available,
-        tables_reserved=section.take("tables_reserved", toml_files.whole(0, 1000), 0),
-        kept_tables=section.take("kept_tables", _check_indices, ()),
-        max_sum_mm=section.take("max_sum_mm", _per_axis, None),
-        max_velo_percent=section.take("max_velo_percent", _per_axis, None),
-        max_speed_mm_min=section.take("max_speed_mm_min", _per_axis, (1.0, 1.0, 1.0)),
-        container=take_container(section),
-    )
-
-
-def take_eec_settings(section: toml_files.Section, machine: Machine, prefix: str = "") -> EecSettings:
-    """Take the settings of encoder tables; ``prefix`` stands before the keys that CEC tables have as well."""
-    profile = take_profile(section)
-    max_points = section.take(f"{prefix}max_points", toml_files.whole(3, 100_000), profile.eec_nodes)
-    encoders = section.take("encoder", _encoders, ((0,), (0,), (0,)))
-    return EecSettings(
-        encoders=encoders,
-        active=_take_active(section, encoders),
-        axis_names=take_axis_names(section),
-        step_mm=take_steps(section, machine, max_points, f"{prefix}step_mm"),
-        loss_mm=take_loss_mm(section),
-        max_points=max_points,
-        max_points_known=profile.eec_nodes_documented or f"{prefix}max_points" in section,
-        decimals=section.take(f"{prefix}decimals", toml_files.whole(3, 9), 6),
-        container=take_container(section),
-    )
-
-
-def take_container(section: toml_files.Section) -> Container:
-    """Take ``container`` and ``program_enables``."""
-    kind = section.take("container", toml_files.choice("ini", "program"), "ini")
-    enables = section.take("program_enables", toml_files.flag, False)
-    if enables and kind == "ini":
-        raise section.fail("program_enables", 'needs container = "program": an INI file switches nothing on')
-    return Container(kind, enables)
-
-
-def _check_indices(value: Any) -> tuple[int, ...]:
-    """A list of different indices of tables."""
-    whole = toml_files.whole(0, 999)
-    if not isinstance(value, list) or len({whole(item) for item in value}) != len(value):
-        raise ValueError("a list of different table indices, e.g. [6, 7], is expected")
-    return tuple(sorted(value))
-
-
-def _per_axis(value: Any) -> tuple[float, float, float]:
-    """One number above zero for all axes, or a table with X, Y and Z."""
-    if isinstance(value, dict):
-        if set(value) != set(AXES):
-            raise ValueError("one number, or a table { X = ..., Y = ..., Z = ... }, is expected")
-        x, y, z = (toml_files.positive(value[axis]) for axis in AXES)
-        return x, y, z
-    number = toml_files.positive(value)
-    return number, number, number
 
 
 def _encoders(value: Any) -> Encoders:
@@ -295,58 +112,224 @@ def _encoders_of_axis(value: Any) -> tuple[int, ...]:
     return tuple(sorted(items))
 
 
-def _take_active(section: toml_files.Section, encoders: Encoders) -> tuple[int, int, int]:
-    """Take ``active_encoder``, one number or a table by axis; default the first one of each axis."""
-    first = {letter: own[0] for letter, own in zip(AXES, encoders, strict=True)}
-    stated = section.take("active_encoder", _encoders, None)
-    found = []
-    for axis, letter in enumerate(AXES):
-        active = (first[letter],) if stated is None else stated[axis]
-        if len(active) != 1 or active[0] not in encoders[axis]:
-            raise section.fail(
-                "active_encoder", f"one of the encoders of {letter}, {list(encoders[axis])}, is expected"
-            )
-        found.append(active[0])
-    return found[0], found[1], found[2]
-
-
-def take_axis_names(section: toml_files.Section) -> tuple[str, str, str]:
-    """Take ``axis_names = { X = "AX1", ... }`` (default AX1, AX2, AX3) from a control's settings."""
-    names_section = section.section("axis_names", required=False)
-    names = [names_section.take(axis, _axis_name, f"AX{number}") for number, axis in enumerate(AXES, start=1)]
-    names_section.finish()
-    if len(set(names)) != 3:
-        raise section.fail("axis_names", f"two axes have one name ({', '.join(names)}); each needs its own")
-    return names[0], names[1], names[2]
-
-
 def _axis_name(value: Any) -> str:
     if not isinstance(value, str) or not _NAME.fullmatch(value.upper()) or not value.isascii():
         raise ValueError("an axis name of letters, digits and '_', e.g. 'AX1' or 'X1', is expected")
     return value.upper()
 
 
-def take_steps(
-    section: toml_files.Section, machine: Machine, most: int, key: str = "step_mm"
-) -> tuple[float | None, ...]:
-    """Take ``step_mm = { X = 50.0, ... }``: the table steps that the user asks for, None where he does not."""
-    steps_section = section.section(key, required=False)
-    steps: list[float | None] = []
-    for letter, axis in zip(AXES, machine.axes, strict=True):
-        step = steps_section.take(letter, _step, None)
+def _table_indices(value: Any) -> tuple[int, ...]:
+    index = whole(0, 999)
+    if not isinstance(value, list) or len({index(item) for item in value}) != len(value):
+        raise ValueError("a list of different table indices, e.g. [6, 7], is expected")
+    return tuple(sorted(value))
+
+
+def _per_axis(value: Any) -> tuple[float, float, float]:
+    """One number above zero for all axes, or a table with X, Y and Z."""
+    if isinstance(value, dict):
+        if set(value) != set(AXES):
+            raise ValueError("one number, or a table { X = ..., Y = ..., Z = ... }, is expected")
+        x, y, z = (positive(value[axis]) for axis in AXES)
+        return x, y, z
+    number = positive(value)
+    return number, number, number
+
+
+@dataclass(frozen=True)
+class SiemensSettings:
+    """Settings of encoder tables and of cross tables alike."""
+
+    profile: str = setting(
+        choice(*PROFILES),
+        USUAL,
+        meaning='model of the control, for its capacity: "840D sl", "828D", "808D", "802D sl"; keys below override it',
+    )
+    axis_names: tuple[str, str, str] = axis_setting(
+        _axis_name,
+        ("AX1", "AX2", "AX3"),
+        differ="two axes have one name ({}); each needs its own",
+        meaning="names of the axes on the control",
+    )
+    loss_mm: float = loss_setting()
+    container: str = setting(
+        choice("ini", "program"),
+        "ini",
+        meaning='"ini": initialisation files that are loaded; "program": sub-programs that are run',
+    )
+    program_enables: bool = setting(
+        flag, False, meaning="the sub-program also switches the tables on at its end; do the sign check first"
+    )
+
+
+@dataclass(frozen=True)
+class CecSettings(SiemensSettings):
+    """``[controllers.siemens-cec]``.
+
+    Parameters
+    ----------
+    sign_stated : False where the machine file does not say it and the inferred one is taken.
+    mode_stated : False where the machine file does not say it: then no file with products is written or read.
+    tables_available : tables that the control has, or None if that is not known.
+    max_sum_mm, max_velo_percent : None if not stated.
+    """
+
+    sign: str = setting(
+        choice("error", "correction"),
+        INFERRED_SIGN,
+        meaning='"error": the control subtracts the sum of the tables (inferred); "correction": it adds it',
+    )
+    mult_mode: str = setting(
+        choice(*MULT_MODES),
+        None,
+        meaning='what two multiplied tables A, B give: "S1" A + B + AB, "S2" AB, "S3" A + AB, "S4" B + AB',
+    )
+    products: bool = setting(
+        flag, None, meaning="write angular errors as products of tables; by default where mult_mode is stated"
+    )
+    axis_style: str = setting(choice("paren", "quote"), "paren", meaning='"paren" writes (AX1), "quote" writes "AX1"')
+    step_mm: tuple[float | None, float | None, float | None] = axis_setting(_STEP, meaning=_STEP_MEANING)
+    nc_axes: int | None = setting(
+        whole(FEWEST_AXES, 93), None, meaning="axes of the whole control (840D sl): it has two cross tables for each"
+    )
+    max_points: int = setting(whole(3, 100_000), PROFILES[USUAL].cec_nodes, meaning="nodes per table, at least 3")
+    tables_available: int | None = setting(
+        whole(1, 1000), None, meaning="number of tables of the control; from the profile, or stated: a limit"
+    )
+    tables_reserved: int = setting(
+        whole(0, 1000), 0, meaning="cross tables that are kept free, e.g. two for each reversal"
+    )
+    kept_tables: tuple[int, ...] = setting(
+        _table_indices, (), meaning="indices of cross tables of other axes, e.g. [6, 7]: never written"
+    )
+    max_sum_mm: tuple[float, float, float] | None = setting(
+        _per_axis, None, meaning="MD32720: one number, or { X = ..., Y = ..., Z = ... }; stated, it is a limit"
+    )
+    max_velo_percent: tuple[float, float, float] | None = setting(
+        _per_axis, None, meaning="MD32730: one number, or { X = ..., Y = ..., Z = ... }; stated, it is a limit"
+    )
+    max_speed_mm_min: tuple[float, float, float] = setting(
+        _per_axis, (1.0, 1.0, 1.0), meaning="MD32000, largest speeds of the axes; only their ratio matters"
+    )
+    sign_stated: bool = False
+    mode_stated: bool = False
+
+    @property
+    def subtracts(self) -> bool:
+        """Whether the control subtracts the sum of the tables from the command."""
+        return self.sign == "error"
+
+    @property
+    def tables_usable(self) -> int | None:
+        """How many tables the errors may take, None if no number is known."""
+        if self.tables_available is None:
+            return None
+        kept = sum(1 for index in self.kept_tables if index < self.tables_available)
+        return max(self.tables_available - self.tables_reserved - kept, 1)
+
+
+@dataclass(frozen=True)
+class EncoderSettings(SiemensSettings):
+    """Settings of encoder tables, with or without cross tables.
+
+    Parameters
+    ----------
+    encoders : for X, Y, Z the measuring systems that get a table: 0 is measuring system 1, 1 is measuring system 2.
+    active : for X, Y, Z the one that the position control uses.
+    eec_nodes_known : False if the number of nodes is not documented for the model and not stated.
+    """
+
+    encoders: Encoders = setting(
+        _encoders,
+        ((0,), (0,), (0,)),
+        key="encoder",
+        meaning="measuring systems that get a table: 0 (system 1), 1 (system 2), [0, 1], or by axis, e.g. { X = [0, 1] }",
+    )
+    active: tuple[int, int, int] = setting(
+        _encoders,
+        None,
+        key="active_encoder",
+        meaning="the measuring system that the position control uses, one number or by axis; default the first",
+    )
+    eec_nodes_known: bool = True
+
+
+@dataclass(frozen=True)
+class EecSettings(EncoderSettings):
+    """``[controllers.siemens-eec]``."""
+
+    max_points: int = setting(whole(3, 100_000), PROFILES[USUAL].eec_nodes, meaning="nodes per axis, at least 3")
+    step_mm: tuple[float | None, float | None, float | None] = axis_setting(_STEP, meaning=_STEP_MEANING)
+    decimals: int = setting(whole(3, 9), 6, meaning="decimals of the values in mm, 3 to 9")
+
+
+@dataclass(frozen=True)
+class CecEecSettings(CecSettings, EncoderSettings):
+    """``[controllers.siemens-cec-eec]``: the encoder tables have the keys with ``eec_``."""
+
+    eec_max_points: int = setting(
+        whole(3, 100_000), PROFILES[USUAL].eec_nodes, meaning="nodes per encoder table, at least 3"
+    )
+    eec_step_mm: tuple[float | None, float | None, float | None] = axis_setting(
+        _STEP, meaning="distance of the nodes of the encoder tables"
+    )
+    eec_decimals: int = setting(whole(3, 9), 6, meaning="decimals of the values of the encoder tables in mm, 3 to 9")
+
+    @property
+    def eec(self) -> EecSettings:
+        """The settings of the encoder tables alone."""
+        common = {item.name: getattr(self, item.name) for item in fields(EncoderSettings)}
+        steps, decimals = self.eec_step_mm, self.eec_decimals
+        return EecSettings(**common, max_points=self.eec_max_points, step_mm=steps, decimals=decimals)
+
+
+Cec = TypeVar("Cec", bound=CecSettings)
+Encoder = TypeVar("Encoder", bound=EncoderSettings)
+
+
+def checked_cec_settings(settings: Cec, section: Section, machine: Machine) -> Cec:
+    """Return the settings of cross tables with what follows from the model and from ``mult_mode``.
+
+    Without ``mult_mode`` and ``products`` no products are written: a wrong mode is worse than a wrong sign.
+    """
+    mode_stated, profile = "mult_mode" in section, PROFILES[settings.profile]
+    tables = profile.cec_tables
+    if profile.tables_per_axis and settings.nc_axes is not None:
+        tables = profile.tables_per_axis * settings.nc_axes
+    settings = unless_stated(settings, section, max_points=profile.cec_nodes, tables_available=tables)
+    settings = unless_stated(settings, section, mult_mode=next(iter(MULT_MODES)), products=mode_stated)
+    if settings.products and not mode_stated:
+        raise section.fail("mult_mode", _MODE_MISSING)
+    if settings.max_points is None or (settings.tables_available is None and not profile.tables_per_axis):
+        raise section.fail("profile", _NOT_DOCUMENTED)
+    _check_steps(settings, section, machine, "")
+    return replace(settings, sign_stated="sign" in section, mode_stated=mode_stated)
+
+
+def checked_encoder_settings(settings: Encoder, section: Section, machine: Machine, prefix: str = "") -> Encoder:
+    """Return the settings of encoder tables with what follows from the model; ``prefix`` of their keys."""
+    profile = PROFILES[settings.profile]
+    settings = unless_stated(settings, section, **{f"{prefix}max_points": profile.eec_nodes})
+    _check_steps(settings, section, machine, prefix)
+    stated: Any = settings.active
+    active = [own[:1] for own in settings.encoders] if stated is None else stated
+    for letter, one, own in zip(AXES, active, settings.encoders, strict=True):
+        if len(one) != 1 or one[0] not in own:
+            raise section.fail("active_encoder", f"one of the encoders of {letter}, {list(own)}, is expected")
+    known = profile.eec_nodes_documented or f"{prefix}max_points" in section
+    x, y, z = (one[0] for one in active)
+    return replace(settings, active=(x, y, z), eec_nodes_known=known)
+
+
+def _check_steps(settings: SiemensSettings, section: Section, machine: Machine, prefix: str) -> None:
+    """Refuse steps that give more nodes than the control takes, and an INI file that is to switch something on."""
+    if settings.program_enables and settings.container == "ini":
+        raise section.fail("program_enables", 'needs container = "program": an INI file switches nothing on')
+    most, key = getattr(settings, f"{prefix}max_points"), f"{prefix}step_mm"
+    for letter, axis, step in zip(AXES, machine.axes, getattr(settings, key), strict=True):
         if step is not None and axis.length_mm / step > most - 1:
             message = f"{step:g} mm gives more than the {most} nodes that max_points allows over {axis.length_mm:g} mm"
-            raise steps_section.fail(letter, message)
-        steps.append(step)
-    steps_section.finish()
-    return tuple(steps)
-
-
-def _step(value: Any) -> float:
-    step = toml_files.positive(value)
-    if Decimal(repr(step)) % POSITION_QUANTUM_MM or step > 1e6:
-        raise ValueError("a step in mm with at most 6 decimals is expected")
-    return step
+            raise section.section(key).fail(letter, message)
 
 
 # Limits of SINUMERIK CEC tables: what the sum reaches over the volume, how fast it changes, and the rules of a set.

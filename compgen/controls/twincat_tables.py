@@ -14,6 +14,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest
 from compgen.data.names import AXES
+from compgen.data.toml_files import setting, whole
 from compgen.errors import InputError
 
 # Axis lists of the TwinCAT CNC (TF5200): leadscrew, cross and plane tables as the control keeps them, and their lookup.
@@ -104,6 +105,18 @@ class AxisList:
     cross: CrossTable | None = None
     plane: PlaneTable | None = None
 
+    @property
+    def numbers(self) -> FloatArray:
+        """Every position and value of the tables, shape (n,)."""
+        parts: list[FloatArray | None] = [np.zeros(1)]
+        if self.screw is not None:
+            parts += [self.screw.setpoints, self.screw.pos, self.screw.neg]
+        if self.cross is not None:
+            parts += [self.cross.setpoints, self.cross.values]
+        if self.plane is not None:
+            parts += [np.array([*self.plane.starts, self.plane.interval]), self.plane.values]
+        return np.concatenate([np.ravel(part) for part in parts if part is not None])
+
 
 @dataclass(frozen=True)
 class TwincatTables:
@@ -114,21 +127,26 @@ class TwincatTables:
 
 @dataclass(frozen=True)
 class PointLimits:
-    """Largest number of points of each kind of table."""
+    """Largest number of points of each kind of table; builds without P-COMP-00059 ... 61 have the defaults."""
 
-    ssfk: int
-    crosscomp: int
-    crosscomp2: int
+    ssfk: int = setting(whole(2, 100_000), 1500)
+    crosscomp: int = setting(whole(2, 100_000), 1001)
+    crosscomp2: int = setting(whole(4, 100_000), 10201)
+
+
+def point_counts(item: AxisList) -> dict[str, int]:
+    """Return the number of points of each table of a list, by its structure (``ssfk``, ``crosscomp``, ``crosscomp2``)."""
+    counts = {} if item.screw is None else {"ssfk": len(item.screw.setpoints)}
+    counts |= {} if item.cross is None else {"crosscomp": len(item.cross.setpoints)}
+    return counts | ({} if item.plane is None else {"crosscomp2": item.plane.values.size})
 
 
 def list_usage(name: str, item: AxisList, most: PointLimits) -> list[Usage]:
     """Return the points of one list (``name``: the axis) against what the control takes."""
-    counts = (
-        ("ssfk", item.screw and len(item.screw.setpoints), most.ssfk),
-        ("crosscomp", item.cross and len(item.cross.setpoints), most.crosscomp),
-        ("crosscomp2", item.plane and item.plane.values.size, most.crosscomp2),
-    )
-    return [Usage(f"points of kw.{kind} of {name}", used, allowed, "points") for kind, used, allowed in counts if used]
+    return [
+        Usage(f"points of kw.{kind} of {name}", used, getattr(most, kind), "points")
+        for kind, used in point_counts(item).items()
+    ]
 
 
 def spans_mm(item: AxisList, axis: int) -> list[tuple[str, int, FloatArray]]:

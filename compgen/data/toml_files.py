@@ -250,6 +250,11 @@ def file_setting(
     return field(default=(load(()) if load else ()) if several else None, metadata=metadata, compare=False)
 
 
+def table_setting(kind: type[T], *, key: str = "", meaning: str = "") -> Any:
+    """Declare a field with the settings that the dataclass ``kind`` declares, from a sub-section."""
+    return field(default_factory=kind, metadata={"check": kind, "key": key, "kind": kind, "meaning": meaning})
+
+
 def take_axes(section: Section, item: Field[Any]) -> tuple[Any, Any, Any]:
     """Return the values of X, Y and Z of a field that :func:`axis_setting` declares."""
     data, key = item.metadata, item.metadata["key"] or item.name
@@ -267,6 +272,10 @@ def declared_settings(kind: type) -> list[tuple[RequestedKey, str]]:
     found = []
     for item in fields(kind) if is_dataclass(kind) else ():
         data, key = item.metadata, item.metadata.get("key") or item.name
+        if "kind" in data:
+            inner = declared_settings(data["kind"])
+            found += [(replace(part, key=f"{key}.{part.key}"), said or data["meaning"]) for part, said in inner]
+            continue
         if "axes" in data:
             parts = [(f"{key}.{letter}", False, default) for letter, default in zip(AXES, data["axes"], strict=True)]
         else:
@@ -282,6 +291,10 @@ def take_settings(kind: type[T], section: Section, /, **given: Any) -> T:
             continue
         if "axes" in item.metadata:
             given[item.name] = take_axes(section, item)
+            continue
+        if "kind" in item.metadata:
+            part = section.section(item.metadata["key"] or item.name, required=False)
+            given[item.name] = read_settings(item.metadata["kind"], part)
             continue
         key, check, unit = (item.metadata[name] for name in ("key", "check", "unit"))
         key, default = key or item.name, item.metadata["stated"]

@@ -204,12 +204,12 @@ def test_settings_of_the_two_kinds_are_taken_where_the_own_section_is_silent():
     }
     control = controller_named("siemens-cec-eec")
     settings = control.read_settings(machine_with(others=others))
-    assert (settings.cec.sign, settings.cec.mult_mode, settings.cec.step_mm) == ("correction", "S3", (80.0, None, None))
+    assert (settings.sign, settings.mult_mode, settings.step_mm) == ("correction", "S3", (80.0, None, None))
     assert (settings.eec.active, settings.eec.max_points, settings.eec.decimals) == ((1, 1, 1), 300, 5)
     assert settings.eec.step_mm == (None, 25.0, None)
     own = {"siemens-cec-eec": {"sign": "error", "eec_max_points": 50, "encoder": 0}}
     settings = control.read_settings(machine_with(own=own, others=others))
-    assert (settings.cec.sign, settings.eec.active, settings.eec.max_points) == ("error", (0, 0, 0), 50)
+    assert (settings.sign, settings.eec.active, settings.eec.max_points) == ("error", (0, 0, 0), 50)
     with pytest.raises(InputError, match=r"\[controllers.siemens-cec-eec\] mult_mode: is missing"):
         control.read_settings(machine_with(others={"siemens-cec": {"products": True}}))
     with pytest.raises(InputError, match=r"eec_max_pints: is not a known key; did you mean 'eec_max_points'"):

@@ -159,9 +159,22 @@ class Controller(ABC, Generic[Settings, Tables]):
     def read_settings(cls, machine: Machine) -> Settings:
         """Read ``[controllers.<name>]`` of the machine file; InputError for what is missing, unknown or wrong.
 
-        The default takes the settings that the fields of ``settings_class`` declare.
+        The settings are those that the fields of ``settings_class`` declare.
         """
-        return toml_files.read_settings(cls.settings_class, machine.controller_settings(cls.name))
+        section = cls.settings_section(machine)
+        settings = cls.check_settings(toml_files.take_settings(cls.settings_class, section), section, machine)
+        section.finish()
+        return settings
+
+    @classmethod
+    def settings_section(cls, machine: Machine) -> toml_files.Section:
+        """Return the section of the machine file that the settings are read from."""
+        return machine.controller_settings(cls.name)
+
+    @classmethod
+    def check_settings(cls, settings: Settings, section: toml_files.Section, machine: Machine) -> Settings:
+        """Check what depends on several keys or on the machine; return the settings with the defaults that do."""
+        return settings
 
     def missing(self) -> InputError | None:
         """Return the error of a setting that an export needs and reading does not; ``build`` raises it. None: complete."""

@@ -121,11 +121,6 @@ def loss_setting(
     return toml_files.setting(toml_files.positive, key="loss_um", unit=MM_PER_UM, stated=default, meaning=meaning)
 
 
-def take_loss_mm(section: toml_files.Section) -> float:
-    """Take ``loss_um`` from a control's settings: the loss by interpolation that is worth no further node; in mm."""
-    return section.take("loss_um", toml_files.positive, NEGLIGIBLE_LOSS_MM / MM_PER_UM) * MM_PER_UM
-
-
 def curve_nodes_mm(machine: Machine, errors: ErrorTable, axis: int, most: int = 1000) -> FloatArray:
     """Return the union of the positions of all curves of an axis within its travel, the travel ends included."""
     low, high = machine.axes[axis].range_mm
