@@ -46,11 +46,10 @@ from compgen.plan.suggest import DEFAULT_EVALUATIONS, Criterion
 from compgen.report.terminal import plan_table, suggestion_table, trajectory_table, visibility_table
 from compgen.simulate import (
     AxisLaser,
-    AxisSimulation,
     DiagonalLaser,
+    SimulatedReadings,
     SimulatedSixDof,
     Simulation,
-    SixDofSimulation,
     read_scenario,
     simulate,
     simulate_axis_runs,
@@ -221,7 +220,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
     with progress(quiet=as_json) as show:
         show("simulating")
         planned = read_scenario(scenario)
-        simulation: Simulation | SixDofSimulation | AxisSimulation
+        simulation: Simulation | SimulatedReadings
         if isinstance(planned.instrument, AxisLaser | DiagonalLaser):
             simulation = simulate_axis_runs(machine, planned, seed)
         elif isinstance(planned.instrument, SimulatedSixDof):
@@ -230,7 +229,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
             simulation = simulate(machine, planned, seed)
     paths = write_simulation(simulation, out)
     if as_json:
-        if isinstance(simulation, SixDofSimulation | AxisSimulation):
+        if isinstance(simulation, SimulatedReadings):
             summary = {"readings": len(simulation.readings), "stations": []}
         else:
             summary = {"readings": len(simulation.lengths), "stations": list(simulation.lengths.stations)}

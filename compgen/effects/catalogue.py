@@ -117,22 +117,18 @@ def check_family(name: str, thing: Any) -> tuple[Any, list[str]]:
     taken = set(listed())
     problems = [] if members else ["it has no members"]
     for effect in members:
-        problems += _effect_problems(effect, taken)
+        card = getattr(effect, "card", None)
+        if not isinstance(effect, Effect):
+            problems.append(f"{type(effect).__name__} is not a compgen.effects.Effect")
+        elif not isinstance(card, Card):
+            problems.append(f"{type(effect).__name__} has no card")
+        else:
+            lacking = [key for key in ("name", "title", "equation", "source", "parameters") if not getattr(card, key)]
+            problems += [f"the name {card.name!r} is taken"] if card.name in taken else []
+            problems += [f"the card of {card.name!r} lacks {', '.join(lacking)}"] if lacking else []
+            if card.scan and card.scan not in {setting.name for setting in card.settings}:
+                problems.append(f"the card of {card.name!r} scans {card.scan!r}, which is none of its settings")
     return family, problems
-
-
-def _effect_problems(effect: Any, taken: set[str]) -> list[str]:
-    if not isinstance(effect, Effect):
-        return [f"{type(effect).__name__} is not a compgen.effects.Effect"]
-    card = getattr(effect, "card", None)
-    if not isinstance(card, Card):
-        return [f"{type(effect).__name__} has no card"]
-    problems = [f"the name {card.name!r} is taken"] if card.name in taken else []
-    lacking = [key for key in ("name", "title", "equation", "source", "parameters") if not getattr(card, key)]
-    problems += [f"the card of {card.name!r} lacks {', '.join(lacking)}"] if lacking else []
-    if card.scan and card.scan not in {setting.name for setting in card.settings}:
-        problems.append(f"the card of {card.name!r} scans {card.scan!r}, which is none of its settings")
-    return problems
 
 
 # What to do about each effect of the catalogue, a sentence for the one who stands at the machine.

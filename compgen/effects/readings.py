@@ -202,29 +202,23 @@ def velocity_mm_s(readings: Readings) -> FloatArray | None:
     if run_of(readings) is None and readings.covariate("time_s") is None:
         moved = readings.approach
         return None if moved is None else np.asarray(moved * feed[:, None] / SECONDS_PER_MIN)
-    motion = _last_motion(readings)
+    # motion from the stop before to each reading in mm, (n, 3); zero where it is the only stop of its run
+    run, time_s = run_of(readings), readings.covariate("time_s")
+    component = readings.direction.argmax(axis=1) if readings.kind == "deviations" else readings.station
+    row = np.arange(len(readings))
+    keys = np.column_stack([0 * row if run is None else run, component])
+    _, sequence = np.unique(keys, axis=0, return_inverse=True)
+    order = np.lexsort((row, row if time_s is None else time_s, sequence.ravel()))
+    motion = np.zeros((len(readings), 3))
+    ends = np.flatnonzero(np.diff(sequence.ravel()[order], append=-1)) + 1
+    for part in np.split(order, ends[:-1]):
+        motion[part] = _within(readings.position_mm[part])
     length = np.linalg.norm(motion, axis=1, keepdims=True)
     cosine = np.divide(motion, length, out=np.zeros_like(motion), where=length > REST_MM)
     if readings.approach is not None:
         known = readings.approach != 0
         cosine = np.where(known, np.abs(cosine) * readings.approach, cosine)
     return np.asarray(cosine * feed[:, None] / SECONDS_PER_MIN)
-
-
-def _last_motion(readings: Readings) -> FloatArray:
-    """Motion from the stop before to each reading in mm, (n, 3); zero where it is the only stop of its run."""
-    run = run_of(readings)
-    component = readings.direction.argmax(axis=1) if readings.kind == "deviations" else readings.station
-    keys = np.column_stack([np.zeros(len(readings), dtype=np.int64) if run is None else run, component])
-    _, sequence = np.unique(keys, axis=0, return_inverse=True)
-    time_s = readings.covariate("time_s")
-    row = np.arange(len(readings))
-    order = np.lexsort((row, row if time_s is None else time_s, sequence.ravel()))
-    motion = np.zeros((len(readings), 3))
-    ends = np.flatnonzero(np.diff(sequence.ravel()[order], append=-1)) + 1
-    for part in np.split(order, ends[:-1]):
-        motion[part] = _within(readings.position_mm[part])
-    return motion
 
 
 def _within(position_mm: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Drawable, Overview, Panel
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Lengths, Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
@@ -286,7 +286,15 @@ class Plan(Drawable):
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``plan.json``."""
-        stations, noise = self.planned.stations, self.planned.noise
+        stations, noise, curves = self.planned.stations, self.planned.noise, {}
+        for name, curve in self.errors.curves.items():
+            error, whole = error_named(name), bool(np.isfinite(curve.u).all())
+            curves[name] = {
+                "unit": error.unit,
+                "determined": whole,
+                "u_max": float(curve.u.max()) / error.si_per_unit if whole else None,
+                "at_mm": float(curve.position_mm[int(np.argmax(curve.u))]) if whole else None,
+            }
         return {
             "determined": self.determined,
             "reasons": list(self.reasons),
@@ -308,7 +316,7 @@ class Plan(Drawable):
                 "constant_um": noise.constant_um,
                 "proportional_um_per_m": noise.proportional_um_per_m,
             },
-            "curves": {name: _curve_summary(name, curve) for name, curve in self.errors.curves.items()},
+            "curves": curves,
             "squareness": {
                 name: {"unit": "urad", "u": _known(u * 1e6)} for name, (_, u) in self.errors.squareness.items()
             },
@@ -329,17 +337,6 @@ class Plan(Drawable):
 
 def _known(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def _curve_summary(name: str, curve: Curve) -> dict[str, Any]:
-    error = error_named(name)
-    whole = bool(np.isfinite(curve.u).all())
-    return {
-        "unit": error.unit,
-        "determined": whole,
-        "u_max": float(curve.u.max()) / error.si_per_unit if whole else None,
-        "at_mm": float(curve.position_mm[int(np.argmax(curve.u))]) if whole else None,
-    }
 
 
 def plan(machine: Machine, stations: PlannedStations, points: Points, options: IdentifyOptions | None = None) -> Plan:
@@ -382,30 +379,24 @@ def plan_of(found: Planned) -> Plan:
     nodes = [axis.nodes_mm for axis in found.machine.axes]
     grid = volume_grid(found.machine, (nodes[0], nodes[1], nodes[2])).position_mm
     of_errors = prediction.of(slice(0, found.problem.parameters.size))
+    table = table_of_values(
+        (name, position_mm, np.zeros(len(position_mm)), prediction.of(columns).u(matrix))
+        for name, position_mm, columns, matrix in error_values(found.problem.parameters)
+    )
+    metadata = {
+        "machine": found.machine.name,
+        "source": "compgen plan",
+        "values": "zero, only u_value is predicted",
+        "reference_point_mm": " ".join(f"{value:g}" for value in found.machine.reference_point_mm),
+    }
     chunks = [grid[k : k + CHUNK_POINTS] for k in range(0, len(grid), CHUNK_POINTS)]
     return Plan(
         planned=found,
         rank=rank,
         nodes_without_data=found.nodes_without_data(),
-        errors=_predicted_errors(found, prediction),
+        errors=table.replace(metadata=metadata),
         volume=VolumeUncertainty(grid, np.concatenate([of_errors.u(found.error_rows(chunk)) for chunk in chunks])),
     )
-
-
-def _predicted_errors(found: Planned, prediction: Prediction) -> ErrorTable:
-    values = error_values(found.problem.parameters)
-    table = table_of_values(
-        (name, position_mm, np.zeros(len(position_mm)), prediction.of(columns).u(matrix))
-        for name, position_mm, columns, matrix in values
-    )
-    reference = " ".join(f"{value:g}" for value in found.machine.reference_point_mm)
-    metadata = {
-        "machine": found.machine.name,
-        "source": "compgen plan",
-        "values": "zero, only u_value is predicted",
-        "reference_point_mm": reference,
-    }
-    return table.replace(metadata=metadata)
 
 
 # What a planned measurement can never see of the catalogue of effects, and what to measure in addition.
@@ -479,6 +470,7 @@ def plan_visibility(found: Planned, points: Points) -> PlanVisibility:
     readings, assumed = _readings(found, points)
     modelled = modelled_errors(found.machine)
     chosen, hidden, cards = {}, {}, {}
+    logged = {*readings.covariates, *readings.labels, "station", "approach_x", "approach_y", "approach_z"}
     for name, effect in catalogue(found.stations.names).items():
         if isinstance(effect, SignError | Squareness):
             missing = effect.displacement(readings) is not None  # else the sign means nothing on this chain
@@ -489,7 +481,10 @@ def plan_visibility(found: Planned, points: Points) -> PlanVisibility:
         cards[name] = effect.card
         columns = _columns(effect, readings)
         if columns is None:
-            hidden[name] = _lacking(effect.card, readings)
+            of_one = "tool offset" if name.startswith("lever_") else "set-up" if name == "tool_offset_error" else ""
+            lacking = [key for key in effect.card.covariates if key not in logged]
+            hidden[name] = f"the plan has no {', '.join(lacking)}" if lacking else "nothing of it varies in this plan"
+            hidden[name] = f"one {of_one}" if of_one else hidden[name]
         else:
             chosen[name] = columns
     gram, base, where = _gram(found, readings, chosen)
@@ -504,16 +499,6 @@ def _columns(effect: Effect, readings: Readings) -> FloatArray | None:
     fixed = effect.at(positions[len(positions) // 2]) if positions else effect
     columns = fixed.columns(readings)
     return None if columns is None or not np.any(columns) else columns
-
-
-def _lacking(card: Card, readings: Readings) -> str:
-    if card.name.startswith("lever_"):
-        return "one tool offset"
-    if card.name == "tool_offset_error":
-        return "one set-up"
-    known = {*readings.covariates, *readings.labels, "station", "approach_x", "approach_y", "approach_z"}
-    lacking = [name for name in card.covariates if name not in known]
-    return f"the plan has no {', '.join(lacking)}" if lacking else "nothing of it varies in this plan"
 
 
 def _readings(found: Planned, points: Points) -> tuple[Readings, list[str]]:
@@ -588,17 +573,12 @@ def _gram(
         rows = slice(first, first + CHUNK_READINGS)
         moved = found.error_rows(readings.position_mm[rows], layout, readings.tool_mm[rows])
         errors = np.einsum("nd,ndp->np", readings.direction[rows], moved)
-        placing = _placing(readings, group.ravel().astype(np.int64), rows, size - layout.size)
+        # derivative of the readings by stations and dead lengths
+        station = readings.station[rows]
+        each, placing = np.arange(len(station)), np.zeros((len(station), size - layout.size))
+        for axis in range(3):
+            placing[each, 3 * station + axis] = -readings.direction[rows, axis]
+        placing[each, 3 * len(readings.stations) + group.ravel()[rows]] = -1.0
         block = np.hstack([errors, placing, *(columns[rows] for columns in chosen.values())]) * weight[rows, None]
         gram += block.T @ block
     return gram, size, where
-
-
-def _placing(readings: Readings, group: NDArray[np.int64], rows: slice, size: int) -> FloatArray:
-    """Derivative of the readings by stations and dead lengths."""
-    station, each = readings.station[rows], np.arange(len(readings.station[rows]))
-    columns = np.zeros((len(station), size))
-    for axis in range(3):
-        columns[each, 3 * station + axis] = -readings.direction[rows, axis]
-    columns[each, 3 * len(readings.stations) + group[rows]] = -1.0
-    return columns

@@ -163,7 +163,17 @@ class Shell:
     def place(self, unit: FloatArray) -> FloatArray:
         """Return the place for the share of the outline, of the distance, and of the height."""
         outwards = SHELL_NEAR_MM + unit[1] * (SHELL_FAR_MM - SHELL_NEAR_MM)
-        x, y = _on_outline(float(unit[0]) % 1.0, self.half_mm + outwards)
+        # the outline runs from the lower left corner to the right, (x, y) by the length gone along it
+        a, b = (float(half) for half in self.half_mm + outwards)
+        along = (float(unit[0]) % 1.0) * 4 * (a + b)
+        if along < 2 * a:
+            x, y = along - a, -b
+        elif along < 2 * a + 2 * b:
+            x, y = a, along - 2 * a - b
+        elif along < 4 * a + 2 * b:
+            x, y = 3 * a + 2 * b - along, b
+        else:
+            x, y = -a, 4 * a + 3 * b - along
         return np.array([*(self.centre_mm + [x, y]), self.table_mm + unit[2] * SHELL_HEIGHT_MM])
 
     def unit(self, place_mm: FloatArray) -> FloatArray:
@@ -177,30 +187,11 @@ class Shell:
             offset[side] = np.copysign(half[side], offset[side])
         far = (outwards - SHELL_NEAR_MM) / (SHELL_FAR_MM - SHELL_NEAR_MM)
         high = (place_mm[2] - self.table_mm) / SHELL_HEIGHT_MM
-        return np.array([_share_of_outline(offset, half), *np.clip([far, high], 0.0, 1.0)])
-
-
-def _on_outline(share: float, half: FloatArray) -> tuple[float, float]:
-    """Point at a share of the outline of a rectangle (half sizes (2,)), from its lower left corner to the right."""
-    a, b = float(half[0]), float(half[1])
-    along = share * 4 * (a + b)
-    if along < 2 * a:
-        return along - a, -b
-    if along < 2 * a + 2 * b:
-        return a, along - 2 * a - b
-    if along < 4 * a + 2 * b:
-        return 3 * a + 2 * b - along, b
-    return -a, 4 * a + 3 * b - along
-
-
-def _share_of_outline(offset: FloatArray, half: FloatArray) -> float:
-    """The share at which :func:`_on_outline` gives the point ``offset`` (2,) on the outline."""
-    a, b = float(half[0]), float(half[1])
-    x, y = float(offset[0]), float(offset[1])
-    distance = np.abs([y + b, x - a, y - b, x + a])
-    side = int(np.argmin(distance))
-    along = (x + a, 2 * a + y + b, 3 * a + 2 * b - x, 4 * a + 3 * b - y)[side]
-    return float(np.clip(along / (4 * (a + b)), 0.0, 1.0 - 1e-12))
+        (a, b), (x, y) = (float(size) for size in half), (float(part) for part in offset)
+        side = int(np.argmin(np.abs([y + b, x - a, y - b, x + a])))
+        along = (x + a, 2 * a + y + b, 3 * a + 2 * b - x, 4 * a + 3 * b - y)[side]
+        share = float(np.clip(along / (4 * (a + b)), 0.0, 1.0 - 1e-12))
+        return np.array([share, *np.clip([far, high], 0.0, 1.0)])
 
 
 def shell_around(machine: Machine) -> Shell:

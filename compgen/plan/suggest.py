@@ -212,7 +212,20 @@ def candidate_trajectories(machine: Machine) -> dict[str, FloatArray]:
     A lattice of k x k has all nodes along every axis on k x k lines; the 12 edges are the one of 2 x 2.
     """
     found = {"12 edges": trajectory_points(Trajectory("frame"), machine)}
-    found["12 edges and cross lines"] = np.concatenate([found["12 edges"], _cross_lines(machine)])
+    # three lines through the middle of the volume along the axes, and its four body diagonals
+    lower, upper = machine.lower_mm, machine.upper_mm
+    most, cross = max(len(axis.nodes_mm) for axis in machine.axes), [found["12 edges"]]
+    for k, axis in enumerate(machine.axes):
+        along = np.tile(0.5 * (lower + upper), (len(axis.nodes_mm), 1))
+        along[:, k] = axis.nodes_mm
+        cross.append(along)
+    diagonals = []
+    for corner in ((0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)):
+        turned = np.array(corner, dtype=bool)
+        a, b = np.where(turned, upper, lower), np.where(turned, lower, upper)
+        diagonals.append(Line(tuple(a.tolist()), tuple(b.tolist()), most))
+    cross.append(trajectory_points(Trajectory("lines", lines=tuple(diagonals)), machine))
+    found["12 edges and cross lines"] = np.concatenate(cross)
     for count in (3, 4, 5, 7):
         if count < min(len(axis.nodes_mm) for axis in machine.axes):
             found[f"lattice {count} x {count}"] = _lattice(machine, count)
@@ -221,23 +234,6 @@ def candidate_trajectories(machine: Machine) -> dict[str, FloatArray]:
     first = {name: np.unique(points, axis=0, return_index=True)[1] for name, points in found.items()}
     unique = {name: points[np.sort(first[name])] for name, points in found.items()}  # each point once
     return dict(sorted(unique.items(), key=lambda item: len(item[1])))
-
-
-def _cross_lines(machine: Machine) -> FloatArray:
-    """Three lines through the middle of the volume along the axes, and its four body diagonals."""
-    lower, upper = machine.lower_mm, machine.upper_mm
-    middle, most = 0.5 * (lower + upper), max(len(axis.nodes_mm) for axis in machine.axes)
-    lines = []
-    for axis in range(3):
-        along = np.tile(middle, (len(machine.axes[axis].nodes_mm), 1))
-        along[:, axis] = machine.axes[axis].nodes_mm
-        lines.append(along)
-    ends = []
-    for corner in ((0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)):
-        turned = np.array(corner, dtype=bool)
-        ends.append((np.where(turned, upper, lower), np.where(turned, lower, upper)))
-    diagonals = tuple(Line(tuple(a.tolist()), tuple(b.tolist()), most) for a, b in ends)
-    return np.concatenate([*lines, trajectory_points(Trajectory("lines", lines=diagonals), machine)])
 
 
 def _lattice(machine: Machine, count: int) -> FloatArray:

@@ -166,7 +166,7 @@ def read_scenario(path: str | Path) -> Scenario:
     instrument = root.section("instrument")
     kind = instrument.take("type", toml_files.choice(*INSTRUMENTS))
     scenario = Scenario(
-        instrument=_instrument(kind, instrument),
+        instrument=INSTRUMENTS[kind](instrument),
         seed=seed,
         name=name,
         errors=errors,
@@ -176,28 +176,20 @@ def read_scenario(path: str | Path) -> Scenario:
         session=read_session(root.section("session")) if "session" in root else None,
         temperatures=read_temperatures(root.section("temperatures", required=False)),
     )
+    if not isinstance(scenario.instrument, SimulatedSixDof | LineLaser):
+        problems = instrument_problems(scenario.instrument)
+        if problems:
+            raise instrument.fail("type", "; ".join(problems))
     root.finish()
+    others: tuple[str, ...] = ()
     if isinstance(scenario.instrument, SimulatedSixDof):
-        for key in ("trajectory", "effects", "session", "temperatures"):
-            if key in root.data:
-                raise root.fail(key, "belongs to other instruments; a six-DOF instrument runs along the axes")
-    if isinstance(scenario.instrument, LineLaser):
-        for key in ("trajectory", "session"):
-            if key in root.data:
-                raise root.fail(
-                    key, "belongs to other instruments; a laser along axes or diagonals runs to and fro along each"
-                )
+        others, text = ("trajectory", "effects", "session", "temperatures"), "a six-DOF instrument runs along the axes"
+    elif isinstance(scenario.instrument, LineLaser):
+        others, text = ("trajectory", "session"), "a laser along axes or diagonals runs to and fro along each"
+    for key in others:
+        if key in root.data:
+            raise root.fail(key, f"belongs to other instruments; {text}")
     return scenario
-
-
-def _instrument(kind: str, section: toml_files.Section) -> AnyInstrument:
-    made = INSTRUMENTS[kind](section)
-    if isinstance(made, SimulatedSixDof | LineLaser):
-        return made
-    problems = instrument_problems(made)
-    if problems:
-        raise section.fail("type", "; ".join(problems))
-    return made
 
 
 def _file_name(value: Any) -> str:
@@ -237,20 +229,14 @@ class Simulation(Displayed):
 
 
 @dataclass(frozen=True)
-class AxisSimulation:
-    """Runs of a virtual machine along axes or diagonals, and its true errors in mm and rad; ``name`` begins the file names."""
+class SimulatedReadings:
+    """Runs along axes or diagonals, or six-DOF readings, of a virtual machine, and its true errors in mm and rad.
+
+    ``name`` begins the file names.
+    """
 
     name: str
-    readings: AxisRuns | Diagonals
-    truth: ErrorTable
-
-
-@dataclass(frozen=True)
-class SixDofSimulation:
-    """The six-DOF readings of a virtual machine, and its true errors in mm and rad; ``name`` begins the file names."""
-
-    name: str
-    readings: SixDof
+    readings: AxisRuns | Diagonals | SixDof
     truth: ErrorTable
 
 
@@ -258,22 +244,17 @@ def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequ
     """Where the tool tip really is in the workpiece frame: exact chain plus ``effects``, shape (n, 3), mm."""
     tip_mm = tip_position(machine, truth.at(stops.position_mm), stops.position_mm, stops.tool_mm)
     for effect in effects:
-        tip_mm = tip_mm + _displacement(effect, machine, stops)
+        moved_mm = np.asarray(effect(machine, stops))
+        if (  # the code of others may return anything
+            moved_mm.shape != stops.position_mm.shape
+            or moved_mm.dtype.kind not in "fi"
+            or not np.all(np.isfinite(moved_mm))
+        ):
+            name = getattr(effect, "__qualname__", type(effect).__qualname__)
+            wanted = f"an array {stops.position_mm.shape} of finite numbers in mm"
+            raise InputError(f"the effect {name} returns {moved_mm.dtype} {moved_mm.shape}; {wanted} is expected")
+        tip_mm = tip_mm + moved_mm.astype(np.float64)
     return tip_mm
-
-
-def _displacement(effect: Effect, machine: Machine, stops: Stops) -> FloatArray:
-    """What an effect adds; InputError if it is not one finite vector per stop, as code of others may have it."""
-    moved_mm = np.asarray(effect(machine, stops))
-    if (
-        moved_mm.shape != stops.position_mm.shape
-        or moved_mm.dtype.kind not in "fi"
-        or not np.all(np.isfinite(moved_mm))
-    ):
-        name = getattr(effect, "__qualname__", type(effect).__qualname__)
-        due = f"an array {stops.position_mm.shape} of finite numbers in mm"
-        raise InputError(f"the effect {name} returns {moved_mm.dtype} {moved_mm.shape}; {due} is expected")
-    return moved_mm.astype(np.float64)
 
 
 def simulate(
@@ -362,37 +343,44 @@ def _changed(
     return replace(lengths, length_mm=lengths.length_mm + change)
 
 
-def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = None) -> SixDofSimulation:
+def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = None) -> SimulatedReadings:
     """Measure a virtual machine with the six-DOF instrument of the scenario; InputError for another instrument."""
-    used_seed = scenario.seed if seed is None else seed
-    seeds = np.random.SeedSequence(used_seed)
-    if not isinstance(scenario.instrument, SimulatedSixDof):
+    instrument = scenario.instrument
+    if not isinstance(instrument, SimulatedSixDof):
         raise InputError("is not a six-DOF instrument; call simulate", file=scenario.source, field="[instrument] type")
-    truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
-    readings = scenario.instrument.measure(machine, truth, random_stream(seeds, NOISE_STREAM))
-    metadata = {**_common(machine, used_seed), **readings.metadata}
-    return SixDofSimulation(scenario.name, replace(readings, metadata=metadata), _described(machine, truth, used_seed))
+    return _measured(machine, scenario, seed, lambda truth, rng: instrument.measure(machine, truth, rng))
 
 
-def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = None) -> AxisSimulation:
+def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = None) -> SimulatedReadings:
     """Measure a virtual machine with the scenario's laser along axes or diagonals; InputError for another instrument."""
-    used_seed = scenario.seed if seed is None else seed
-    seeds = np.random.SeedSequence(used_seed)
-    if not isinstance(scenario.instrument, LineLaser):
+    instrument = scenario.instrument
+    if not isinstance(instrument, LineLaser):
         raise InputError(
             "is not a laser along axes or diagonals; call simulate", file=scenario.source, field="[instrument] type"
         )
-    truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
     moving = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect | RunEffect)]
-    readings = scenario.instrument.measure(
-        machine,
-        lambda stops: actual_tips(machine, truth, stops, moving),
-        scenario.effects,
-        scenario.temperatures,
-        random_stream(seeds, NOISE_STREAM),
-    )
+
+    def measure(truth: ErrorTable, rng: np.random.Generator) -> AxisRuns | Diagonals:
+        def tips(stops: Stops) -> FloatArray:
+            return actual_tips(machine, truth, stops, moving)
+
+        return instrument.measure(machine, tips, scenario.effects, scenario.temperatures, rng)
+
+    return _measured(machine, scenario, seed, measure)
+
+
+def _measured(
+    machine: Machine,
+    scenario: Scenario,
+    seed: int | None,
+    measure: Callable[[ErrorTable, np.random.Generator], AxisRuns | Diagonals | SixDof],
+) -> SimulatedReadings:
+    used_seed = scenario.seed if seed is None else seed
+    seeds = np.random.SeedSequence(used_seed)
+    truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
+    readings = measure(truth, random_stream(seeds, NOISE_STREAM))
     metadata = {**_common(machine, used_seed), **readings.metadata}
-    return AxisSimulation(scenario.name, replace(readings, metadata=metadata), _described(machine, truth, used_seed))
+    return SimulatedReadings(scenario.name, replace(readings, metadata=metadata), _described(machine, truth, used_seed))
 
 
 def _common(machine: Machine, seed: int) -> dict[str, str]:
@@ -414,7 +402,7 @@ _FORMATS: dict[type, tuple[str, Callable[[Any], str]]] = {
 }
 
 
-def write_simulation(simulation: Simulation | SixDofSimulation | AxisSimulation, folder: str | Path) -> dict[str, Path]:
+def write_simulation(simulation: Simulation | SimulatedReadings, folder: str | Path) -> dict[str, Path]:
     """Write the readings, e.g. ``<name>.lengths.csv``, and ``truth.errors.csv``; return paths by file name.
 
     Examples

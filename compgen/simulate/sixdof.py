@@ -177,20 +177,15 @@ class Tracer:
         self.half_turn = np.eye(3)
         if beam_direction < 0:
             self.half_turn = 2.0 * np.outer(np.eye(3)[DIRECTIONS[axis][2]], np.eye(3)[DIRECTIONS[axis][2]]) - np.eye(3)
-        self.values = self._own_frame(systematics or {}, axis)
-        self.geometry = _geometry(optics, axis)
-        self._out, self._back = self._prism(self.values)
-
-    def _own_frame(self, values: Mapping[str, float], axis: int) -> dict[str, float]:
-        """Parameters in the frame of the picture: machine axes after the half turn; beam tilts by their channel."""
-        own = {}
-        for name, value in values.items():
+        self.values = {}  # in the frame of the picture: machine axes after the half turn; beam tilts by their channel
+        for name, value in (systematics or {}).items():
             rest = name.partition("_")[2]
             if rest.startswith("PE"):
-                own[name] = value * (self.beam_direction if rest == "PEz" else 1)
+                self.values[name] = value * (beam_direction if rest == "PEz" else 1)
             else:
-                own[name] = value * float(self.half_turn["xyz".index(rest[0]), "xyz".index(rest[0])])
-        return own
+                self.values[name] = value * float(self.half_turn["xyz".index(rest[0]), "xyz".index(rest[0])])
+        self.geometry = _geometry(optics, axis)
+        self._out, self._back = self._prism(self.values)
 
     def _prism(self, values: Mapping[str, float]) -> tuple[BeamPath, BeamPath]:
         """The way from unit to target and back through the prism of the axis."""
@@ -256,13 +251,12 @@ class Tracer:
         number = 2 * geometry.axis + 1
         spot1, path = self._spot(first, pose, number)
         spot2, _ = self._spot(second, pose, number + 1, offset=-flip * optics.beam_separation_mm)
-        angle = self._autocollimation(second, pose)
-        nominal = (
-            distance_mm
-            + self.optics.exit_to_prism_mm
-            + self._nominal_prism()
-            + optics.apex_depth_mm * (optics.glass_index)
-        )
+        # behind the angle lens: the beam that the film on the front face reflects
+        film = OpticalPlane(np.zeros(3), X).placed(pose)
+        direction = self._back(reflect(self._out(second), film)).direction
+        angle = optics.focal_length_mm * direction[1:] / abs(direction[0])
+        prism = (0.0, optics.prism_leg_mm * optics.glass_index, optics.prism_leg_mm)[geometry.axis]
+        nominal = distance_mm + optics.exit_to_prism_mm + prism + optics.apex_depth_mm * optics.glass_index
         displacement = 0.5 * path - nominal
         result = np.array(
             [displacement, flip * spot1[0], spot1[1], flip * spot2[0], spot2[1], flip * angle[0], angle[1]]
@@ -270,27 +264,19 @@ class Tracer:
         assert len(result) == len(SIGNALS)
         return result
 
-    def _nominal_prism(self) -> float:
-        leg = self.optics.prism_leg_mm
-        return (0.0, leg * self.optics.glass_index, leg)[self.geometry.axis]
-
     def _beam(self, offset_mm: FloatArray, tilt_rad: FloatArray) -> Ray:
         direction = np.array([1.0, tilt_rad[0], tilt_rad[1]])
         point = np.array([self.geometry.exit_mm, offset_mm[0], offset_mm[1]])
         return Ray(point, direction / np.linalg.norm(direction))
 
-    def _cube(self, pose: RigidPose, offset_mm: float) -> tuple[OpticalPlane, list[OpticalPlane]]:
-        """Front plane of the plate, and the three mirrors that meet at the apex behind it, ``offset_mm`` beside beam 1."""
-        beside = np.eye(3)[DIRECTIONS[self.geometry.axis][1]]
-        local = self.geometry.target.turn.T @ beside * offset_mm
-        front = OpticalPlane(np.zeros(3), X).placed(pose)
-        apex = local + self.optics.apex_depth_mm * X
-        return front, [OpticalPlane(apex, normal).placed(pose) for normal in _TRIAD]
-
     def _spot(self, ray: Ray, pose: RigidPose, number: int, offset: float = 0.0) -> tuple[FloatArray, float]:
         """Spot (y, z) of the beam that cube corner ``number`` returns, and the whole optical path."""
         n = self.optics.glass_index
-        front, mirrors = self._cube(pose, offset)
+        # front plane of the plate, and the three mirrors that meet at the apex behind it, ``offset`` from beam 1
+        across = np.eye(3)[DIRECTIONS[self.geometry.axis][1]]
+        apex = self.geometry.target.turn.T @ across * offset + self.optics.apex_depth_mm * X
+        front = OpticalPlane(np.zeros(3), X).placed(pose)
+        mirrors = [OpticalPlane(apex, normal).placed(pose) for normal in _TRIAD]
         ray = refract(self._out(ray), front, 1.0, n)
         for mirror in mirrors:
             ray = reflect(ray, mirror, n)
@@ -300,21 +286,10 @@ class Tracer:
         end = _advance(self._back(ray), OpticalPlane(self.geometry.exit_mm * X, X), 1.0)
         return end.point_mm[1:] - np.array([offset, 0.0]), end.path_mm
 
-    def _autocollimation(self, ray: Ray, pose: RigidPose) -> FloatArray:
-        """Spot (y, z) behind the angle lens of the beam that the film on the front face reflects."""
-        front = OpticalPlane(np.zeros(3), X).placed(pose)
-        direction = self._back(reflect(self._out(ray), front)).direction
-        return np.asarray(self.optics.focal_length_mm * direction[1:] / abs(direction[0]))
 
-
-def _triad() -> FloatArray:
-    """Three perpendicular unit normals, one a row, all inclined alike to +x."""
-    first = np.ones(3) / np.sqrt(3.0)
-    second = np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
-    return np.column_stack([first, second, np.cross(first, second)])
-
-
-_TRIAD = _triad()
+#: Three perpendicular unit normals, one a row, all inclined alike to +x.
+_DIAGONAL, _ACROSS = np.ones(3) / np.sqrt(3.0), np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
+_TRIAD = np.column_stack([_DIAGONAL, _ACROSS, np.cross(_DIAGONAL, _ACROSS)])
 
 
 # Raw signals of the six-DOF instrument on a virtual machine: exact chain, exact ray tracer.
@@ -433,10 +408,11 @@ class SimulatedSixDof:
     @property
     def true_instrument(self) -> SixDofInstrument:
         """The instrument as it really is."""
-        axes = {
-            k: replace(entry, systematics=_sum(entry.systematics, self.uncalibrated, known_systematics(k)))
-            for k, entry in self.instrument.axes.items()
-        }
+        axes = {}
+        for k, entry in self.instrument.axes.items():
+            names = dict.fromkeys([*entry.systematics, *(n for n in self.uncalibrated if n in known_systematics(k))])
+            total = {name: entry.systematics.get(name, 0.0) + self.uncalibrated.get(name, 0.0) for name in names}
+            axes[k] = replace(entry, systematics=total)
         return replace(self.instrument, axes=axes)
 
     def measure(self, machine: Machine, truth: ErrorTable, rng: np.random.Generator) -> SixDof:
@@ -448,7 +424,15 @@ class SimulatedSixDof:
             for run in range(1, self.runs + 1):
                 drift = tilt + np.cumsum(self.drift_rad * rng.standard_normal((len(along), 2)), axis=0)
                 tilt = drift[-1]
-                signals = self._signals(machine, truth, axis, along, direction, drift, rng)
+                drawn = rng.standard_normal((len(along), 6)) * self.scatter[axis]
+                moved = np.zeros((len(along), 6))
+                moved[:, list(DIRECTIONS[axis])] = drawn[:, :3]
+                moved[:, [3 + k for k in ROTATIONS[axis]]] = drawn[:, 3:]
+                moved[:, axis] += 0.5 * direction * self.reversal_mm[axis]
+                signals = run_signals(machine, truth, self.true_instrument, axis, along, drift, None, moved)
+                monitor = self.instrument.optics.focal_length_mm * drift
+                noise = rng.standard_normal((len(along), 9)) * self.noise_mm
+                signals = np.hstack([signals, monitor]) + noise
                 blocks.append((np.full(len(along), axis), along, np.full(len(along), run), direction, signals))
         return self._readings(machine, blocks)
 
@@ -466,26 +450,6 @@ class SimulatedSixDof:
             return there, np.zeros(len(there))
         return np.concatenate([there, there[::-1]]), np.repeat([1.0, -1.0], len(there))
 
-    def _signals(
-        self,
-        machine: Machine,
-        truth: ErrorTable,
-        axis: int,
-        along: FloatArray,
-        direction: FloatArray,
-        drift: FloatArray,
-        rng: np.random.Generator,
-    ) -> FloatArray:
-        """Signals (n, 9) of one run: those of SIGNALS and the drift monitor, mm."""
-        drawn = rng.standard_normal((len(along), 6)) * self.scatter[axis]
-        moved = np.zeros((len(along), 6))
-        moved[:, list(DIRECTIONS[axis])] = drawn[:, :3]
-        moved[:, [3 + k for k in ROTATIONS[axis]]] = drawn[:, 3:]
-        moved[:, axis] += 0.5 * direction * self.reversal_mm[axis]
-        signals = run_signals(machine, truth, self.true_instrument, axis, along, drift, None, moved)
-        monitor = self.instrument.optics.focal_length_mm * drift
-        return np.asarray(np.hstack([signals, monitor]) + rng.standard_normal((len(along), 9)) * self.noise_mm)
-
     def _readings(self, machine: Machine, blocks: list[tuple[NDArray[Any], ...]]) -> SixDof:
         axis, along, run, direction, signals = (np.concatenate(column) for column in zip(*blocks, strict=True))
         names = (*SIGNALS, "y_psd2_mm", "z_psd2_mm")
@@ -501,11 +465,6 @@ class SimulatedSixDof:
         )
 
 
-def _sum(given: Mapping[str, float], further: Mapping[str, float], known: tuple[str, ...]) -> dict[str, float]:
-    names = dict.fromkeys([*given, *(name for name in further if name in known)])
-    return {name: given.get(name, 0.0) + further.get(name, 0.0) for name in names}
-
-
 def read_sixdof_measurement(section: toml_files.Section) -> SimulatedSixDof:
     """Read the ``[instrument]`` section of a scenario of type ``sixdof``, its type taken already, strictly."""
     path = section.file("file")
@@ -513,12 +472,13 @@ def read_sixdof_measurement(section: toml_files.Section) -> SimulatedSixDof:
         raise section.fail("file", "is missing; give the instrument TOML, relative to the scenario")
     instrument = read_instrument(path)
     positions = section.section("positions_mm", required=False)
+    targets = [positions.take(letter, _positions, None) for letter in AXES]
     measurement = toml_files.take_settings(
         SimulatedSixDof,
         section,
         instrument=instrument,
         uncalibrated=read_systematics(section.section("uncalibrated", required=False)),
-        positions_mm=tuple(_targets(positions, letter) for letter in AXES),
+        positions_mm=tuple(None if value is None else np.asarray(value) for value in targets),
         scatter=_scatter(section),
         noise_mm=_noise(section.section("noise", required=False), instrument),
     )
@@ -527,13 +487,8 @@ def read_sixdof_measurement(section: toml_files.Section) -> SimulatedSixDof:
     return measurement
 
 
-def _targets(section: toml_files.Section, letter: str) -> FloatArray | None:
-    """Target positions: a list, or a table with from, to and step."""
-    value = section.take(letter, _positions, None)
-    return None if value is None else np.asarray(value)
-
-
 def _positions(value: Any) -> tuple[float, ...]:
+    """Target positions: a list, or a table with from, to and step."""
     if not isinstance(value, dict):
         return toml_files.ascending(value)
     if set(value) != {"from", "to", "step"}:

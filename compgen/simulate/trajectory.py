@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,6 +107,11 @@ class Stops:
         return len(self.position_mm)
 
 
+def _levels(value: Any) -> FloatArray:
+    items = toml_files.numbers(value)
+    return np.array(items if len(items) == 1 else toml_files.ascending(value))
+
+
 # --- reading -----------------------------------------------------------------------------------------------------
 
 
@@ -127,11 +132,6 @@ def read_trajectory(section: toml_files.Section) -> Trajectory:
         levels_mm=tuple(explicit) or (None, None, None),
         lines=lines,
     )
-
-
-def _levels(value: Any) -> FloatArray:
-    items = toml_files.numbers(value)
-    return np.array(items if len(items) == 1 else toml_files.ascending(value))
 
 
 # --- points ------------------------------------------------------------------------------------------------------
@@ -182,21 +182,16 @@ def trajectory_points(trajectory: Trajectory, machine: Machine) -> FloatArray:
     if trajectory.kind == "lines":
         blocks = [np.linspace(line.from_mm, line.to_mm, line.points) for line in trajectory.lines]
     else:
-        chosen = tuple(_axis_levels(trajectory, machine, axis) for axis in range(3))
-        blocks = BLOCKS[trajectory.kind](cast(Levels, chosen))
+        chosen = []
+        for axis, (explicit, entry) in enumerate(zip(trajectory.levels_mm, machine.axes, strict=True)):
+            if explicit is None and trajectory.counts is not None:
+                explicit = np.linspace(*entry.range_mm, trajectory.counts[axis])
+            chosen.append(entry.nodes_mm if explicit is None else explicit)
+        blocks = BLOCKS[trajectory.kind]((chosen[0], chosen[1], chosen[2]))
     points = np.round(np.concatenate(blocks), POSITION_DECIMALS) + 0.0
     moved = np.any(np.diff(points, axis=0) != 0, axis=1)
     kept: FloatArray = points[np.concatenate([[True], moved])]
     return kept
-
-
-def _axis_levels(trajectory: Trajectory, machine: Machine, axis: int) -> FloatArray:
-    explicit = trajectory.levels_mm[axis]
-    if explicit is not None:
-        return explicit
-    if trajectory.counts is not None:
-        return np.linspace(*machine.axes[axis].range_mm, trajectory.counts[axis])
-    return machine.axes[axis].nodes_mm
 
 
 # --- stops -------------------------------------------------------------------------------------------------------
@@ -341,7 +336,12 @@ def plan_session(
     InputError
         if a point lies outside the machine's travel.
     """
-    lines = [_jittered(line, session.jitter, machine, rng) for line in _lines(trajectory, machine)]
+    lines = []
+    for line in _lines(trajectory, machine):
+        if session.jitter > 0.0:
+            shift = rng.uniform(-session.jitter, session.jitter, len(line))
+            line = np.clip(line + shift[:, None] * (line[-1] - line[0]), machine.lower_mm, machine.upper_mm)
+        lines.append(np.round(line, POSITION_DECIMALS) + 0.0)
     check_stops(np.concatenate(lines), machine)
     tools = np.round(np.array(trajectory.tools_mm or [machine.tool_offset_mm]), POSITION_DECIMALS)
     conditions = list(
@@ -364,13 +364,6 @@ def _lines(trajectory: Trajectory, machine: Machine) -> list[FloatArray]:
         return passes_of(trajectory, machine)
     there = [np.linspace(line.from_mm, line.to_mm, line.points) for line in trajectory.lines]
     return [way for line in there for way in ([line, line[::-1]] if trajectory.there_and_back else [line])]
-
-
-def _jittered(line: FloatArray, jitter: float, machine: Machine, rng: np.random.Generator) -> FloatArray:
-    if jitter > 0.0:
-        shift = rng.uniform(-jitter, jitter, len(line))
-        line = np.clip(line + shift[:, None] * (line[-1] - line[0]), machine.lower_mm, machine.upper_mm)
-    return np.asarray(np.round(line, POSITION_DECIMALS) + 0.0)
 
 
 def _stops(

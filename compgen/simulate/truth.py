@@ -91,15 +91,6 @@ def read_truth_plan(section: toml_files.Section, folder: Path) -> TruthPlan:
         raise section.fail("random", "errors come from a file already; give either file or random = true")
     table = read_errors(folder / file) if file is not None else ErrorTable()
     random = toml_files.take_settings(RandomErrors, section) if drawn else None
-    given = ErrorTable(
-        {**table.curves, **_read_curves(section)},
-        {**table.squareness, **_read_squareness(section.section("squareness_urad", required=False))},
-    )
-    section.finish()
-    return TruthPlan(given, random)
-
-
-def _read_curves(section: toml_files.Section) -> dict[str, Curve]:
     curves: dict[str, Curve] = {}
     for entry in section.sections("curve"):
         name = entry.take("name", _curve_name)
@@ -107,7 +98,12 @@ def _read_curves(section: toml_files.Section) -> dict[str, Curve]:
             raise entry.fail("name", f"the curve of {name} is given twice; give it once")
         curves[name] = _read_curve(entry, error_named(name))
         entry.finish()
-    return curves
+    angles = section.section("squareness_urad", required=False)
+    stated = {name: angles.take(name, toml_files.number, None) for name in SQUARENESS_NAMES}
+    angles.finish()
+    squareness = {name: (value * RAD_PER_URAD, np.nan) for name, value in stated.items() if value is not None}
+    section.finish()
+    return TruthPlan(ErrorTable({**table.curves, **curves}, {**table.squareness, **squareness}), random)
 
 
 def _read_curve(entry: toml_files.Section, error: ErrorName) -> Curve:
@@ -127,12 +123,6 @@ def _curve_name(value: Any) -> str:
     if value not in CURVE_NAMES:
         raise ValueError(f"the name of one of the 18 error curves is expected; {nearest(str(value), CURVE_NAMES)}")
     return str(value)
-
-
-def _read_squareness(section: toml_files.Section) -> dict[str, tuple[float, float]]:
-    given = {name: section.take(name, toml_files.number, None) for name in SQUARENESS_NAMES}
-    section.finish()
-    return {name: (value * RAD_PER_URAD, np.nan) for name, value in given.items() if value is not None}
 
 
 def child_seeds(seeds: np.random.SeedSequence, index: int) -> np.random.SeedSequence:

@@ -290,27 +290,19 @@ def squareness(short: str, p: Values, settings: Values) -> Displacement:
     return lambda machine, stops: _moved_by(machine, stops, f"E{short}", np.full(len(stops), p["c_urad"]))
 
 
-def _arm(machine: Machine, name: str) -> list[tuple[int, int, float]]:
-    """What an angular error moves: (component, axis whose travel is the lever, sign), by turning a carriage."""
-    found = []
-    for axis in range(3):
-        if axis == error_named(name).axis:
-            continue
-        both = []
-        for angle in (SMALL_RAD, -SMALL_RAD):
-            errors = np.zeros((1, len(ERROR_INDEX)))
-            errors[0, ERROR_INDEX[name]] = angle
-            both.append(tip_position(machine, errors, np.eye(3)[[axis]], np.zeros(3))[0])
-        slope = (both[0] - both[1]) / (2 * SMALL_RAD)
-        found += [(k, axis, float(np.sign(slope[k]))) for k in range(3) if abs(slope[k]) > 0.5]
-    return found
-
-
 def sign(name: str, p: Values, settings: Values) -> Displacement:
     """One of two products of an angular error, taken with the other sign."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
-        component, axis, direction = max(_arm(machine, name))
+        # what the angle moves: (component, axis whose travel is the lever, sign), by turning a carriage
+        arms = []
+        for axis in (axis for axis in range(3) if axis != error_named(name).axis):
+            errors = np.zeros((2, len(ERROR_INDEX)))
+            errors[:, ERROR_INDEX[name]] = SMALL_RAD, -SMALL_RAD
+            both = tip_position(machine, errors, np.eye(3)[[axis, axis]], np.zeros(3))
+            slope = (both[0] - both[1]) / (2 * SMALL_RAD)
+            arms += [(k, axis, float(np.sign(slope[k]))) for k in range(3) if abs(slope[k]) > 0.5]
+        component, axis, direction = max(arms)
         vectors = np.zeros((len(stops), 3))
         curve = _curve(machine, stops, error_named(name).axis, p)
         vectors[:, component] = -direction * stops.position_mm[:, axis] * curve
@@ -493,32 +485,27 @@ EFFECTS: dict[str, Callable[[toml_files.Section], Displacement]] = {}
 
 def read_effects(sections: list[toml_files.Section]) -> tuple[SimulatedEffect, ...]:
     """Read the effects of a scenario in their order; InputError for an unknown name, key or value."""
-    return tuple(_read_effect(section) for section in sections)
-
-
-def _read_effect(section: toml_files.Section) -> SimulatedEffect:
-    name = section.take("name", toml_files.text)
-    if name in EFFECTS:
-        return _read_own(name, section)
-    known = catalogue(_stations(name, section))
-    if name not in known or not known[name].card.parameters:
-        names = [*EFFECTS, *(other for other, effect in listed().items() if effect.card.parameters)]
-        reason = why_missing("effect", name)
-        raise section.fail("name", f"unknown effect; {nearest(name, names)}; --plugin PATH adds some{reason}")
-    effect, values = read_values(known[name], section)
-    section.finish()
-    by_name = {p.name: float(v) for p, v in zip(effect.card.parameters, values, strict=True)}
-    return _built_in(name, by_name, effect.settings) or _of_columns(effect, values)
-
-
-def _read_own(name: str, section: toml_files.Section) -> Displacement:
-    """Read an effect by the reader of a plug-in."""
-    effect = EFFECTS[name](section)
-    section.finish()
-    problems = call_problem(effect, ["machine", "stops"], f"the effect {name}")
-    if problems:
-        raise section.fail("name", "; ".join(problems))
-    return effect
+    found: list[SimulatedEffect] = []
+    for section in sections:
+        name = section.take("name", toml_files.text)
+        if name in EFFECTS:  # by the reader of a plug-in
+            moving = EFFECTS[name](section)
+            section.finish()
+            problems = call_problem(moving, ["machine", "stops"], f"the effect {name}")
+            if problems:
+                raise section.fail("name", "; ".join(problems))
+            found.append(moving)
+            continue
+        known = catalogue(_stations(name, section))
+        if name not in known or not known[name].card.parameters:
+            names = [*EFFECTS, *(other for other, effect in listed().items() if effect.card.parameters)]
+            reason = why_missing("effect", name)
+            raise section.fail("name", f"unknown effect; {nearest(name, names)}; --plugin PATH adds some{reason}")
+        effect, values = read_values(known[name], section)
+        section.finish()
+        by_name = {p.name: float(v) for p, v in zip(effect.card.parameters, values, strict=True)}
+        found.append(_built_in(name, by_name, effect.settings) or _of_columns(effect, values))
+    return tuple(found)
 
 
 def _stations(name: str, section: toml_files.Section) -> tuple[str, ...]:
