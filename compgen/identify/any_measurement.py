@@ -208,10 +208,15 @@ def evidence_files(
     return files
 
 
+#: Comments of a measurement that say with what and by whom it was made; the report shows them.
+MEASURED_WITH = ("instrument", "serial_number", "operator")
+
+
 def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, result: Identification) -> str:
     """Return the text of ``residuals.csv``: measurement minus model of every reading, um, in the order of the files.
 
-    ``used`` is 0 for readings that were rejected; lengths have columns for station and commanded position.
+    ``used`` is 0 for readings that were rejected; lengths have columns for station and commanded position. Comments of the
+    measurement about instrument and operator are kept.
     """
     columns: dict[str, Sequence[str] | FloatArray] = {}
     if isinstance(measurement, Lengths) and len(measurement) == len(result.residual_mm):
@@ -220,4 +225,7 @@ def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, re
     columns["residual_um"] = -result.residual_mm / MM_PER_UM
     columns["used"] = result.accepted.astype(np.float64)
     digits = {"x_mm": 3, "y_mm": 3, "z_mm": 3, "residual_um": 4, "used": 0}
-    return format_csv(columns, {"machine": machine.name, "method": result.method}, digits)
+    described = measurement.other if isinstance(measurement, MixedMeasurement) else measurement
+    comments = described.readings.metadata if isinstance(described, SixDofMeasurement) else described.metadata
+    stated = {key: comments[key] for key in MEASURED_WITH if comments.get(key)}
+    return format_csv(columns, {"machine": machine.name, "method": result.method, **stated}, digits)

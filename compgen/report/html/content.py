@@ -456,5 +456,6 @@ def _provenance(source: ResultFolder) -> dict[str, Any]:
         "report_made_by": f"compgen {program_version()}",
         "inputs": list(inputs),
         "date": date,
+        **({} if source.residuals is None else source.residuals.stated),
         "errors_sha256": sorted({str(item.manifest.get("errors_sha256", "")) for item in source.controls} - {""}),
     }

@@ -22,6 +22,7 @@ from compgen.data.machine import Machine, read_machine
 from compgen.data.messages import one_line
 from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.identify.any_measurement import MEASURED_WITH
 from compgen.tables import ReadTables, read_tables
 from compgen.tables.synthesis import projector
 
@@ -79,12 +80,16 @@ class ControlFolder:
 
 @dataclass(frozen=True)
 class ReadingResiduals:
-    """Residuals of the readings, mm, shape (n,); ``station`` and commanded ``position_mm`` (n, 3) where there are some."""
+    """Residuals of the readings, mm, shape (n,); ``station`` and commanded ``position_mm`` (n, 3) where there are some.
+
+    ``stated`` is what the measurement says of its instrument and operator.
+    """
 
     residual_mm: FloatArray
     used: NDArray[np.bool_]
     station: tuple[str, ...] = ()
     position_mm: FloatArray | None = None
+    stated: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -203,10 +208,11 @@ def _residuals(path: Path) -> ReadingResiduals | None:
     table = read_csv(path, ("residual_um", "used"), ("station", "x_mm", "y_mm", "z_mm"))
     used = table.numbers("used") > 0.5
     residual_mm = table.numbers("residual_um") * 1e-3
+    stated = {key: table.metadata[key] for key in MEASURED_WITH if table.metadata.get(key)}
     if "station" not in table.columns:
-        return ReadingResiduals(residual_mm, used)
+        return ReadingResiduals(residual_mm, used, stated=stated)
     position_mm = np.column_stack([table.numbers(f"{axis}_mm") for axis in "xyz"])
-    return ReadingResiduals(residual_mm, used, tuple(table.text("station")), position_mm)
+    return ReadingResiduals(residual_mm, used, tuple(table.text("station")), position_mm, stated)
 
 
 def _volume(path: Path) -> Volume | None:

@@ -16,14 +16,13 @@ from markupsafe import Markup
 from rich.console import Group
 from rich.text import Text
 
+from compgen.data.charts import LABEL, Picture
 from compgen.data.files import OutputFolder, json_text, json_values
 from compgen.data.messages import number_text, one_line
 from compgen.data.names import COVERAGE
 from compgen.report.html.content import FIGURES, content, um
 from compgen.report.html.folder import ResultFolder, TableCurve, read_folder, table_curves
 from compgen.report.html.pictures import (
-    LABEL,
-    Picture,
     draw_curves,
     draw_residuals,
     draw_slices,
@@ -31,8 +30,8 @@ from compgen.report.html.pictures import (
     draw_squareness,
     draw_stations,
     draw_tables,
-    drawing,
     grid_of,
+    thousands,
 )
 from compgen.resources import data_folder
 from compgen.tables import REPORT_FILES
@@ -61,7 +60,7 @@ def render_page(
     seconds : how long the drawing took; None leaves it out.
     """
     environment = _environment()
-    script = _file(environment, "script.js")
+    script = _file(environment, "charts.js") + _file(environment, "script.js")
     drawn = [picture for group in pictures.values() for picture in group]
     policy = f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{_hash(script)}'"
     policy += "; base-uri 'none'; form-action 'none'"
@@ -69,6 +68,8 @@ def render_page(
         data=data,
         controls=list(zip(data["controls"], source.controls, strict=True)),
         pictures=pictures,
+        has_fit=source.fitted is not None,
+        has_named=any(item["series"][-1]["name"].startswith("table ") for item in (p.data for p in pictures["curves"])),
         figures=FIGURES,
         policy=policy,
         style=Markup(_file(environment, "style.css")),
@@ -92,6 +93,7 @@ def _environment() -> Environment:
         "known": lambda value: number_text(value, missing="not known"),
         "markdown": markdown,
         "unit": lambda name: LABEL.get(name, name),
+        "thousands": thousands,
     }
     return environment
 
@@ -454,23 +456,18 @@ def draw(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, list[Pictur
         item.name: table_curves(source.machine, errors, item) for item in source.controls
     }
     found: dict[str, list[Picture]] = {"curves": [], "squareness": [], "measurement": []}
-    with drawing():
-        if source.identified is not None:
-            found["curves"] = draw_curves(source.identified, source.fitted, tables)
-            found["squareness"] = _some(draw_squareness(source.identified, source.fitted))
-        if source.residuals is not None:
-            found["measurement"] += _some(draw_residuals(source.residuals))
-        found["measurement"] += _some(draw_stations(source.identify.get("stations", []), source.residuals))
-        for k, item in enumerate(source.controls):
-            grid = grid_of(item.volume)
-            found[f"space-{k}"] = [draw_space(grid, k)] if grid is not None else []
-            found[f"slices-{k}"] = [draw_slices(grid, k)] if grid is not None else []
-            found[f"tables-{k}"] = draw_tables(item.name, k, tables[item.name])
+    if source.identified is not None:
+        found["curves"] = draw_curves(source.identified, source.fitted, tables)
+        found["squareness"] = draw_squareness(source.identified)
+    if source.residuals is not None:
+        found["measurement"] = draw_residuals(source.residuals)
+    found["stations"] = draw_stations(source.identify.get("stations", []), source.residuals)
+    for k, item in enumerate(source.controls):
+        grid = grid_of(item.volume)
+        found[f"space-{k}"] = [draw_space(grid, k)] if grid is not None else []
+        found[f"slices-{k}"] = draw_slices(grid, k) if grid is not None else []
+        found[f"tables-{k}"] = draw_tables(item.name, k, tables[item.name])
     return found
-
-
-def _some(picture: Picture | None) -> list[Picture]:
-    return [] if picture is None else [picture]
 
 
 # The report in a few lines for the terminal.

@@ -1,0 +1,332 @@
+"""Charts as SVG for pages: axes with round numbers, lines, points, bands, bars and heat maps.
+
+Everything is drawn here, so a page needs no plotting library, prints well and can be read without a script. Coordinates are
+those of the data; :class:`Plot` maps them to the picture. Colours are roles (``line``, ``before`` ...), CSS variables that
+the style sheet ``templates/_report/style.css`` gives a light and a dark value. ``templates/_report/charts.js`` adds zoom
+to every element of the class ``axes``.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup, escape
+from numpy.typing import ArrayLike, NDArray
+
+#: What a colour is for.
+ROLES = ("ink", "muted", "grid", "line", "band", "fit", "table", "before", "after", "c0", "c1", "c2", "c3", "c4", "c5")
+#: Roles of lines that are drawn next to each other.
+CYCLE = ("c0", "c1", "c2", "c3", "c4", "c5")
+#: Units as pages write them.
+LABEL = {"um": "µm", "urad": "µrad"}
+#: Width and height of a picture and the part of it that the axes take (left, top, right, bottom), for pages that show
+#: several pictures in a row. All have the same width, so all have letters of the same size.
+SIZE, BOX = (250.0, 150.0), (46.0, 10.0, 243.0, 121.0)
+FONT = 9.0
+DASHED, DOTTED = "5 3", "2 2"
+#: Colours of heat maps from the smallest to the largest value: cividis, which is even in brightness for any kind of colour
+#: vision (Nunez, Anderton and Renslow 2018).
+HEAT = ("00224e", "1a386f", "434e6c", "61656f", "7d7c78", "9b9476", "bcae6c", "dec958", "fee838")
+#: Colours from negative over zero to positive (Moreland 2009).
+DIVERGING = ("3b4cc0", "8db0fe", "dddcdc", "f4987a", "b40426")
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A drawn picture: markup, heading, a word on what it shows, and the data that the script of the page shows."""
+
+    key: str
+    title: str
+    svg: Markup
+    data: Mapping[str, Any] = field(default_factory=dict)
+    note: str = ""
+
+
+def ticks(low: float, high: float, count: int = 5) -> list[float]:
+    """Return round numbers within the interval, about ``count``: steps of 1, 2 or 5 times a power of ten.
+
+    >>> ticks(-3.0, 11.0)
+    [-2.0, 0.0, 2.0, 4.0, 6.0, 8.0, 10.0]
+    """
+    raw = (high - low) / count or 1.0
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= raw * 0.7)
+    return [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+
+
+def tick_texts(values: Sequence[float]) -> list[str]:
+    """Return the numbers of ticks, all with as many decimals as their step needs.
+
+    >>> tick_texts([0.0, 0.5, 1.0]), tick_texts([-2000.0, 0.0])
+    (['0.0', '0.5', '1.0'], ['−2000', '0'])
+    """
+    step = min((abs(b - a) for a, b in zip(values, values[1:], strict=False)), default=0.0) or 1.0
+    decimals = max(0, -math.floor(math.log10(step) + 1e-9))
+    return [f"{value + 0.0:.{decimals}f}".replace("-", "−") for value in values]
+
+
+def limits_of(*values: ArrayLike, margin: float = 0.07, zero: bool = False) -> tuple[float, float]:
+    """Return the limits of an axis that shows all finite values, and zero if asked for, with a margin."""
+    known = np.concatenate([np.ravel(np.asarray(part, dtype=np.float64)) for part in (*values, [0.0] * zero)])
+    known = known[np.isfinite(known)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    spare = margin * (high - low) or max(1.0, 0.1 * abs(high))
+    return low - spare, high + spare
+
+
+class Plot:
+    """Axes in a picture: a rectangle ``box`` (left, top, right, bottom) of it with limits in units of the data.
+
+    Ticks are (value, text); without them round numbers are chosen, and people can zoom. ``bare`` axes have neither ticks
+    nor lines.
+    """
+
+    def __init__(
+        self,
+        x: tuple[float, float],
+        y: tuple[float, float],
+        box: tuple[float, float, float, float] = BOX,
+        *,
+        x_label: str = "",
+        y_label: str = "",
+        title: str = "",
+        x_ticks: Sequence[tuple[float, str]] | None = None,
+        y_ticks: Sequence[tuple[float, str]] | None = None,
+        bare: bool = False,
+    ) -> None:
+        self.x, self.y, self.box, self.bare = x, y, box, bare
+        self.labels, self.ticks = (x_label, y_label, title), (x_ticks, y_ticks)
+        self.drawn: list[str] = []
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """Where the axes are in the picture and their limits, for the script of the page."""
+        return {"frame": list(self.box), "limits": [*self.x, *self.y]}
+
+    def _px(self, x: ArrayLike, y: ArrayLike) -> tuple[Values, Values]:
+        (x0, x1), (y0, y1), (left, top, right, bottom) = self.x, self.y, self.box
+        across = left + (np.asarray(x, dtype=np.float64) - x0) / (x1 - x0) * (right - left)
+        return across, bottom - (np.asarray(y, dtype=np.float64) - y0) / (y1 - y0) * (bottom - top)
+
+    def _stroke(self, path: str, role: str, width: float, more: str = "") -> None:
+        # Lines keep their width when the picture is made larger, and when its part is.
+        self.drawn.append(
+            f'<path d="{path}" fill="none" vector-effect="non-scaling-stroke" '
+            f'style="stroke:var(--{role});stroke-width:{width:g}{more}"/>'
+        )
+
+    def line(self, x: ArrayLike, y: ArrayLike, role: str, *, width: float = 1.5, dash: str = "") -> None:
+        """Draw a line through points (n,), with gaps where a value is not finite; or m lines (m, n)."""
+        px, py = self._px(x, y)
+        if px.ndim == 1:
+            whole = np.isfinite(px + py)
+            runs = np.split(np.arange(len(px)), np.flatnonzero(~whole))
+            pieces = [run[whole[run]] for run in runs]
+        else:
+            pieces = list(np.arange(px.size).reshape(px.shape))
+        path = "".join(_path(px.flat[piece], py.flat[piece]) for piece in pieces if len(piece) > 1)
+        self._stroke(path, role, width, f";stroke-dasharray:{dash}" if dash else "")
+
+    def dots(self, x: ArrayLike, y: ArrayLike, role: str, *, size: float = 4.0, square: bool = False) -> None:
+        """Draw round or square points."""
+        px, py = (np.ravel(part) for part in np.broadcast_arrays(*self._px(x, y)))
+        known = np.isfinite(px + py)
+        # A line without length with round or square ends: it keeps its form when one axis is stretched.
+        path = "".join(f"M{a:.2f} {b:.2f}h0" for a, b in zip(px[known].tolist(), py[known].tolist(), strict=True))
+        self._stroke(path, role, size, f";stroke-linecap:{'square' if square else 'round'}")
+
+    def spread(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, role: str, *, width: float = 1.0) -> None:
+        """Draw vertical lines from ``low`` to ``high``, the uncertainty of points."""
+        px, bottom = self._px(x, low)
+        _, top = self._px(x, high)
+        rows = np.column_stack([px, bottom, top])
+        rows = rows[np.isfinite(rows).all(axis=1)].tolist()
+        self._stroke("".join(f"M{a:.2f} {b:.2f}V{c:.2f}" for a, b, c in rows), role, width)
+
+    def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, role: str = "band") -> None:
+        """Fill between two lines."""
+        px, bottom = self._px(x, low)
+        _, top = self._px(x, high)
+        path = _path(np.concatenate([px, px[::-1]]), np.concatenate([bottom, top[::-1]]))
+        self.drawn.append(f'<path d="{path}Z" style="fill:var(--{role})"/>')
+
+    def bars(self, left: ArrayLike, right: ArrayLike, low: ArrayLike, high: ArrayLike, role: str) -> None:
+        """Fill rectangles."""
+        (x0, y0), (x1, y1) = self._px(left, low), self._px(right, high)
+        rows = np.column_stack(np.broadcast_arrays(*map(np.ravel, (x0, y0, x1, y1)))).tolist()
+        path = "".join(f"M{a:.2f} {b:.2f}H{c:.2f}V{d:.2f}H{a:.2f}Z" for a, b, c, d in rows)
+        self.drawn.append(f'<path d="{path}" style="fill:var(--{role})"/>')
+
+    def across(self, value: float, role: str = "muted", *, width: float = 0.9, dash: str = "") -> None:
+        """Draw a horizontal line."""
+        self.line(self.x, (value, value), role, width=width, dash=dash)
+
+    def upright(self, value: float, role: str = "muted", *, width: float = 0.9, dash: str = "") -> None:
+        """Draw a vertical line."""
+        self.line((value, value), self.y, role, width=width, dash=dash)
+
+    def heat(self, x: tuple[float, float], y: tuple[float, float], shares: Values, colours: Sequence[str]) -> None:
+        """Fill a rectangle with cells; ``shares`` (rows from ``y[0]`` up, columns) are 0 for the first colour, 1 the last."""
+        (left, right), (bottom, top) = self._px(x, y)
+        self.drawn.append(
+            f'<image x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}" height="{bottom - top:.2f}" '
+            f'preserveAspectRatio="none" style="image-rendering:pixelated" '
+            f'href="data:image/png;base64,{_png(_colours(shares[::-1], colours))}"/>'
+        )
+
+    def coloured_dots(self, x: Values, y: Values, shares: Values, colours: Sequence[str], size: float = 3.0) -> None:
+        """Draw points (n,) in the colours of a scale."""
+        steps = 16
+        index = np.rint(np.clip(shares, 0.0, 1.0) * steps).astype(int)
+        for k, rgb in enumerate(_colours(np.arange(steps + 1) / steps, colours)):
+            if (index == k).any():
+                self.dots(x[index == k], y[index == k], "ink", size=size)
+                self.drawn[-1] = self.drawn[-1].replace("var(--ink)", "#" + bytes(rgb.tolist()).hex())
+
+    def text(
+        self, x: float, y: float, text: str, *, anchor: str = "start", shift: tuple[float, float] = (0, 0)
+    ) -> None:
+        """Write a text at a point, moved by ``shift`` units of the picture."""
+        px, py = self._px(x, y)
+        self.drawn.append(_text(float(px) + shift[0], float(py) + shift[1], text, anchor))
+
+    def layer(self, name: str, start: int) -> None:
+        """Make what was drawn since ``start`` (an earlier ``len(drawn)``) a layer that the page can show and hide."""
+        self.drawn[start:] = [f'<g class="layer layer-{name}">', *self.drawn[start:], "</g>"]
+
+    def markup(self) -> str:
+        """Return the SVG of the axes and of what was drawn on them."""
+        left, top, right, bottom = self.box
+        x_label, y_label, title = self.labels
+        head = ' data-bare="1"' if self.bare else ' data-fixed="1"' if any(self.ticks) else ""
+        head += "".join(f' data-{key}="{" ".join(f"{v:.9g}" for v in part)}"' for key, part in self.data.items())
+        size = f'x="{left:g}" y="{top:g}" width="{right - left:g}" height="{bottom - top:g}"'
+        view = f'viewBox="{left:g} {top:g} {right - left:g} {bottom - top:g}"'
+        parts = [f'<g class="axes"{head}>', *([] if self.bare else [f'<g class="scale">{self._scale()}</g>'])]
+        # An svg within the svg cuts off what lies outside its box.
+        parts += [f'<svg {size} {view} preserveAspectRatio="none"><g class="drawn">', *self.drawn, "</g></svg>"]
+        if x_label:
+            parts.append(_text(0.5 * (left + right), bottom + 2.6 * FONT, x_label, "middle"))
+        if y_label:
+            parts.append(
+                _text(
+                    8.0, 0.5 * (top + bottom), y_label, "middle", f' transform="rotate(-90 8 {(top + bottom) / 2:g})"'
+                )
+            )
+        if title:
+            parts.append(_text(0.5 * (left + right), top - 3.0, title, "middle"))
+        return "".join([*parts, "</g>"])
+
+    def _scale(self) -> str:
+        """Grid, ticks with their numbers, and the lines left and below."""
+        left, top, right, bottom = self.box
+        x_ticks, y_ticks = (
+            _labelled(given, limits, room) for given, limits, room in zip(
+                self.ticks, (self.x, self.y), ((right - left) / 40, (bottom - top) / 24), strict=True
+            )
+        )  # fmt: skip
+        across = [(float(self._px(value, self.y[0])[0]), text) for value, text in x_ticks]
+        up = [(float(self._px(self.x[0], value)[1]), text) for value, text in y_ticks]
+        grid = "".join(f"M{a:.1f} {top:g}V{bottom:g}" for a, _ in across) + "".join(
+            f"M{left:g} {b:.1f}H{right:g}" for b, _ in up
+        )
+        return (
+            f'<path d="{grid}" fill="none" style="stroke:var(--grid);stroke-width:.6"/>'
+            f'<path d="M{left:g} {top:g}V{bottom:g}H{right:g}" fill="none" style="stroke:var(--muted);stroke-width:.7"/>'
+            + "".join(_text(a, bottom + 1.2 * FONT, text, "middle") for a, text in across)
+            + "".join(_text(left - 4.0, b + 0.35 * FONT, text, "end") for b, text in up)
+        )
+
+
+def svg(key: str, title: str, plots: Sequence[Plot], size: tuple[float, float] = SIZE, more: str = "") -> Markup:
+    """Return the markup of a picture.
+
+    Parameters
+    ----------
+    key : unique on the page; put before every id.
+    title : what the picture shows, for readers that do not see it.
+    more : further SVG, e.g. of :func:`legend`.
+    """
+    head = f'<svg class="plot" viewBox="0 0 {size[0]:g} {size[1]:g}" font-size="{FONT:g}" role="img"'
+    return Markup(
+        f'{head} aria-labelledby="{key}-title"><title id="{key}-title">{escape(title)}</title>'
+        + "".join(plot.markup() for plot in plots)
+        + more
+        + "</svg>"
+    )
+
+
+def legend(left: float, top: float, names: Sequence[tuple[str, str]]) -> str:
+    """Return a list of (role, text) with a point each, as SVG."""
+    return "".join(
+        f'<circle cx="{left:g}" cy="{top + 12 * k - 3:g}" r="2.6" style="fill:var(--{role})"/>'
+        + _text(left + 6.0, top + 12 * k, text, "start")
+        for k, (role, text) in enumerate(names)
+    )
+
+
+def colour_bar(
+    left: float, top: float, bottom: float, limits: tuple[float, float], label: str, colours: Sequence[str]
+) -> str:
+    """Return an upright scale of colours with round numbers and their unit, as SVG."""
+    bar = Plot((0.0, 1.0), limits, (left, top, left + 8.0, bottom), bare=True)
+    bar.heat((0.0, 1.0), limits, np.linspace(0.0, 1.0, 32)[:, None], colours)
+    marks = _labelled(None, limits, (bottom - top) / 24)
+    places = [(float(bar._px(0.0, value)[1]), text) for value, text in marks]
+    numbers = "".join(_text(left + 11.0, place + 0.35 * FONT, text, "start") for place, text in places)
+    # Only the picture of the bar: it is no axes that could be zoomed.
+    return "".join(bar.drawn) + numbers + _text(left + 4.0, top - 3.0, label, "middle")
+
+
+def rounded(values: Sequence[float], digits: int = 4) -> list[float | None]:
+    """Return numbers with ``digits`` significant digits for the data of a page; None for what is not a number."""
+    return [float(f"{value:.{digits}g}") if value == value else None for value in values]
+
+
+def _labelled(
+    given: Sequence[tuple[float, str]] | None, limits: tuple[float, float], room: float
+) -> Sequence[tuple[float, str]]:
+    """The ticks that were given, else round numbers, as many as there is room for."""
+    if given is not None:
+        return given
+    places = ticks(*limits, max(2, min(6, int(room))))
+    return list(zip(places, tick_texts(places), strict=True))
+
+
+def _path(x: Values, y: Values) -> str:
+    flat = np.column_stack([x, y]).ravel().tolist()
+    return ("M" + " ".join(["%.2f %.2f"] * len(x))) % tuple(flat)
+
+
+def _text(x: float, y: float, text: str, anchor: str, more: str = "") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" style="fill:var(--ink)"{more}>{escape(text)}</text>'
+
+
+def _colours(shares: Values, colours: Sequence[str]) -> NDArray[np.uint8]:
+    """Red, green and blue (..., 3), interpolated between colours at even distances."""
+    rgb = np.array([list(bytes.fromhex(text)) for text in colours], dtype=np.float64)
+    at = np.clip(shares, 0.0, 1.0) * (len(rgb) - 1)
+    found = np.stack([np.interp(at, np.arange(len(rgb)), rgb[:, k]) for k in range(3)], axis=-1)
+    return np.rint(found).astype(np.uint8)
+
+
+def _png(rgb: NDArray[np.uint8]) -> str:
+    """A picture (rows, columns, 3) as PNG in base64 (ISO/IEC 15948: 8 bits, true colour, no filter)."""
+    rows = b"".join(b"\0" + row.tobytes() for row in rgb)
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", rgb.shape[1], rgb.shape[0], 8, 2, 0, 0, 0)),
+        (b"IDAT", zlib.compress(rows, 9)),
+        (b"IEND", b""),
+    )
+    body = b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )
+    return base64.b64encode(b"\x89PNG\r\n\x1a\n" + body).decode()
