@@ -30,7 +30,7 @@ from compgen.controls.fanuc_pitch_tables import (
     shortfall_text,
 )
 from compgen.controls.fanuc_records import PointGrid, Punched, Sample, as_sample
-from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, by_travel, nodes_by_axis, travel_of
 from compgen.controls.shared.grids import (
     EquidistantGrid,
     common_step,
@@ -369,9 +369,8 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
                 section = np.ceil(along / float(block.interval_mm) - 1e-9) + block.reference
                 inside = np.clip(section, block.curve_numbers[0], block.last).astype(np.int64)
                 up, down = (curve[inside - block.curve_numbers[0]].astype(np.float64) for curve in curves)
-            travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, axis])
-            counts = np.where(travel > 0, up, np.where(travel < 0, down, 0.5 * (up + down)))
-            added[:, axis] = self.settings.sign * count_mm * counts
+            travel = travel_of(points, axis)
+            added[:, axis] = self.settings.sign * count_mm * by_travel(travel, up, down)
             if np.any((travel == 0) & (up != down)):
                 unknown.append(AXES[axis])
         if unknown:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,15 +20,23 @@ from compgen.controls.heidenhain_text import (
     read_table,
     template_layout,
 )
-from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
+from compgen.controls.shared.base import (
+    Controller,
+    SourceFile,
+    Term,
+    Usage,
+    by_travel,
+    coverage_violations,
+    nodes_by_axis,
+    travel_of,
+)
 from compgen.controls.shared.grids import (
-    RANGE_SHARE,
-    UNCERTAINTY_SHARE,
     EquidistantGrid,
     curve_nodes_mm,
     fewest_nodes,
     loss_setting,
     nearly_best,
+    worth_mm,
 )
 from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
 from compgen.data import toml_files
@@ -176,14 +185,6 @@ def _wide(columns: list[tuple[str, int]]) -> list[tuple[str, int]]:
     return [(name, max(width, len(name) + 2)) for name, width in columns]
 
 
-def _check_older(section: toml_files.Section, settings: HeidenhainSettings) -> None:
-    if settings.older and settings.backlash != "empty":
-        raise section.fail("backlash_column", "the column BACKLASH is known of the newer controls only (generation)")
-    for key, values in (("datum_mm", settings.datum_mm), ("spacing_exponent", settings.exponent)):
-        if not settings.older and any(value is not None for value in values):
-            raise section.fail(key, 'belongs to generation = "power-of-two"; tables with free positions have neither')
-
-
 def _check_templates(section: toml_files.Section, settings: HeidenhainSettings) -> None:
     """Hold the saved tables against what has to be written into them; the errors point at their header line."""
     for layout, due in ((settings.com, settings.axis_names), (settings.cma, (ACTIVE, *settings.axis_names))):
@@ -251,15 +252,6 @@ def intervals(travel_mm: float, spacing: Decimal) -> int:
     (77, 123)
     """
     return int((Decimal(repr(travel_mm)) / spacing).to_integral_value(rounding=ROUND_CEILING))
-
-
-def _tolerance_mm(errors: ErrorTable, output: int, axis: int, loss_mm: float) -> float:
-    """Loss of a correction that is worth no node: as wanted, or what the uncertainty of its own error hides."""
-    curve = errors.curves.get(f"E{AXES[output]}{AXES[axis]}")
-    if curve is None or not np.all(np.isfinite(curve.u)):
-        return loss_mm
-    hidden = UNCERTAINTY_SHARE * float(np.sqrt(np.mean(curve.u**2)))
-    return max(loss_mm, min(hidden, RANGE_SHARE * float(np.ptp(curve.value))))
 
 
 # Compensation-value tables (.COM) and their assignment (.CMA): what they hold, read from text, and their limits.
@@ -342,24 +334,6 @@ def _kind(file: SourceFile, table: TextTable) -> str:
     return found
 
 
-def _stem(table: TextTable, cell: str, line: int, present: set[str]) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}\.(COM|V)", cell, re.ASCII | re.IGNORECASE):
-        raise table.file.fail(f"{cell[:40]!r} is not the name of a .COM file", line)
-    stem = file_stem(cell)
-    if stem not in present:
-        raise table.file.fail(f"names {cell}, which is not among the given files", line)
-    return stem
-
-
-def _spacing_violations(what: str, table: ComTable) -> list[str]:
-    steps = {b - a for a, b in zip(table.positions, table.positions[1:], strict=False)}
-    allowed = {spacing_mm(n) for n in range(SMALLEST_EXPONENT, LARGEST_EXPONENT + 1)}
-    if len(steps) == 1 and steps <= allowed:
-        return []
-    shown = ", ".join(f"{step:f}" for step in sorted(steps)[:3])
-    return [f"{what} has the spacing {shown} mm; expected one power of two times 0.0001 mm (6.5536 mm: n = 16)"]
-
-
 # What the templates of HEIDENHAIN tables show: cells in their fields, parameters to set, worked numbers, warnings.
 
 
@@ -409,7 +383,15 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         section = machine.controller_settings(cls.name)
         settings = toml_files.read_settings(HeidenhainSettings, section)
         check_names(section, settings.axis_names)
-        _check_older(section, settings)
+        if settings.older and settings.backlash != "empty":
+            raise section.fail(
+                "backlash_column", "the column BACKLASH is known of the newer controls only (generation)"
+            )
+        for key, values in (("datum_mm", settings.datum_mm), ("spacing_exponent", settings.exponent)):
+            if not settings.older and any(value is not None for value in values):
+                raise section.fail(
+                    key, 'belongs to generation = "power-of-two"; tables with free positions have neither'
+                )
         _check_templates(section, settings)
         return settings
 
@@ -425,12 +407,16 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         tables = {}
         for axis in range(3):
             nodes_mm = terms[one_dimensional_name(axis, axis)].nodes_mm
-            positions, before = self._written_positions(axis, nodes_mm)
-            after = len(positions) - before - len(nodes_mm)
+            exact = [Decimal(repr(float(node))).quantize(QUANTUM_MM) for node in nodes_mm]
+            # beyond both ends at least one more, which gets the end value: tables end with no slope
+            step, before = (exact[1] - exact[0] if self.settings.older else MARGIN_MM), 1
+            datum = self.settings.datum_mm[axis]
+            if self.settings.older and datum is not None:
+                before = max(0, int((exact[0] - datum) / step))
+            positions = (*(exact[0] - k * step for k in range(before, 0, -1)), *exact, exact[-1] + step)
             columns = {
                 output: _rounded(
-                    np.pad(values[one_dimensional_name(output, axis)], (before, after), mode="edge")
-                    * self.settings.sign,
+                    np.pad(values[one_dimensional_name(output, axis)], (before, 1), mode="edge") * self.settings.sign,
                     self.settings.decimals,
                 )
                 for output in range(3)
@@ -444,7 +430,9 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         com = {}
         for axis in range(3):
             layout = settings.com_layout(axis)
-            rows = self._com_rows(layout, axis, tables.tables.get(axis) or self._no_table(axis))
+            low, high = (Decimal(repr(end)).quantize(QUANTUM_MM) for end in self.machine.axes[axis].range_mm)
+            nothing = ComTable((low, high), {axis: (Decimal(0), Decimal(0))})  # nothing is corrected over this axis
+            rows = self._com_rows(layout, axis, tables.tables.get(axis, nothing))
             com[AXES[axis]] = {"layout": layout, "rows": rows}
         cma = settings.cma_layout()
         names = {settings.axis_names[axis]: f"AXIS_{AXES[axis]}.COM" for axis in sorted(tables.tables)}
@@ -498,7 +486,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             if backlash is not None:
                 positive = table.at(axis, along) if axis in table.columns else np.zeros(len(points))
                 step = backlash - positive if self.settings.backlash == "absolute" else backlash
-                total[:, axis] += step * _share_of_negative(points, axis)
+                total[:, axis] += by_travel(travel_of(points, axis), np.zeros(len(points)), step)
         return self.settings.sign * total
 
     def violations(self, tables: ComTables) -> list[str]:
@@ -511,8 +499,12 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
                 found.append(
                     f"{what} has {len(table.positions)} entries, the limit is {settings.max_points} (9095 error 3)"
                 )
-            if settings.older:
-                found += _spacing_violations(what, table)
+            steps = {b - a for a, b in pairwise(table.positions)}
+            if settings.older and (len(steps) > 1 or _exponent(*steps) is None):
+                shown = ", ".join(f"{step:f}" for step in sorted(steps)[:3])
+                found.append(
+                    f"{what} has the spacing {shown} mm; expected one power of two times 0.0001 mm (6.5536 mm: n = 16)"
+                )
             found += coverage_violations(
                 self.machine, axis, float(table.positions[0]), float(table.positions[-1]), what
             )
@@ -596,7 +588,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         candidates = self._candidates_mm(errors, axis)
         terms = one_dimensional_terms(self.machine, errors, [candidates] * 3, [(output, axis) for output in range(3)])
         wanted = np.array([term.start for term in terms])
-        tolerances = np.array([_tolerance_mm(errors, output, axis, self.settings.loss_mm) for output in range(3)])
+        tolerances = np.array([worth_mm(errors, axis, self.settings.loss_mm, output) for output in range(3)])
         if self.settings.older:
             return self._power_of_two(axis, candidates, wanted / tolerances[:, None])
         reference = np.flatnonzero(np.abs(candidates - self.machine.reference_point_mm[axis]) < 1e-6).tolist()
@@ -641,20 +633,6 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         count = int(((high - first) / step).to_integral_value(rounding=ROUND_CEILING)) + 1
         return EquidistantGrid(first, step, max(count, 2))
 
-    def _written_positions(self, axis: int, nodes_mm: FloatArray) -> tuple[tuple[Decimal, ...], int]:
-        """Return all positions of a table in exact numbers, and how many of them stand before the first of ``nodes_mm``.
-
-        Beyond both ends stands at least one more, which gets the end value: tables end with no slope.
-        """
-        exact = [Decimal(repr(float(node))).quantize(QUANTUM_MM) for node in nodes_mm]
-        if not self.settings.older:
-            return (exact[0] - MARGIN_MM, *exact, exact[-1] + MARGIN_MM), 1
-        step = exact[1] - exact[0]
-        datum = self.settings.datum_mm[axis]
-        before = 1 if datum is None else max(0, int((exact[0] - datum) / step))
-        first = exact[0] - before * step
-        return tuple(first + k * step for k in range(before + len(exact) + 1)), before
-
     def _active(self, table: TextTable, present: set[str]) -> dict[int, str]:
         """Stem of the .COM file by input axis of the line that is marked; every file that is named must be there."""
         marked: list[int] = []
@@ -667,8 +645,14 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
                 raise table.file.fail(f"column {ACTIVE} holds {str(mark)[:20]!r}; expected '*' or nothing", row.line)
             named = {}
             for column, cell in row.cells.items():
-                if column not in (NUMBER_COLUMN, ACTIVE):
-                    named[self._axis(table, column, row.line)] = _stem(table, cell, row.line, present)
+                if column in (NUMBER_COLUMN, ACTIVE):
+                    continue
+                axis, stem = self._axis(table, column, row.line), file_stem(cell)
+                if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}\.(COM|V)", cell, re.ASCII | re.IGNORECASE):
+                    raise table.file.fail(f"{cell[:40]!r} is not the name of a .COM file", row.line)
+                if stem not in present:
+                    raise table.file.fail(f"names {cell}, which is not among the given files", row.line)
+                named[axis] = stem
             lines.append(named)
             marked += [len(lines) - 1] if mark else []
             if len(marked) > 1:
@@ -731,11 +715,6 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             )
         return tuple(datum + k * spacing_mm(exponent) for k in range(len(table.rows)))
 
-    def _no_table(self, axis: int) -> ComTable:
-        """Zeros at both ends of the travel, for an axis over which nothing is corrected."""
-        low, high = (Decimal(repr(end)).quantize(Decimal("0.0001")) for end in self.machine.axes[axis].range_mm)
-        return ComTable((low, high), {axis: (Decimal(0), Decimal(0))})
-
     def _com_rows(self, layout: ComLayout, axis: int, table: ComTable) -> list[list[str]]:
         """Cells of every row in the order of the layout's columns."""
         settings = self.settings
@@ -790,7 +769,28 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
 
     def _parameters(self, tables: ComTables) -> list[dict[str, str]]:
         if not self.settings.older:
-            return self._newer_parameters()
+            return [
+                {
+                    "name": "CfgAxes/axisList",
+                    "value": ", ".join(self.settings.axis_names),
+                    "meaning": "keys of X, Y, Z; the columns of .COM and .CMA carry these names",
+                },
+                {
+                    "name": "MP_refPosition",
+                    "value": "as it is",
+                    "meaning": "AXISPOS counts from the machine datum; the positions of the machine file must do so too",
+                },
+                {
+                    "name": "column ACTIVE of CONFIG.CMA",
+                    "value": "* in line 0",
+                    "meaning": "exactly one line is active",
+                },
+                {
+                    "name": "linear axis error compensation",
+                    "value": "off",
+                    "meaning": "for X, Y, Z: linear and non-linear compensation of one axis exclude each other",
+                },
+            ]
         rows = [
             {
                 "name": f"MP730 bit {axis}",
@@ -810,26 +810,6 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
                 }
             )
         return rows
-
-    def _newer_parameters(self) -> list[dict[str, str]]:
-        return [
-            {
-                "name": "CfgAxes/axisList",
-                "value": ", ".join(self.settings.axis_names),
-                "meaning": "keys of X, Y, Z; the columns of .COM and .CMA carry these names",
-            },
-            {
-                "name": "MP_refPosition",
-                "value": "as it is",
-                "meaning": "AXISPOS counts from the machine datum; the positions of the machine file must do so too",
-            },
-            {"name": "column ACTIVE of CONFIG.CMA", "value": "* in line 0", "meaning": "exactly one line is active"},
-            {
-                "name": "linear axis error compensation",
-                "value": "off",
-                "meaning": "for X, Y, Z: linear and non-linear compensation of one axis exclude each other",
-            },
-        ]
 
     def _warnings(self, tables: ComTables) -> list[str]:
         settings = self.settings
@@ -862,10 +842,3 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
 
 def _rounded(values_mm: FloatArray, decimals: int) -> tuple[Decimal, ...]:
     return tuple(Decimal(int(count)).scaleb(-decimals) for count in np.rint(values_mm * 10**decimals))
-
-
-def _share_of_negative(points: Points, axis: int) -> FloatArray:
-    """1 after negative travel of the axis, 0 after positive travel, one half where it is not known: the mean."""
-    if points.approach is None:
-        return np.full(len(points), 0.5)
-    return 0.5 - 0.5 * np.sign(points.approach[:, axis])

@@ -14,6 +14,7 @@ from decimal import Decimal
 from pathlib import Path
 
 from compgen.controls.shared.base import SourceFile
+from compgen.controls.shared.scanner import fixed_point, plain_lines
 from compgen.data.files import read_bytes
 from compgen.data.messages import doubled, one_line
 from compgen.errors import InputError
@@ -77,40 +78,12 @@ class TextTable:
         text = row.cells.get(column)
         if text is None:
             raise self.file.fail(f"column {column} is blank here; a filled column has a number in every row", row.line)
-        if _NUMBER.fullmatch(text):
-            return Decimal(text)
-        raise self.file.fail(f"column {column}: {one_line(text)[:40]!r} {_fault(text)}", row.line)
-
-
-def _fault(text: str) -> str:
-    """Say what is wrong with a number."""
-    if "," in text:
-        return "has a comma; the decimal mark is a point"
-    if re.fullmatch(r"[+-]?[\d.]+[eE][+-]?\d+", text):
-        return "has an exponent; expected plain decimals"
-    return "is not a number; expected plain decimals such as -0.0123"
-
-
-def split_lines(file: SourceFile) -> list[str]:
-    """Return the lines without their ends; InputError for a text that cannot be a table by its size or characters."""
-    if len(file.text) > MOST_CHARACTERS:
-        message = f"the file holds {len(file.text)} characters; no table is longer than {MOST_CHARACTERS}"
-        raise file.fail(message, 1)
-    lines = file.text.removeprefix("\ufeff").split("\n")
-    for number, line in enumerate(lines, start=1):
-        bare = line.removesuffix("\r")
-        if len(bare) > MOST_IN_LINE:
-            raise file.fail(f"the line has {len(bare)} characters; at most {MOST_IN_LINE} are possible", number)
-        wrong = next((char for char in bare if not (" " <= char <= "~" or char == "\t")), None)
-        if wrong is not None:
-            raise file.fail(f"holds the character {ascii(wrong)}; tables are printable ASCII", number)
-        lines[number - 1] = bare
-    return lines
+        return fixed_point(self.file, row.line, text, f"column {column}", _NUMBER)
 
 
 def read_table(file: SourceFile) -> TextTable:
     """Read one table; InputError with the line for whatever is malformed or cut."""
-    lines = split_lines(file)
+    lines = plain_lines(SourceFile(file.path, file.text.removeprefix("\ufeff")), MOST_CHARACTERS, MOST_IN_LINE)
     words = tuple(lines[0].split())
     if len(words) < 3 or words[0] != BEGIN:
         raise file.fail(f"{one_line(lines[0])[:40]!r} is not a first line such as 'BEGIN AXIS_Y .COM MM'", 1)
@@ -125,7 +98,9 @@ def read_table(file: SourceFile) -> TextTable:
     for number, line in enumerate(lines[header + 1 :], start=header + 2):
         text = line.strip()
         if text == END:
-            _nothing_behind(file, lines, number)
+            for behind, rest in enumerate(lines[number:], start=number + 1):
+                if rest.strip():
+                    raise file.fail(f"{one_line(rest)[:20]!r} is behind {END}, where the table ends", behind)
             before, after = tuple(lines[: header + 1]), tuple(lines[number - 1 :])
             return TextTable(file, words, before, columns, tuple(rows), after)
         if text and not text.startswith(";"):
@@ -188,12 +163,6 @@ def _by_field(
             )
         cells[column.name] = match.group()
     return cells
-
-
-def _nothing_behind(file: SourceFile, lines: Sequence[str], end: int) -> None:
-    for number, line in enumerate(lines[end:], start=end + 1):
-        if line.strip():
-            raise file.fail(f"{one_line(line)[:20]!r} stands behind {END}", number)
 
 
 # --- writing: layouts of our own, and those of a table saved on a control ----------------------------------------------
@@ -262,18 +231,12 @@ def template_layout(path: Path, kind: str) -> ComLayout:
         if filled:
             message = f"holds {one_line(filled[0])[:20]!r}; expected a table without values as a template"
             raise file.fail(message, row.line)
-    crlf = _crlf(file)
+    ends = [line.endswith("\r") for line in file.text.split("\n")[:-1]]
+    if len(set(ends)) > 1:
+        message = "ends otherwise than the first line (CR LF and LF are mixed)"
+        raise file.fail(message, ends.index(not ends[0]) + 1)
     fields = tuple(
         TableColumn(column.name, column.start, 0 if k == len(table.columns) - 1 else column.width)
         for k, column in enumerate(table.columns)
     )
-    return ComLayout(table.before, fields, table.after, crlf, path)
-
-
-def _crlf(file: SourceFile) -> bool:
-    """Whether the lines end with CR LF; InputError where both kinds of line end stand in one file."""
-    ends = [line.endswith("\r") for line in file.text.split("\n")[:-1]]
-    for number, end in enumerate(ends, start=1):
-        if end != ends[0]:
-            raise file.fail("ends otherwise than the first line (CR LF and LF are mixed)", number)
-    return bool(ends and ends[0])
+    return ComLayout(table.before, fields, table.after, bool(ends and ends[0]), path)

@@ -11,7 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
+from compgen.controls.shared.base import (
+    Controller,
+    SourceFile,
+    Term,
+    Usage,
+    by_travel,
+    coverage_violations,
+    nodes_by_axis,
+    travel_of,
+)
 from compgen.controls.shared.grids import loss_setting, uneven_nodes_mm
 from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
 from compgen.data import toml_files
@@ -488,8 +497,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         for axis, table in tables.tables.items():
             position = points.position_mm[:, axis]
             forward, reverse = table.at(position, 1), table.at(position, -1)
-            travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, axis])
-            added[:, axis] = np.select([travel > 0, travel < 0], [forward, reverse], 0.5 * (forward + reverse))
+            added[:, axis] = by_travel(travel_of(points, axis), forward, reverse)
         return added
 
     def violations(self, tables: CompTables) -> list[str]:

@@ -299,6 +299,16 @@ def nodes_by_axis(nodes_mm: Iterable[tuple[int, FloatArray]]) -> tuple[FloatArra
     return x, y, z
 
 
+def travel_of(points: Points, axis: int) -> FloatArray:
+    """Return the direction of the last travel of an axis at each point, +1 or -1, 0 where it is not known: shape (n,)."""
+    return np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, axis])
+
+
+def by_travel(travel: FloatArray, positive: FloatArray, negative: FloatArray) -> FloatArray:
+    """Return the value after positive or negative travel (n,), the mean of both where the direction is not known."""
+    return np.select([travel > 0, travel < 0], [positive, negative], 0.5 * (positive + negative))
+
+
 def coverage_violations(machine: Machine, axis: int, first_mm: float, last_mm: float, what: str) -> list[str]:
     """Return a message if a table from ``first_mm`` to ``last_mm`` leaves a part of the axis' travel uncovered."""
     low, high = machine.axes[axis].range_mm

@@ -192,9 +192,12 @@ def nearly_best(tried: Sequence[tuple[float, EquidistantGrid]]) -> EquidistantGr
     return next((grid for loss, grid in tried if loss <= enough), None)
 
 
-def worth_mm(errors: ErrorTable, axis: int, loss_mm: float) -> float:
-    """Return the loss of positioning that is worth no further node: as wanted, or what its uncertainty makes idle."""
-    curve = errors.curves.get(f"E{AXES[axis]}{AXES[axis]}")
+def worth_mm(errors: ErrorTable, axis: int, loss_mm: float, output: int | None = None) -> float:
+    """Return the loss that is worth no further node: as requested, or what the uncertainty of the error makes idle.
+
+    The error is that of ``output`` over ``axis``, by default positioning.
+    """
+    curve = errors.curves.get(f"E{AXES[axis if output is None else output]}{AXES[axis]}")
     return loss_mm if curve is None else max(loss_mm, _idle_loss(curve))
 
 
