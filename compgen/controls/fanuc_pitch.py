@@ -39,7 +39,7 @@ from compgen.controls.shared.grids import (
     nearly_best,
     worth_mm,
 )
-from compgen.controls.shared.integers import IntegerCurve, best_integers, lowest_free, section_weights
+from compgen.controls.shared.integers import IntegerCurve, best_integers, lowest_free, travel_weights
 from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
@@ -161,7 +161,8 @@ def _block(
     at_reference = int(np.floor(both[-towards][below] + 0.5))
     both[-towards] = both[-towards] - at_reference
     ways = (1, -1) if settings.bidirectional else (1,)
-    best = {way: _best(machine, settings, axis, nodes_mm, both[way]) for way in ways}
+    sections = travel_weights(machine, axis, nodes_mm)
+    best = {way: best_integers(both[way], sections, below, settings.increment_limit) for way in ways}
     limited = [PitchShortfall(axis, item.largest, item.full_sections) for item in best.values() if item.limited]
     keep = settings.kept[axis] is not None
     interval = Decimal(repr(round(float(nodes_mm[-1] - nodes_mm[0]), 9))) / (len(nodes_mm) - 1)
@@ -176,14 +177,6 @@ def _block(
         at_reference=at_reference if settings.bidirectional else 0,
     )
     return block, limited[:1]
-
-
-def _best(
-    machine: Machine, settings: PitchSettings, axis: int, nodes_mm: FloatArray, wanted: FloatArray
-) -> IntegerCurve:
-    emphasis = machine.emphasis
-    sections = section_weights(nodes_mm, machine.axes[axis].range_mm, emphasis.zone_mm[axis], emphasis.zone_weight)
-    return best_integers(wanted, sections, reference_node(machine, axis, nodes_mm), settings.increment_limit)
 
 
 def _stored(settings: PitchSettings, best: IntegerCurve, below: int, keep: bool) -> tuple[int, ...]:

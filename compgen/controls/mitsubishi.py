@@ -29,9 +29,9 @@ from compgen.controls.mitsubishi_tables import (
     shortfall_text,
     values_of,
 )
-from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis, plan_contradictions
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controls.shared.grids import EquidistantGrid, curve_nodes_mm, equidistant_grid
-from compgen.controls.shared.integers import IntegerCurve, best_integers, lowest_free, section_weights
+from compgen.controls.shared.integers import best_integers, lowest_free, travel_weights
 from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
@@ -81,6 +81,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
     name = "mitsubishi"
     settings_class = MitsubishiSettings
     anchored = True
+    has_plan = True
     sample_setting = "style_from"
 
     @classmethod
@@ -104,8 +105,16 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         chosen = [self._grid(errors, axis).nodes_mm for axis in range(3)]
         terms = []
         for pair in self.settings.pairs:
-            kept = self._kept_grid(pair)
-            nodes = chosen if kept is None else [kept.nodes_mm] * 3
+            kept, nodes = self.settings.kept(pair), chosen
+            if kept is not None:
+                if not kept.first <= kept.reference <= kept.last:
+                    raise kept.entry.fail(
+                        f"set {kept.index + 1} has the reference number {kept.reference} and the numbers {kept.first} to "
+                        f"{kept.last}, which cannot be kept: state interval_mm in the machine file for new ones"
+                    )
+                reference = Decimal(repr(self.machine.reference_point_mm[pair[1]]))
+                start = reference + (kept.first - kept.reference) * kept.interval_mm
+                nodes = [EquidistantGrid(start, kept.interval_mm, kept.last - kept.first + 1).nodes_mm] * 3
             terms += one_dimensional_terms(self.machine, errors, nodes, [pair], anchored=True)
         return terms
 
@@ -125,14 +134,18 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             output, base = pair
             term = terms[one_dimensional_name(output, base)]
             at = int(np.argmin(np.abs(term.nodes_mm - self.machine.reference_point_mm[base])))
-            best = self._best_counts(pair, term.nodes_mm, values[term.name], at)
+            corrections = np.asarray(values[term.name])
+            wanted = settings.sign * (corrections - corrections[at]) / settings.count_mm(pair)
+            # sums can take steps of any size; violations say where one is out of range
+            limit = int(2 * np.max(np.abs(wanted))) + 2 if settings.absolute else HIGHEST_VALUE
+            best = best_integers(wanted, travel_weights(self.machine, base, term.nodes_mm), at, limit)
             numbers = values_of(best.counts, at, settings.kept_at_reference(pair), absolute=settings.absolute)
             kept, own = settings.kept(pair), settings.own_set(pair)
             first = lowest_free(taken, settings.first_number, len(numbers)) if kept is None else kept.first
             self._check_free(pair, first, first + len(numbers) - 1)
             taken.append((first, first + len(numbers) - 1))
             index = free.pop(0) if own is None else own.index
-            interval = _interval(term.nodes_mm)
+            interval = Decimal(repr(float(term.nodes_mm[1] - term.nodes_mm[0]))).quantize(INTERVAL_QUANTUM_MM)
             scale = settings.scale_of(pair)
             sets.append(SetTable(base, output, first + at, first, numbers, scale, interval, settings.absolute, index))
             if best.limited:
@@ -143,22 +156,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         """Return the context beyond the common one; ``rows`` are the sheet's, ``plan`` holds number -> value."""
         settings = self.settings
         absolute = tables.sets[0].absolute
-        known = "as the control has it" if self.settings.sample.file is not None else "must be the control's own value"
-        parameters = [
-            _row(
-                SYSTEM,
-                str(int(not absolute)),
-                f"Pinc: {'absolute values' if absolute else 'increments'}; holds for the sets of ALL axes and {known}",
-            )
-        ]
-        values: list[dict[str, str]] = []
-        for table in tables.sets:
-            parameters += self._set_rows(table.index, table)
-            values += self._value_rows(table)
-        for item in self._no_longer_used(tables):
-            parameters += [
-                _row(BASE + k + SET_STEP * item.index, "", f"set {item.index + 1} is no longer used") for k in (0, 1)
-            ]
+        parameters, values = self._rows(tables)
         return {
             "sign_statement": self._sign_statement(tables),
             "parameters": [
@@ -186,14 +184,6 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
     def parse(self, files: Sequence[SourceFile]) -> MitsubishiTables:
         """Read the set sheet or the parameter file of the control; a ``.json`` plan is passed over."""
         return parse_tables(self.settings, files)
-
-    def contradictions(self, tables: MitsubishiTables, files: Sequence[SourceFile]) -> list[str]:
-        """Say where a plan beside the text differs from it."""
-        return plan_contradictions(files, lambda: self.context(tables)["plan"])
-
-    def remarks(self, tables: MitsubishiTables, files: Sequence[SourceFile]) -> list[str]:
-        """Say which system the values have, which sets were kept apart, and how many lines were passed over."""
-        return list(tables.remarks)
 
     def emulate(self, tables: MitsubishiTables, points: Points) -> FloatArray:
         """Return the sum of the sets' curves, linear between division points, held beyond the ends."""
@@ -262,7 +252,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         for table in tables.sets:
             first = BASE + SET_STEP * table.index
             numbers = f"#{table.first} to #{table.last}"
-            pair = f"{AXES[table.output]}({AXES[table.base].lower()})"
+            pair = table.name
             found.append(f"Set {table.index + 1} (#{first} to #{first + 6}) and numbers {numbers}: {pair}")
         changed = [
             row
@@ -282,10 +272,11 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             if table.absolute and constant:
                 found.append(
                     f"The value at the reference number #{table.reference} stays {table.at_reference}: a constant of "
-                    f"{constant:g} um in all values of {AXES[table.output]}({AXES[table.base].lower()}), which shifts the zero "
+                    f"{constant:g} um in all values of {table.name}, which shifts the zero "
                     "of the axis as before"
                 )
-            old = sample.entries.get(self._old_reference(table))
+            own = self.settings.own_set((table.output, table.base))
+            old = None if own is None else sample.entries.get(own.reference)
             if table.absolute and not table.at_reference and old is not None and not _same(old.value or "0", "0"):
                 found.append(
                     f"The value at the reference number #{old.number} was {old.value} and is now 0: "
@@ -296,38 +287,40 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             found.append(f"Switched off, because this export has no such table: {', '.join(cleared)}")
         return found
 
-    def _old_reference(self, table: SetTable) -> int:
-        """Reference number of the control's own set for a table, 0 if it has none."""
-        own = self.settings.own_set((table.output, table.base))
-        return 0 if own is None else own.reference
-
     def _no_longer_used(self, tables: MitsubishiTables) -> list[ControlSet]:
         """Sets of X, Y, Z in the control's file that hold none of the tables: they would go on acting beside them."""
         written = {table.index for table in tables.sets}
         others = self.settings.sample.others(self.settings.axis_names)
         return [item for item in self.settings.sample.sets if item.index not in written and item not in others]
 
-    def _set_rows(self, index: int, table: SetTable) -> list[dict[str, str]]:
-        names = self.settings.axis_names
-        numbers = (table.reference, table.first, table.last, table.scale)
-        values = (names[table.base], names[table.output], *map(str, numbers), f"{table.interval_mm:.3f}")
-        return [
-            _row(BASE + k + SET_STEP * index, value, f"{name}: {meaning}; set {index + 1}")
-            for k, (value, (name, meaning)) in enumerate(zip(values, MEANINGS, strict=True))
-        ]
-
-    def _value_rows(self, table: SetTable) -> list[dict[str, str]]:
-        positions = self.machine.reference_point_mm[table.base] + table.along_mm
-        pair = f"{AXES[table.output]}({AXES[table.base].lower()})"
-        return [
-            _row(table.first + k, str(value), f"{pair} at {AXES[table.base]} {positions[k]:.3f} mm")
-            for k, value in enumerate(table.values)
-        ]
+    def _rows(self, tables: MitsubishiTables) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
+        """Rows of the sheet: parameters of the sets, and values."""
+        names, absolute = self.settings.axis_names, tables.sets[0].absolute
+        known = "as the control has it" if self.settings.sample.file is not None else "must be the control's own value"
+        system = f"Pinc: {'absolute values' if absolute else 'increments'}; holds for the sets of ALL axes and {known}"
+        parameters, values = [_row(SYSTEM, str(int(not absolute)), system)], []
+        for table in tables.sets:
+            numbers = (table.reference, table.first, table.last, table.scale)
+            cells = (names[table.base], names[table.output], *map(str, numbers), f"{table.interval_mm:.3f}")
+            parameters += [
+                _row(BASE + k + SET_STEP * table.index, cell, f"{name}: {meaning}; set {table.index + 1}")
+                for k, (cell, (name, meaning)) in enumerate(zip(cells, MEANINGS, strict=True))
+            ]
+            positions = self.machine.reference_point_mm[table.base] + table.along_mm
+            values += [
+                _row(table.first + k, str(value), f"{table.name} at {AXES[table.base]} {positions[k]:.3f} mm")
+                for k, value in enumerate(table.values)
+            ]
+        for item in self._no_longer_used(tables):
+            parameters += [
+                _row(BASE + k + SET_STEP * item.index, "", f"set {item.index + 1} is no longer used") for k in (0, 1)
+            ]
+        return parameters, values
 
     def _summary(self, table: SetTable) -> dict[str, Any]:
         ends = self.machine.reference_point_mm[table.base] + table.along_mm
         return {
-            "pair": f"{AXES[table.output]}({AXES[table.base].lower()})",
+            "pair": table.name,
             "first": table.first,
             "last": table.last,
             "reference": table.reference,
@@ -359,21 +352,17 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         )
 
     def _warnings(self, tables: MitsubishiTables) -> list[str]:
+        system = (
+            f"#{SYSTEM} holds for the tables of ALL axes. Read it at the control first: if it is not "
+            f"{int(not tables.sets[0].absolute)}, do not enter the sheet; set mode in the machine file and export again."
+        )
         return [
             "The parameter numbers are those that are remembered of the M series; no document was read. Compare them with "
             "the parameter manual of the control before anything is entered.",
-            *self._system_warning(tables),
+            *([] if self.settings.sample.file is not None else [system]),
             "The direction of the values on the negative side follows from the formula of the manual, not from an example: "
             "check it at one division on each side (part 3).",
             *(shortfall_text(self.settings, item) for item in tables.shortfalls if item.missed_counts <= 1.0),
-        ]
-
-    def _system_warning(self, tables: MitsubishiTables) -> list[str]:
-        if self.settings.sample.file is not None:
-            return []
-        return [
-            f"#{SYSTEM} holds for the tables of ALL axes. Read it at the control first: if it is not "
-            f"{int(not tables.sets[0].absolute)}, do not enter the sheet; set mode in the machine file and export again."
         ]
 
     def _check(self, table: SetTable) -> dict[str, Any]:
@@ -399,21 +388,6 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             "interval_mm": float(table.interval_mm),
         }
 
-    def _kept_grid(self, pair: tuple[int, int]) -> EquidistantGrid | None:
-        """Division points of the control's own set for a table, None if there is none that is kept."""
-        kept = self.settings.kept(pair)
-        if kept is None:
-            return None
-        if not kept.first <= kept.reference <= kept.last:
-            raise kept.entry.fail(
-                f"set {kept.index + 1} has the reference number {kept.reference} and the numbers {kept.first} to {kept.last}, "
-                "which cannot be kept: state interval_mm in the machine file for new ones"
-            )
-        start = (
-            Decimal(repr(self.machine.reference_point_mm[pair[1]])) + (kept.first - kept.reference) * kept.interval_mm
-        )
-        return EquidistantGrid(start, kept.interval_mm, kept.last - kept.first + 1)
-
     def _check_free(self, pair: tuple[int, int], first: int, last: int) -> None:
         """Refuse numbers that a set of another table in the control's file uses."""
         own = self.settings.own_set(pair)
@@ -422,7 +396,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             if item is not own and first <= high and last >= low:
                 raise item.entry.fail(
                     f"set {item.index + 1} ({item.output} over {item.base}) uses the numbers {low} to {high}; {first} to {last} "
-                    f"of {AXES[pair[0]]}({AXES[pair[1]].lower()}) would overwrite them. State interval_mm for new numbers"
+                    f"of {one_dimensional_name(*pair)} would overwrite them. State interval_mm for new numbers"
                 )
 
     def _grid(self, errors: ErrorTable, axis: int) -> EquidistantGrid:
@@ -453,7 +427,13 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         if asked is not None:
             return grid_of(asked)
         grid = grid_of(None)
-        largest = 0.0 if settings.absolute else self._largest_step(errors, axis, grid)
+        largest = 0.0  # change of a correction over one interval, in counts; it stays in proportion to the interval
+        if not settings.absolute:
+            fine = np.unique(np.concatenate([grid.nodes_mm, curve_nodes_mm(self.machine, errors, axis)]))
+            pairs = [pair for pair in settings.pairs if pair[1] == axis]
+            for term, pair in zip(one_dimensional_terms(self.machine, errors, [fine] * 3, pairs), pairs, strict=True):
+                steepest = float(np.max(np.abs(np.diff(term.start) / np.diff(fine)))) / settings.count_mm(pair)
+                largest = max(largest, steepest * float(grid.step))
         share = min(1.0, (HIGHEST_VALUE - 1) / max(STEEPER * largest, 1e-9))
         if share == 1.0 and not grid.step % INTERVAL_QUANTUM_MM:
             return grid
@@ -462,32 +442,3 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         # Two nodes less: with the reference point as a node the ends may need one more on either side.
         least = Decimal(repr(self.machine.axes[axis].length_mm)) / max(most - 3, 1) / INTERVAL_QUANTUM_MM
         return grid_of(float(max(quanta, least.to_integral_value(rounding=ROUND_CEILING)) * INTERVAL_QUANTUM_MM))
-
-    def _largest_step(self, errors: ErrorTable, axis: int, grid: EquidistantGrid) -> float:
-        """Largest change of a wanted correction over one interval, in counts; it stays in proportion to the interval."""
-        fine = np.unique(np.concatenate([grid.nodes_mm, curve_nodes_mm(self.machine, errors, axis)]))
-        pairs = [pair for pair in self.settings.pairs if pair[1] == axis]
-        terms = one_dimensional_terms(self.machine, errors, [fine] * 3, pairs)
-        steepest = max(
-            float(np.max(np.abs(np.diff(term.start) / np.diff(fine)))) / self.settings.count_mm(pair)
-            for term, pair in zip(terms, pairs, strict=True)
-        )
-        return steepest * float(grid.step)
-
-    def _best_counts(self, pair: tuple[int, int], nodes_mm: FloatArray, values_mm: FloatArray, at: int) -> IntegerCurve:
-        """Return the best curve in counts at the division points for corrections (n,), zero at index ``at``.
-
-        In the absolute system steps of any size can be stored; the limits say where a sum is out of range.
-        """
-        base = pair[1]
-        wanted = self.settings.sign * (np.asarray(values_mm) - values_mm[at]) / self.settings.count_mm(pair)
-        emphasis = self.machine.emphasis
-        sections = section_weights(
-            nodes_mm, self.machine.axes[base].range_mm, emphasis.zone_mm[base], emphasis.zone_weight
-        )
-        limit = int(2 * np.max(np.abs(wanted))) + 2 if self.settings.absolute else HIGHEST_VALUE
-        return best_integers(wanted, sections, at, limit)
-
-
-def _interval(nodes_mm: FloatArray) -> Decimal:
-    return Decimal(repr(float(nodes_mm[1] - nodes_mm[0]))).quantize(INTERVAL_QUANTUM_MM)

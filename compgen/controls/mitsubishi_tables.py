@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from compgen.controls.shared.base import SourceFile, Usage, coverage_violations
 from compgen.controls.shared.grids import loss_setting
-from compgen.controls.shared.terms import ACROSS
+from compgen.controls.shared.scanner import check_size
+from compgen.controls.shared.terms import ACROSS, one_dimensional_name
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.files import read_bytes
@@ -93,8 +94,7 @@ def begins_with_mark(path: Path) -> bool:
 
 def sheet_entries(file: SourceFile) -> list[ParameterEntry]:
     """Rows ``#number,value,meaning``; blank lines and lines that begin with '#' and no digit (the header) are skipped."""
-    if len(file.text) > MOST_IN_SHEET:
-        raise file.fail(f"holds {len(file.text)} characters; no set sheet is longer than {MOST_IN_SHEET}", 1)
+    check_size(file, MOST_IN_SHEET)
     found = []
     for line, raw in enumerate(file.text.removeprefix("\ufeff").split("\n"), start=1):
         text = raw.strip(" \t\r")
@@ -122,8 +122,7 @@ def file_entries(file: SourceFile) -> tuple[list[ParameterEntry], int]:
 
     InputError with the line for a record of compensation that is not understood, and for a file that is cut.
     """
-    if len(file.text) > MOST_CHARACTERS:
-        raise file.fail(f"holds {len(file.text)} characters; no parameter file is longer than {MOST_CHARACTERS}", 1)
+    check_size(file, MOST_CHARACTERS)
     lines = [raw.strip(" \t\r") for raw in file.text.removeprefix("\ufeff").split("\n")]
     inside = [number for number, text in enumerate(lines, start=1) if text]
     if len(inside) < 2 or lines[inside[0] - 1] != "%" or lines[inside[-1] - 1] != "%":
@@ -141,11 +140,8 @@ def file_entries(file: SourceFile) -> tuple[list[ParameterEntry], int]:
                 raise file.fail(f"#{number} has the word {record[2][:10]}; compensation parameters have none", line)
             found.append(ParameterEntry(number, record[3].strip(), file, line))
         elif number == UNIT and record is not None:
-            found += (
-                []
-                if any(entry.number == UNIT for entry in found)
-                else [ParameterEntry(UNIT, record[3].strip(), file, line)]
-            )
+            if all(entry.number != UNIT for entry in found):
+                found.append(ParameterEntry(UNIT, record[3].strip(), file, line))
         elif re.match(r"N\s*[45]\d{3}(?!\d)", text):
             raise file.fail(f"{one_line(text[:30])!r} is not understood; a record such as N4101P-2 is expected", line)
         else:
@@ -213,40 +209,33 @@ def read_control_file(paths: Sequence[Path]) -> ControlFile:
     if "\ufffd" in file.text:
         line = file.text[: file.text.index("\ufffd")].count("\n") + 1
         raise file.fail("holds a byte that is not ASCII; a parameter file is ASCII text", line)
-    return control_file(file)
-
-
-def control_file(file: SourceFile) -> ControlFile:
-    """Return what a parameter file shows; see :func:`read_control_file`."""
     if not is_parameter_file(file):
         raise file.fail("is not a parameter file of the control (ALL.PRM): the first line is not '%'", 1)
     entries = by_number(file_entries(file)[0])
     if SYSTEM not in entries:
         raise file.fail(f"#{SYSTEM} (absolute or increment system) is missing", 1)
-    sets = [item for k in range(SETS) if (item := _control_set(entries, k)) is not None]
-    unit = entries.get(UNIT)
-    unit_um = None if unit is None else UNITS_UM.get(unit.value)
+    sets = []
+    for index in range(
+        SETS
+    ):  # a set without axes is empty, whatever its numbers are; others need not be of a linear axis
+        shift = SET_STEP * index
+        expected = [entries.get(parameter + shift) for parameter in range(BASE, INTERVAL + 1)]
+        present = [entry for entry in expected if entry is not None]
+        names = [entry.value for entry in present if entry.number - shift in (BASE, OUTPUT)]
+        if not any(names):
+            continue
+        if len(present) < len(expected) or not all(names):
+            message = f"set {index + 1} is not complete: #{BASE + shift} to #{INTERVAL + shift} are expected"
+            raise present[0].fail(message)
+        reference, negative, positive, scale = (entry.whole(0, 99999) for entry in present[2:6])
+        low, high = sorted((negative, positive))
+        interval_mm = present[6].interval_mm()
+        sets.append(ControlSet(index, names[0], names[1], reference, low, high, scale, interval_mm, present[3]))
+    unit_um = UNITS_UM.get(entries[UNIT].value) if UNIT in entries else None
     numbers = [number for number in entries if number >= FIRST_NUMBER]
     full = sorted(numbers) == list(range(FIRST_NUMBER, FIRST_NUMBER + len(numbers)))
     last = max(numbers) if full and numbers else LAST_NUMBER
     return ControlFile(file, entries[SYSTEM].whole(0, 1) == 0, unit_um, tuple(sets), last, entries)
-
-
-def _control_set(entries: Mapping[int, ParameterEntry], index: int) -> ControlSet | None:
-    """Return a set, None if it has no axis; its numbers need not suit a linear axis."""
-    shift = SET_STEP * index
-    due = [entries.get(parameter + shift) for parameter in range(BASE, INTERVAL + 1)]
-    present = [entry for entry in due if entry is not None]
-    names = [entry.value for entry in present if entry.number - shift in (BASE, OUTPUT)]
-    if not any(names):
-        return None
-    if len(present) < len(due) or not all(names):
-        first = present[0]
-        raise first.fail(f"set {index + 1} is not complete: #{BASE + shift} to #{INTERVAL + shift} are expected")
-    reference, negative, positive, scale = (entry.whole(0, 99999) for entry in present[2:6])
-    low, high = sorted((negative, positive))
-    interval = present[6].interval_mm()
-    return ControlSet(index, names[0], names[1], reference, low, high, scale, interval, present[3])
 
 
 # Settings of ``[controllers.mitsubishi]``: what the control counts in, section lengths, numbers that are free.
@@ -437,6 +426,11 @@ class SetTable:
     interval_mm: Decimal
     absolute: bool = False
     index: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name such as ``X(y)``."""
+        return one_dimensional_name(self.output, self.base)
 
     @property
     def last(self) -> int:
@@ -646,14 +640,14 @@ def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: Mit
 
 def set_name(table: SetTable) -> str:
     """Name of a set in messages, e.g. ``the table X(y)``."""
-    return f"the table {AXES[table.output]}({AXES[table.base].lower()})"
+    return f"the table {table.name}"
 
 
 def shortfall_text(settings: MitsubishiSettings, item: SetShortfall) -> str:
     """Say that the range of the values keeps a table from what was wanted, and what helps."""
     count_um = settings.count_mm((item.output, item.base)) / MM_PER_UM
     return (
-        f"the table {AXES[item.output]}({AXES[item.base].lower()}) is too steep for {HIGHEST_VALUE} counts of "
+        f"the table {one_dimensional_name(item.output, item.base)} is too steep for {HIGHEST_VALUE} counts of "
         f"{count_um:g} um per division: it misses by up to {item.missed_counts * count_um:.1f} um; a larger scale or a "
         "shorter interval_mm is needed"
     )

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
 from compgen.kinematics.curves import hat_entries, hat_matrix
 
 IntArray = NDArray[np.int64]
@@ -76,6 +77,12 @@ def section_weights(
         products = np.column_stack([(1.0 - share) ** 2, (1.0 - share) * share, share**2])
         np.add.at(result, left, (weight * half)[:, None] * products)
     return result
+
+
+def travel_weights(machine: Machine, axis: int, nodes_mm: FloatArray) -> FloatArray:
+    """Return :func:`section_weights` for the travel of an axis and the work zone of the machine."""
+    emphasis = machine.emphasis
+    return section_weights(nodes_mm, machine.axes[axis].range_mm, emphasis.zone_mm[axis], emphasis.zone_weight)
 
 
 def nearest_polyline(
