@@ -99,8 +99,8 @@ def _template_problems(name: str, folder: Any) -> list[str]:
 
 #: What plug-ins may add: word, name of the dict in a file, group of entry points, registry, check.
 KINDS = (
-    Kind("control", "CONTROLLERS", "compgen.controllers", CONTROLLERS, check_control),
-    Kind("effect", "EFFECTS", "compgen.effects", EFFECTS, check_effect),
+    Kind("control", "CONTROLLERS", "compgen.controllers", CONTROLLERS, check_control, broken=CONTROLLERS.broken),
+    Kind("effect", "EFFECTS", "compgen.effects", EFFECTS, check_effect, broken=EFFECTS.broken),
     Kind("effect family", "FAMILIES", "compgen.effect_families", FAMILIES, check_family),
     Kind("instrument", "INSTRUMENTS", "compgen.instruments", INSTRUMENTS, check_instrument),
 )

@@ -50,7 +50,7 @@ def open_machine(name: str, machines: Sequence[Path] = (), *, whole: bool = Fals
             from compgen.data.registry import why_missing
 
             message = f"is not a controller; {nearest(controller, CONTROLLERS)}"
-            message += why_missing("control", controller) or "; if it comes from a plug-in, add --plugin PATH"
+            message += why_missing(CONTROLLERS.broken, controller) or "; if it comes from a plug-in, add --plugin PATH"
             raise InputError(message, file=machine.source, field=f"[controllers.{controller}]")
         if whole or not shipped:
             CONTROLLERS[controller].read_settings(machine)

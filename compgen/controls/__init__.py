@@ -18,6 +18,8 @@ class Controls(MutableMapping[str, type[AnyController]]):
 
     def __init__(self, built_in: Mapping[str, str]) -> None:
         self._classes: dict[str, str | type[AnyController]] = dict(built_in)
+        #: Why an entry point of an installed distribution is not available, by its name.
+        self.broken: dict[str, str] = {}
 
     def __getitem__(self, name: str) -> type[AnyController]:
         found = self._classes[name]
@@ -87,7 +89,7 @@ def controller_named(name: str) -> type[AnyController]:
     if name not in CONTROLLERS:
         from compgen.data.registry import why_missing
 
-        raise InputError(f"no controller is named {name!r}; {_hint(name)}{why_missing('control', name)}")
+        raise InputError(f"no controller is named {name!r}; {_hint(name)}{why_missing(CONTROLLERS.broken, name)}")
     return CONTROLLERS[name]
 
 

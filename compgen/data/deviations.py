@@ -209,7 +209,17 @@ def read_parts(files: str | Path | Sequence[str | Path]) -> Deviations:
     """
     tables = _PARTS.read_tables(files)
     for table in tables:
-        _check_alike(table, _check_components(table, *_PARTS.fields[2:4]))
+        # both are of one size, however the part was turned: an inch or a metre shows here
+        measured = _check_components(table, *_PARTS.fields[2:4])
+        nominal = [f"{name[1]}_mm" for name in measured if f"{name[1]}_mm" in table.columns]
+        spans = [
+            float(np.linalg.norm([np.ptp(table.numbers(name)) for name in names], axis=0))
+            for names in (nominal, measured)
+            if len(names) > 1
+        ]
+        if len(spans) == 2 and not 0.5 < (spans[1] + 1e-9) / (spans[0] + 1e-9) < 2.0:
+            text = f"the nominal features span {spans[0]:g}, the measured ones {spans[1]:g}; both are in mm: check the units"
+            raise InputError(text, file=table.path, field=f"columns {', '.join(measured)}")
     found = join_deviations([_part(table) for table in tables])
     unknown = found.u_mm is None or bool(np.isnan(found.u_mm).all())
     return aligned(replace(found, u_mm=None if unknown else found.u_mm))
@@ -221,18 +231,6 @@ def _part(table: CsvTable) -> Deviations:
     nominal_mm = np.column_stack([values.pop("xy_mm"), values.pop("z_mm")])
     values["metadata"]["measured"] = PART
     return Deviations(nominal_mm + _origin(table), values.pop("measured_mm") - nominal_mm, **values)
-
-
-def _check_alike(table: CsvTable, measured: Sequence[str]) -> None:
-    """Nominal and measured coordinates must be of one size, however the part was turned: an inch or a metre shows here."""
-    nominal = [table.numbers(f"{name[1]}_mm") for name in measured if f"{name[1]}_mm" in table.columns]
-    spans = [float(np.linalg.norm([np.ptp(column) for column in columns], axis=0))
-             for columns in (nominal, [table.numbers(name) for name in measured]) if len(columns) > 1]  # fmt: skip
-    if len(spans) == 2 and not 0.5 < (spans[1] + 1e-9) / (spans[0] + 1e-9) < 2.0:
-        text = (
-            f"the nominal features span {spans[0]:g}, the measured ones {spans[1]:g}; both are in mm: check the units"
-        )
-        raise InputError(text, file=table.path, field=f"columns {', '.join(measured)}")
 
 
 def _origin(table: CsvTable) -> FloatArray:
@@ -267,8 +265,10 @@ def aligned(deviations: Deviations) -> Deviations:
         nominal = deviations.position_mm[own]
         actual = nominal + deviations.deviation_mm[own]
         rotation = _best_rotation(nominal, actual)
+        # means over what was measured; 0 for a component that was not
         seen = np.isfinite(actual)
-        middle, there = _centres(nominal, actual)
+        count = np.maximum(seen.sum(axis=0), 1)
+        middle, there = (np.where(seen, values, 0.0).sum(axis=0) / count for values in (nominal, actual))
         poses[setup] = RoughPose(middle, there, rotation)
         back = np.where(seen, actual - there, 0.0) @ rotation
         turned[own] = np.where(seen, back + middle - nominal, np.nan)
@@ -280,13 +280,6 @@ def aligned(deviations: Deviations) -> Deviations:
                 file=deviations.origin[0][0] if deviations.origin else None,
             )
     return replace(deviations, deviation_mm=turned, poses=poses)
-
-
-def _centres(nominal_mm: FloatArray, actual_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means (3,) of the nominal and the measured coordinates over what was measured; 0 for a component that was not."""
-    seen = np.isfinite(actual_mm)
-    count = np.maximum(seen.sum(axis=0), 1)
-    return np.where(seen, nominal_mm, 0.0).sum(axis=0) / count, np.where(seen, actual_mm, 0.0).sum(axis=0) / count
 
 
 def _best_rotation(nominal_mm: FloatArray, actual_mm: FloatArray) -> FloatArray:

@@ -175,7 +175,18 @@ class Schema:
         required = [name for field in self.fields if field.presence == "required" for name in field.columns]
         others = [name for field in self.fields if field.presence != "required" for name in field.columns]
         table = read_csv(file, (*required, *self.needed), others, (TEMPERATURES,))
-        self._check_repeats(table)
+        # two rows that agree in the keys must differ in a label, a direction, the tool or the time
+        names = (
+            (*self.keys, "approach", *APPROACH_COLUMNS, *TOOL_COLUMNS, *LABEL_COLUMNS, "time_s") if self.keys else ()
+        )
+        present = [name for name in names if name in table.columns]
+        found = repeated(zip(*(table.columns[name] for name in present), strict=True))
+        if found is not None:
+            first, row = found
+            keys = [name for name in self.keys if name in present]
+            what = " and ".join(f"{name} {table.columns[name][row]!r}" for name in keys)
+            message = f"{what} already appear in line {table.lines[first]}; give repeats a run or repeat column"
+            raise table.fail(row, keys[-1], message)
         return table
 
     def read_tables(self, files: str | Path | Sequence[str | Path]) -> list[CsvTable]:
@@ -196,20 +207,6 @@ class Schema:
         found = {field.name: field.of_table(table) for field in self.fields}
         metadata = {key: value for key, value in table.metadata.items() if key != "rows"}
         return {**found, "metadata": metadata, "origin": [(str(table.path), line) for line in table.lines]}
-
-    def _check_repeats(self, table: CsvTable) -> None:
-        """Two rows that agree in the keys must differ in a label, a direction, the tool or the time."""
-        if not self.keys:
-            return
-        names = (*self.keys, "approach", *APPROACH_COLUMNS, *TOOL_COLUMNS, *LABEL_COLUMNS, "time_s")
-        present = [name for name in names if name in table.columns]
-        found = repeated(zip(*(table.columns[name] for name in present), strict=True))
-        if found is not None:
-            first, row = found
-            keys = [name for name in self.keys if name in present]
-            what = " and ".join(f"{name} {table.columns[name][row]!r}" for name in keys)
-            message = f"{what} already appear in line {table.lines[first]}; give repeats a run or repeat column"
-            raise table.fail(row, keys[-1], message)
 
     def joined(self, parts: Sequence[R]) -> R:
         """Return several records as one: labels that some lack are 0, covariates nan, directions unknown.

@@ -31,14 +31,19 @@ _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _FAULTS = (Exception, SystemExit)
 #: How the origin of a plug-in from a path begins.
 PATH_ORIGIN = "plug-in "
-#: Why an entry point of an installed distribution is not available, by word of its kind and name.
-_BROKEN: dict[tuple[str, str], str] = {}
 
 
-def why_missing(word: str, name: str) -> str:
+class Registry(dict[str, Any]):
+    """What a program and its plug-ins offer, by name; ``broken`` says why an installed entry point is not available."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.broken: dict[str, str] = {}
+
+
+def why_missing(broken: Mapping[str, str], name: str) -> str:
     """Return the reason, for the end of a message, if ``name`` would come from an entry point that is broken."""
-    reason = _BROKEN.get((word, name))
-    return f"; {reason}" if reason else ""
+    return f"; {broken[name]}" if name in broken else ""
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,7 @@ class Kind:
     registry : what receives it, by name.
     check : takes name and thing, returns the thing to register and everything that is wrong with it, in words.
     origins : where each thing of a plug-in came from, by name.
+    broken : why an entry point of an installed distribution is not available, by its name.
     """
 
     word: str
@@ -61,47 +67,39 @@ class Kind:
     registry: MutableMapping[str, Any]
     check: Callable[[str, Any], tuple[Any, list[str]]]
     origins: dict[str, str] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)
 
     def register(self, name: str, thing: Any, origin: str) -> None:
         """Add a thing of the plug-in ``origin``; InputError with everything that is wrong with it."""
         thing, problems = self.check(name, thing) if isinstance(name, str) else (thing, [])
-        problems = [*_name_problems(name, self), *problems]
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name) > 40:
+            text = "its name has to be lower-case letters and digits with single '-' between them, e.g. 'my-csv'"
+            problems = [text, *problems]
+        elif name in self.registry:
+            problems = [f"the name is taken by {self.origins.get(name, 'a built-in one')}; choose another", *problems]
         if problems:
-            file, line = _place_of(thing)
+            code = thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing)
+            try:  # where the code of the thing begins, as far as it is known
+                file, line = inspect.getsourcefile(code), inspect.getsourcelines(code)[1]
+            except (OSError, TypeError):
+                file, line = None, None
             what = f"{origin}: the {self.word} {name!r} cannot be registered: {'; '.join(problems)}"
             raise InputError(what, file=file, line=line)
         self.registry[name] = thing
         self.origins[name] = origin
 
 
-def _name_problems(name: Any, kind: Kind) -> list[str]:
-    if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name) > 40:
-        return ["its name has to be lower-case letters and digits with single '-' between them, e.g. 'my-csv'"]
-    if name in kind.registry:
-        return [f"the name is taken by {kind.origins.get(name, 'a built-in one')}; choose another"]
-    return []
-
-
-def _place_of(thing: Any) -> tuple[str | None, int | None]:
-    """File and line where the code of a thing begins, as far as it is known."""
-    code = thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing)
-    try:
-        return inspect.getsourcefile(code), inspect.getsourcelines(code)[1]
-    except (OSError, TypeError):
-        return None, None
-
-
 def call_problem(function: Any, arguments: Sequence[str], what: str) -> list[str]:
     """Say what is wrong if ``function`` cannot be called with these arguments, in their order and by their names."""
-    due = f"{what}({', '.join(arguments)})"
+    expected = f"{what}({', '.join(arguments)})"
     if not callable(function):
-        return [f"{due} is missing" if function is None else f"{what} is not a function; expected {due}"]
+        return [f"{expected} is missing" if function is None else f"{what} is not a function; expected {expected}"]
     try:
         signature = inspect.signature(function)
         signature.bind(*arguments)
         return []
     except (TypeError, ValueError):
-        return [f"{what}{signature} cannot be called as {due}"]
+        return [f"{what}{signature} cannot be called as {expected}"]
 
 
 def load_file(path: str | Path, kinds: Sequence[Kind]) -> None:
@@ -184,7 +182,7 @@ def load_entry_points(kinds: Sequence[Kind]) -> None:
                     kind.register(entry.name, thing, origin)
                 except InputError as error:
                     if entry.name not in kind.registry:
-                        _BROKEN[kind.word, entry.name] = str(error)
+                        kind.broken[entry.name] = str(error)
                     warnings.warn(f"left out: {error}", CompgenWarning, stacklevel=4)
 
 

@@ -15,7 +15,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest
 from compgen.data.names import AXES, ERROR_INDEX, SECONDS_PER_MIN, error_named
-from compgen.data.registry import call_problem, why_missing
+from compgen.data.registry import Registry, call_problem, why_missing
 from compgen.effects import DisplacementEffect, Effect, catalogue, listed, readings_of_points
 from compgen.effects.active import STATION_NAME, dead_path_stations, read_values
 from compgen.errors import InputError
@@ -480,7 +480,7 @@ STATION_EFFECTS = {"station_drift": station_drift, "length_step": length_step, "
 
 SimulatedEffect = Displacement | LengthEffect | RunEffect
 #: Reader of a section ``[[effects]]`` of a scenario by its ``name``; plug-ins add to it.
-EFFECTS: dict[str, Callable[[toml_files.Section], Displacement]] = {}
+EFFECTS = Registry()
 
 
 def read_effects(sections: list[toml_files.Section]) -> tuple[SimulatedEffect, ...]:
@@ -499,7 +499,7 @@ def read_effects(sections: list[toml_files.Section]) -> tuple[SimulatedEffect, .
         known = catalogue(_stations(name, section))
         if name not in known or not known[name].card.parameters:
             names = [*EFFECTS, *(other for other, effect in listed().items() if effect.card.parameters)]
-            reason = why_missing("effect", name)
+            reason = why_missing(EFFECTS.broken, name)
             raise section.fail("name", f"unknown effect; {nearest(name, names)}; --plugin PATH adds some{reason}")
         effect, values = read_values(known[name], section)
         section.finish()
