@@ -9,6 +9,7 @@ to every element of the class ``axes``.
 from __future__ import annotations
 
 import base64
+import hashlib
 import math
 import struct
 import zlib
@@ -19,6 +20,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import ArrayLike, NDArray
+
+from compgen.resources import data_folder
 
 #: What a colour is for.
 ROLES = ("ink", "muted", "grid", "line", "band", "fit", "table", "before", "after", "c0", "c1", "c2", "c3", "c4", "c5")
@@ -186,7 +189,9 @@ class Plot:
         """Draw points (n,) in the colours of a scale."""
         steps = 16
         index = np.rint(np.clip(shares, 0.0, 1.0) * steps).astype(int)
-        for k, rgb in enumerate(_colours(np.arange(steps + 1) / steps, colours)):
+        found = _colours(np.arange(steps + 1) / steps, colours)
+        for k in sorted(range(steps + 1), key=lambda k: abs(k - steps / 2)):  # the ends of the scale lie on top
+            rgb = found[k]
             if (index == k).any():
                 self.dots(x[index == k], y[index == k], "ink", size=size)
                 self.drawn[-1] = self.drawn[-1].replace("var(--ink)", "#" + bytes(rgb.tolist()).hex())
@@ -284,6 +289,28 @@ def colour_bar(
     numbers = "".join(_text(left + 11.0, place + 0.35 * FONT, text, "start") for place, text in places)
     # Only the picture of the bar: it is no axes that could be zoomed.
     return "".join(bar.drawn) + numbers + _text(left + 4.0, top - 3.0, label, "middle")
+
+
+def picture_grid(pictures: Sequence[Picture], kind: str = "") -> str:
+    """Return pictures as HTML, side by side as far as there is room; ``kind`` is "wide" for one across the page."""
+    return '<div class="grid">{}</div>'.format(
+        "\n".join(
+            f'<figure class="picture {kind}" id="figure-{item.key}" tabindex="0"><figcaption>{escape(item.title)} '
+            f'<span class="note">{escape(item.note)}</span></figcaption><div class="canvas">{item.svg}</div></figure>'
+            for item in pictures
+        )
+    )
+
+
+def page_assets(*scripts: str) -> tuple[Markup, Markup, str]:
+    """Return style sheet, script and content security policy of a page in one file that fetches nothing."""
+    folder = data_folder("templates") / "_report"
+    style, script = (folder / "style.css").read_text("utf-8"), "".join((folder / n).read_text("utf-8") for n in scripts)
+    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+    if scripts:
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        policy += f"; script-src 'sha256-{digest}'"
+    return Markup(style), Markup(script), policy
 
 
 def rounded(values: Sequence[float], digits: int = 4) -> list[float | None]:

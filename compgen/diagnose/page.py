@@ -4,180 +4,155 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from html import escape
-from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from compgen.data.csv_files import FloatArray
+from compgen.data.charts import (
+    BOX,
+    DIVERGING,
+    Picture,
+    Plot,
+    colour_bar,
+    limits_of,
+    page_assets,
+    picture_grid,
+    svg,
+)
 from compgen.data.files import json_text
 from compgen.data.names import MM_PER_UM
 from compgen.diagnose.axis_diagnosis import AxisDiagnosis, AxisFindings
 from compgen.diagnose.diagnosis import Diagnosis
-from compgen.diagnose.layout import IntArray
 from compgen.diagnose.search import gains, remainder_of
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+# Pictures of a diagnosis: residuals before and after over everything that they may depend on, and the suspects.
 
 
-# Pictures of a diagnosis as SVG: residuals before and after over everything that they may depend on, and the suspects.
-
-
-BEFORE, AFTER = "#c1440e", "#1f6fb2"
 BINS = 24
-#: Readings drawn in a panel; more do not show.
+#: Readings drawn in a picture; more do not show.
 MOST_DOTS = 1500
 MOST_SUSPECTS = 12
-PICTURE_STYLE: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "compgen", "font.size": 8, "axes.titlesize": 9}
 
 
-def pictures_of(found: Diagnosis) -> dict[str, str]:
-    """Return the SVG texts by name: ``where``, ``volume``, ``suspects``."""
-    import matplotlib  # imported here: slow to load, and only the pages need it
-
-    matplotlib.use("svg")
-    with matplotlib.rc_context(PICTURE_STYLE):
-        return {"where": _where(found), "volume": _volume(found), "suspects": _suspects_picture(found)}
-
-
-def axis_pictures(found: AxisDiagnosis) -> dict[str, str]:
-    """Return a picture of the runs of every axis by its letter."""
-    import matplotlib  # imported here: slow to load, and only the pages need it
-
-    matplotlib.use("svg")
-    with matplotlib.rc_context(PICTURE_STYLE):
-        return {part.session.letter: _runs(part) for part in found.axes}
-
-
-def _runs(part: AxisFindings) -> str:
-    """Scatter within the cells over time, and all runs over the targets, before and after."""
-    from matplotlib import pyplot
-
+def axis_pictures(part: AxisFindings) -> list[Picture]:
+    """Return scatter within the cells over time, and all runs over the targets, as measured and without what was removed."""
     session = part.session
     measured, without = session.deviation_mm / MM_PER_UM, (session.deviation_mm - part.removed_mm) / MM_PER_UM
     kept = ~np.isin(np.arange(len(session)), part.left_out)
+    every = np.ones_like(kept)
     count = np.maximum(np.bincount(session.cell[kept], minlength=int(session.cell.max()) + 1), 1)
-    figure, axes = pyplot.subplots(1, 3, figsize=(10, 3.2))
-    figure.subplots_adjust(left=0.06, right=0.99, top=0.92, bottom=0.14, wspace=0.25)
-    for values, colour, rows in ((measured, BEFORE, np.ones_like(kept)), (without, AFTER, kept)):
+    scatter = []
+    for values, role, rows in ((measured, "before", every), (without, "after", kept)):
         means = np.bincount(session.cell[kept], values[kept], len(count)) / count
-        left = values - means[session.cell]
-        axes[0].plot(session.time[rows], left[rows], ".-", color=colour, lw=0.5, ms=4)
-    axes[0].plot(session.time[~kept], (measured - means[session.cell])[~kept], "o", mfc="none", color=BEFORE, ms=5)
-    axes[0].set_xlabel("time in s" if session.timed else "number of the reading in time")
-    axes[0].set_ylabel("deviation less its mean, um")
-    for panel, title, values, colour, rows in (
-        (axes[1], "as measured", measured, BEFORE, np.ones_like(kept)),
-        (axes[2], "without", without, AFTER, kept),
-    ):
+        scatter.append((values - means[session.cell], role, rows))
+    letter, time = session.letter, "time (s)" if session.timed else "number of the reading in time"
+    plot = Plot(
+        limits_of(session.time, margin=0.03), limits_of(*(left[rows] for left, _, rows in scatter)),
+        x_label=time, y_label="µm",
+    )  # fmt: skip
+    for left, role, rows in scatter:
+        plot.line(session.time[rows], left[rows], role, width=0.7)
+        plot.dots(session.time[rows], left[rows], role)
+    plot.dots(session.time[~kept], scatter[0][0][~kept], "before", size=6.0)
+    plot.dots(session.time[~kept], scatter[0][0][~kept], "page", size=3.5)
+    title = "Deviation less the mean of its target and direction, over time"
+    pictures = [Picture(f"time-{letter}", "Scatter", svg(f"time-{letter}", title, [plot]), note="over time")]
+    for name, values, role, rows in (("As measured", measured, "before", every), ("Without", without, "after", kept)):
+        limits = limits_of(measured, without[kept])
+        plot = Plot(limits_of(session.position_mm, margin=0.03), limits, x_label=f"{letter} (mm)", y_label="µm")
         for run in np.unique(session.leg):
-            own = (session.leg == run) & rows
-            marker = "^" if own.any() and session.direction[own][0] > 0 else "v"
-            panel.plot(session.position_mm[own], values[own], marker + "-", color=colour, lw=0.5, ms=3, alpha=0.8)
-        panel.set_title(title)
-        panel.set_xlabel(f"{session.letter} in mm")
-    axes[2].sharey(axes[1])
-    return _text_of(figure)
+            chosen = (session.leg == run) & rows
+            upwards = bool(chosen.any() and session.direction[chosen][0] > 0)
+            plot.line(session.position_mm[chosen], values[chosen], role, width=0.7)
+            plot.dots(session.position_mm[chosen], values[chosen], role, square=not upwards)
+        key = f"{role}-{letter}"
+        drawn = svg(key, f"All runs over the targets, {name.lower()}", [plot])
+        pictures.append(Picture(key, name, drawn, note="all runs over the targets"))
+    return pictures
 
 
-def _text_of(figure: Any) -> str:
-    from matplotlib import pyplot
-
-    stream = StringIO()
-    figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
-    pyplot.close(figure)
-    text = stream.getvalue()
-    return text[text.index("<svg") :]
-
-
-def _where(found: Diagnosis) -> str:
-    """Residuals before and after against every covariate."""
-    from matplotlib import pyplot
-
-    panels = _covariates(found)
-    columns = 3
-    rows = -(-len(panels) // columns)
-    figure, axes = pyplot.subplots(rows, columns, figsize=(10, 2.3 * rows), squeeze=False)
-    figure.subplots_adjust(left=0.07, right=0.99, top=1 - 0.1 / rows, bottom=0.22 / rows, hspace=0.45, wspace=0.28)
-    for k, (label, values) in enumerate(panels):
-        _panel(axes.flat[k], label, values, found)
-    for k in range(len(panels), rows * columns):
-        axes.flat[k].axis("off")
-    return _text_of(figure)
-
-
-def _covariates(found: Diagnosis) -> list[tuple[str, FloatArray]]:
-    """What residuals are drawn against: label and values (n,)."""
+def residual_pictures(found: Diagnosis) -> list[Picture]:
+    """Return mean and scatter of the residuals before and after over every quantity that they may depend on."""
     readings, layout = found.analysis.fit.readings, found.analysis.fit.observed.layout
-    panels = [(f"{'XYZ'[k]} in mm", readings.position_mm[:, k]) for k in range(3) if np.ptp(readings.position_mm[:, k])]
+    over = [(f"{'XYZ'[k]} (mm)", readings.position_mm[:, k]) for k in range(3) if np.ptp(readings.position_mm[:, k])]
     if len(readings.stations) > 1:
-        panels.append(("station", readings.station.astype(np.float64)))
-        panels.append(("range in mm", readings.range_mm))
-    panels.append(("time in s" if layout.timed else "order of stops", layout.time[layout.stop]))
+        over += [("station", readings.station.astype(np.float64)), ("range (mm)", readings.range_mm)]
+    over.append(("time (s)" if layout.timed else "order of stops", layout.time[layout.stop]))
     if readings.approach is not None:
-        for k in range(3):
-            if np.ptp(readings.approach[:, k]):
-                panels.append((f"direction of {'XYZ'[k]}", readings.approach[:, k]))
-    for name, values in readings.covariates.items():
-        if name != "time_s" and np.isfinite(values).all() and np.ptp(values):
-            panels.append((name, values))
-    return panels
-
-
-def _panel(axes: Axes, label: str, values: FloatArray, found: Diagnosis) -> None:
-    """Mean and scatter of the residuals in bins of a covariate."""
-    few = len(np.unique(values)) <= BINS
-    edges = np.unique(values) if few else np.quantile(values, np.linspace(0, 1, BINS + 1))
-    index = np.searchsorted(edges, values) if few else np.clip(np.searchsorted(edges, values) - 1, 0, BINS - 1)
-    centres = edges if few else 0.5 * (edges[1:] + edges[:-1])
-    width = np.ptp(centres) / 120 if len(centres) > 1 else 0.01
-    for shift, colour, residual in (
-        (-width, BEFORE, found.gap.residual_before_mm),
-        (width, AFTER, found.gap.residual_after_mm),
-    ):
+        over += [(f"direction of {'XYZ'[k]}", values) for k, values in enumerate(readings.approach.T) if np.ptp(values)]
+    over += [
+        (name, values)
+        for name, values in readings.covariates.items()
+        if name != "time_s" and np.isfinite(values).all() and np.ptp(values)
+    ]
+    pictures = []
+    for number, (label, values) in enumerate(over):
+        edges = np.unique(values)
+        if few := len(edges) <= BINS:
+            index, centres = np.searchsorted(edges, values), edges
+        else:
+            edges = np.quantile(values, np.linspace(0, 1, BINS + 1))
+            index, centres = np.clip(np.searchsorted(edges, values) - 1, 0, BINS - 1), 0.5 * (edges[1:] + edges[:-1])
+        shift = np.ptp(centres) / 120 if len(centres) > 1 else 0.01
         count = np.maximum(np.bincount(index, minlength=len(centres)), 1)
-        mean = np.bincount(index, residual, len(centres)) / count
-        square = np.bincount(index, residual**2, len(centres)) / count
-        spread = np.sqrt(np.maximum(square - mean**2, 0.0))
-        axes.errorbar(
-            centres + shift, mean / MM_PER_UM, spread / MM_PER_UM, fmt=".", color=colour, lw=0.7, ms=4, alpha=0.9
-        )
-    axes.axhline(0.0, color="#888888", lw=0.5)
-    axes.set_xlabel(label)
-    axes.set_ylabel("residual in um")
+        drawn = []
+        for side, role, residual_mm in (
+            (-1.0, "before", found.gap.residual_before_mm), (1.0, "after", found.gap.residual_after_mm),
+        ):  # fmt: skip
+            mean = np.bincount(index, residual_mm, len(centres)) / count
+            square = np.bincount(index, residual_mm**2, len(centres)) / count
+            spread = np.sqrt(np.maximum(square - mean**2, 0.0))
+            drawn.append((role, centres + side * shift, mean / MM_PER_UM, spread / MM_PER_UM))
+        limits = limits_of(*(mean + side * spread for _, _, mean, spread in drawn for side in (-1, 1)), zero=True)
+        plot = Plot(limits_of(centres, margin=0.05 if not few else 0.1), limits, x_label=label, y_label="µm")
+        plot.across(0.0)
+        for role, at, mean, spread in drawn:
+            plot.spread(at, mean - spread, mean + spread, role)
+            plot.dots(at, mean, role)
+        key = f"where-{number}"
+        pictures.append(Picture(key, f"Over {label}", svg(key, f"Residuals over {label}, before and after", [plot])))
+    return pictures
 
 
-def _volume(found: Diagnosis) -> str:
-    """Residuals over the volume, seen from three sides: left before, right after."""
-    from matplotlib import pyplot
-
+def volume_pictures(found: Diagnosis) -> list[Picture]:
+    """Return the residuals over the volume, seen from three sides, before and after, on one scale of colours."""
     position = found.analysis.fit.readings.position_mm
-    rows = _some(len(position))
-    figure, axes = pyplot.subplots(2, 3, figsize=(10, 5.2))
-    figure.subplots_adjust(left=0.07, right=0.93, top=0.94, bottom=0.1, hspace=0.4, wspace=0.3)
+    rows = np.arange(len(position))
+    if len(position) > MOST_DOTS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, MOST_DOTS, replace=False))
     largest = float(np.quantile(np.abs(found.gap.residual_before_mm), 0.99)) / MM_PER_UM or 1.0
-    shown: Any = None
-    for row, (title, residual) in enumerate(
-        (("before", found.gap.residual_before_mm), ("after", found.gap.residual_after_mm))
-    ):
-        for column, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
-            panel = axes[row, column]
-            shown = panel.scatter(
-                position[rows, a], position[rows, b], c=residual[rows] / MM_PER_UM, s=6, cmap="coolwarm",
-                vmin=-largest, vmax=largest, rasterized=True,
-            )  # fmt: skip
-            panel.set_xlabel(f"{'XYZ'[a]} in mm")
-            panel.set_ylabel(f"{'XYZ'[b]} in mm")
-            panel.set_title(title)
-    figure.colorbar(shown, ax=axes, label="residual in um", shrink=0.8, pad=0.02)
-    return _text_of(figure)
+    pictures = []
+    for when, residual_mm in (("before", found.gap.residual_before_mm), ("after", found.gap.residual_after_mm)):
+        for a, b in ((0, 1), (0, 2), (1, 2)):
+            x, y = position[rows, a], position[rows, b]
+            limits = limits_of(x, margin=0.03), limits_of(y, margin=0.03)
+            plot = Plot(
+                *limits, (BOX[0], BOX[1], 200.0, BOX[3]), x_label=f"{'XYZ'[a]} (mm)", y_label=f"{'XYZ'[b]} (mm)"
+            )
+            shares = 0.5 + 0.5 * residual_mm[rows] / MM_PER_UM / largest
+            plot.coloured_dots(x, y, shares, DIVERGING)
+            bar = colour_bar(210.0, BOX[1], BOX[3], (-largest, largest), "µm", DIVERGING)
+            key = f"volume-{when}-{a}{b}"
+            drawn = svg(key, f"Residuals {when}, in {'XYZ'[a]} and {'XYZ'[b]}", [plot], more=bar)
+            pictures.append(Picture(key, when.capitalize(), drawn))
+    return pictures
 
 
-def _some(count: int) -> IntArray:
-    if count <= MOST_DOTS:
-        return np.arange(count)
-    return np.sort(np.random.default_rng(0).choice(count, MOST_DOTS, replace=False))
+def suspects_picture(ranked: Sequence[tuple[str, float, float]], chosen: Container[str]) -> Picture:
+    """Return what each suspect would explain by itself, as bars of its logarithm; those of the verdict in a colour."""
+    size = np.log10([max(chi2, 0.5) for _, chi2, _ in ranked])
+    ends = float(np.floor(size.min(initial=0.0))), float(np.ceil(size.max(initial=1.0)))
+    height, count = 14.0 * len(ranked), len(ranked)
+    marks = [(float(k), f"{10.0**k:g}") for k in range(int(ends[0]), int(ends[1]) + 1)]
+    names = [(float(count - k), name) for k, (name, _, _) in enumerate(ranked)]
+    plot = Plot(
+        ends, (0.5, count + 0.5), (150.0, 8.0, 600.0, 8.0 + height),
+        x_label="chi-square that it explains by itself", x_ticks=marks, y_ticks=names,
+    )  # fmt: skip
+    for (at, name), length in zip(names, size.tolist(), strict=True):
+        plot.bars(ends[0], length, at - 0.4, at + 0.4, "after" if name in chosen else "muted")
+    drawn = svg("suspects", "Suspects by what each explains by itself", [plot], (620.0, height + 36.0))
+    return Picture("suspects", "Suspects", drawn)
 
 
 def suspects_of(found: Diagnosis) -> list[tuple[str, float, float]]:
@@ -194,51 +169,27 @@ def suspects_of(found: Diagnosis) -> list[tuple[str, float, float]]:
     return [(name, chi2, share) for name, (chi2, share) in ranked]
 
 
-def _suspects_picture(found: Diagnosis) -> str:
-    """Ranked suspects: what each would explain by itself; those of the verdict in another colour."""
-    from matplotlib import pyplot
-
-    ranked = suspects_of(found)
-    chosen = {item.name for item in found.verdict.named}
-    figure, axes = pyplot.subplots(figsize=(7, 0.35 * len(ranked) + 1.0))
-    figure.subplots_adjust(left=0.28, right=0.97, top=0.97, bottom=0.15)
-    names: Sequence[str] = [name for name, _, _ in ranked]
-    colours = [AFTER if name in chosen else "#bbbbbb" for name in names]
-    axes.barh(range(len(ranked)), [max(chi2, 0.5) for _, chi2, _ in ranked], color=colours)
-    axes.set_yticks(range(len(ranked)), names)
-    axes.invert_yaxis()
-    axes.set_xscale("log")
-    axes.set_xlabel("chi-square that it explains by itself")
-    return _text_of(figure)
-
-
 # The page of a diagnosis: one self-contained HTML file with its pictures.
-
-
-PAGE_STYLE = (
-    "body{font:15px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}"
-    "table{border-collapse:collapse}td,th{padding:.2rem .8rem;text-align:left;border-bottom:1px solid #ddd}"
-    "svg{max-width:100%;height:auto}.grade{color:#666}"
-)
 
 
 def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
     """Return the text of ``index.html``; ``data`` is the content of ``diagnosis.json``."""
-    pictures = pictures_of(found)
     title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
+    ranked = suspects_of(found)
     rows = "".join(
         f"<tr><td>{escape(name)}</td><td>{chi2:.1f}</td><td>{100 * share:.1f} %</td></tr>"
-        for name, chi2, share in suspects_of(found)
+        for name, chi2, share in ranked
     )
+    legend = '<span class="key before"></span> before <span class="key after"></span> after'
     parts = [
         _effects(data),
         _gap(data),
-        "<h2>Where model and measurement disagree</h2><p>Mean and scatter of the residuals: red before, blue after.</p>",
-        pictures["where"],
+        f'<h2>Where model and measurement disagree</h2><p class="legend">Mean and scatter of the residuals: {legend}</p>',
+        picture_grid(residual_pictures(found)),
         "<h2>Over the volume</h2>",
-        pictures["volume"],
+        picture_grid(volume_pictures(found)),
         "<h2>Suspects</h2>",
-        pictures["suspects"],
+        picture_grid([suspects_picture(ranked, {item.name for item in found.verdict.named})], "wide") if ranked else "",
         f"<table><tr><th>suspect</th><th>chi-square by itself</th><th>visible</th></tr>{rows}</table>",
     ]
     return _page(title, parts, data)
@@ -248,12 +199,13 @@ def axis_page(found: AxisDiagnosis, data: dict[str, Any]) -> str:
     """Return the text of ``index.html`` of axis runs."""
     title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
     parts = [_effects(data), _figures(data), _gap(data)]
-    for letter, text in axis_pictures(found).items():
+    for part in found.axes:
         parts += [
-            f"<h2>Axis {escape(letter)}</h2><p>Left: deviation less the mean of its target and direction, in the order of "
-            "time; red as measured, blue without what was taken off, hollow: left out. Right: all runs over the targets, "
-            "upwards (triangles up) and downwards, as measured and without.</p>",
-            text,
+            f"<h2>Axis {escape(part.session.letter)}</h2><p>Scatter: deviation less the mean of its target and direction, in "
+            'the order of time; <span class="key before"></span> as measured, <span class="key after"></span> without what was '
+            "taken off, open points: left out. Then all runs over the targets, upwards (round points) and downwards (square), "
+            "as measured and without.</p>",
+            picture_grid(axis_pictures(part)),
         ]
     return _page(title, parts, data)
 
@@ -267,8 +219,14 @@ def _page(title: str, parts: list[str], data: dict[str, Any]) -> str:
         _list("What this measurement cannot show", data["invisible"]),
         _list("Notes", [*data["reasons"], *data["notes"]]),
     ]
-    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{PAGE_STYLE}</style>'
-    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(parts) + "\n</body></html>\n"
+    style, script, policy = page_assets("charts.js")
+    head = f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">'
+    head += '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    head += f"<title>{escape(title)}</title><style>{style}</style>"
+    body = "\n".join(parts)
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n{body}\n<script>{script}</script></body></html>\n'
+    )
 
 
 def _effects(data: dict[str, Any]) -> str:
@@ -279,7 +237,7 @@ def _effects(data: dict[str, Any]) -> str:
             for name, entry in item["parameters"].items()
         )
         others = ", ".join(f"{o['name']} {o['weight']:.2f}" for o in item["alias_set"] if o["name"] != item["name"])
-        text = f"<b>{escape(item['name'])}</b> <span class=grade>{escape(item['grade'].replace('_', ' '))}</span> "
+        text = f"<b>{escape(item['name'])}</b> <span class=note>{escape(item['grade'].replace('_', ' '))}</span> "
         text += escape(values) + (f"; cannot be told from {escape(others)}" if others else "")
         text += escape("".join(f"; {reason}" for reason in item.get("reasons", [])))
         if item.get("text"):

@@ -9,7 +9,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from compgen.data.charts import DASHED, DOTTED, LABEL, Picture, Plot, limits_of, svg
+from compgen.data.charts import DASHED, DOTTED, LABEL, Picture, Plot, limits_of, page_assets, svg
 from compgen.data.files import OutputFolder
 from compgen.data.messages import number_text
 from compgen.data.names import COVERAGE, error_named
@@ -28,11 +28,9 @@ def history_page(drift: Drift) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number_text, "probability": probability, "moment": moment_of, "zip": zip}
-    assert environment.loader is not None
-    style = environment.loader.get_source(environment, "style.css")[0]
-    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+    style, _, policy = page_assets()
     return environment.get_template("history.html.j2").render(
-        drift=drift.summary(), pictures=draw_history(drift), style=Markup(style), policy=policy
+        drift=drift.summary(), pictures=draw_history(drift), style=style, policy=policy
     )
 
 

@@ -226,6 +226,5 @@ def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, re
     columns["used"] = result.accepted.astype(np.float64)
     digits = {"x_mm": 3, "y_mm": 3, "z_mm": 3, "residual_um": 4, "used": 0}
     described = measurement.other if isinstance(measurement, MixedMeasurement) else measurement
-    comments = getattr(described, "readings", described).metadata  # six-DOF readings are kept with their instrument
-    stated = {key: comments[key] for key in MEASURED_WITH if comments.get(key)}
+    stated = {key: described.metadata[key] for key in MEASURED_WITH if described.metadata.get(key)}
     return format_csv(columns, {"machine": machine.name, "method": result.method, **stated}, digits)

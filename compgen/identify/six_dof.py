@@ -162,6 +162,11 @@ class SixDofMeasurement:
         """Return the number of rows."""
         return len(self.readings)
 
+    @property
+    def metadata(self) -> Mapping[str, str]:
+        """Comments ``key = value`` of the file."""
+        return self.readings.metadata
+
 
 def identify_sixdof(machine: Machine, measurement: SixDofMeasurement) -> Identification:
     """Identify the errors of every measured axis, and squareness where both axes were measured.

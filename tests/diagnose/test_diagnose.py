@@ -293,10 +293,8 @@ def test_the_command_writes_its_files_and_the_extended_machine_takes_the_effect_
     assert data["effects"][0]["name"] == "backlash_Y"
     assert json.loads((tmp_path / "out/diagnosis.json").read_text())["verdict"] == "named"
     page = (tmp_path / "out/index.html").read_text()
-    assert page.count("<svg") == 3
-    assert "http" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
-        "http://creativecommons.org", ""
-    )
+    assert all(f'id="figure-{name}"' in page for name in ("where-0", "volume-before-01", "volume-after-12", "suspects"))
+    assert "http" not in page.replace("http://www.w3.org", "").replace("http-equiv", "")
     extended = read_machine(tmp_path / "out/extended.toml")
     assert list(extended.effects) == ["backlash_Y"]
     again = diagnose(extended, session(13, displaced=backlash)).to_dict()

@@ -383,7 +383,7 @@ def test_the_page_holds_figures_pictures_and_what_to_do(gantry, tmp_path):
     path.write_text(format_axis_runs(session(21, effect=warmup)))
     assert run_command(cli, ["diagnose", "zha-gantry", str(path), "--out", str(tmp_path / "out")]) == 0
     page = (tmp_path / "out/index.html").read_text()
-    assert page.count("<svg") == 1
+    assert page.count('<svg class="plot"') == 3  # over time, and all runs with and without
     assert "What to do:" in page
     assert "<td>R</td>" in page
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +14,7 @@ from markupsafe import Markup
 from rich.console import Group
 from rich.text import Text
 
-from compgen.data.charts import LABEL, Picture
+from compgen.data.charts import LABEL, Picture, page_assets
 from compgen.data.files import OutputFolder, json_text, json_values
 from compgen.data.messages import number_text, one_line
 from compgen.data.names import COVERAGE
@@ -60,10 +58,8 @@ def render_page(
     seconds : how long the drawing took; None leaves it out.
     """
     environment = _environment()
-    script = _file(environment, "charts.js") + _file(environment, "script.js")
+    style, script, policy = page_assets("charts.js", "script.js")
     drawn = [picture for group in pictures.values() for picture in group]
-    policy = f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{_hash(script)}'"
-    policy += "; base-uri 'none'; form-action 'none'"
     return environment.get_template("page.html.j2").render(
         data=data,
         controls=list(zip(data["controls"], source.controls, strict=True)),
@@ -72,8 +68,8 @@ def render_page(
         has_named=any(item["series"][-1]["name"].startswith("table ") for item in (p.data for p in pictures["curves"])),
         figures=FIGURES,
         policy=policy,
-        style=Markup(_file(environment, "style.css")),
-        script=Markup(script),
+        style=style,
+        script=script,
         payload=script_data({picture.key: dict(picture.data) for picture in drawn if picture.data}),
         seconds=seconds,
     )
@@ -96,15 +92,6 @@ def _environment() -> Environment:
         "thousands": thousands,
     }
     return environment
-
-
-def _file(environment: Environment, name: str) -> str:
-    assert environment.loader is not None
-    return environment.loader.get_source(environment, name)[0]
-
-
-def _hash(script: str) -> str:
-    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 def script_data(value: Any) -> Markup:
