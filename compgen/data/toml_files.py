@@ -27,13 +27,23 @@ _REQUIRED = object()
 
 
 @dataclass(frozen=True)
-class RequestedKey:
-    """A key that a reader asked for: its name with those of sub-sections, its default unless required, its check."""
+class DeclaredKey:
+    """A key of a section as it is declared: with the names of sub-sections, its default unless required, its check."""
 
     key: str
     required: bool
     default: Any
     check: Callable[[Any], Any]
+
+    @property
+    def shown(self) -> Any:
+        """The default if a file could have it; a reader may take others, in a form of its own: None."""
+        value = list(self.default) if isinstance(self.default, tuple) else self.default
+        try:
+            self.check(value)
+        except (ValueError, TypeError):
+            return None
+        return value
 
     @property
     def allowed(self) -> str:
@@ -54,19 +64,6 @@ class Section:
         self.data, self.path, self.text, self.name = dict(data), path, text, name
         self._nth = 0  # which of the tables of that name, for an array of tables
         self._known: set[str] = set()
-        self._asked: dict[str, RequestedKey | Section] = {}
-
-    @property
-    def asked(self) -> list[RequestedKey]:
-        """What was taken so far, in its order, also in sub-sections (``axis_names.X``)."""
-        found: list[RequestedKey] = []
-        for key, item in self._asked.items():
-            if isinstance(item, RequestedKey):
-                found.append(item)
-            else:  # a sub-section; one without a key so far stands for itself
-                inner = [replace(one, key=f"{key}.{one.key}") for one in item.asked]
-                found += inner or [RequestedKey(key, False, None, table)]
-        return found
 
     def fail(self, key: str, message: str) -> InputError:
         """Return the error that points at ``key`` of this section."""
@@ -84,7 +81,6 @@ class Section:
     def take(self, key: str, check: Callable[[Any], T], default: D) -> T | D: ...
     def take(self, key: str, check: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
         """Return the checked value of ``key``; ``check`` raises ValueError with what is expected."""
-        self._asked[key] = RequestedKey(key, default is _REQUIRED, None if default is _REQUIRED else default, check)
         if key not in self:
             if default is _REQUIRED:
                 raise self.fail(key, f"is missing{self._misspelt(key)}")
@@ -106,9 +102,7 @@ class Section:
         """Return the sub-section ``key`` (an empty one if it is absent and not required)."""
         full = f"{self.name}.{key}" if self.name else key
         value = self.take(key, table) if required else self.take(key, table, {})
-        inner = Section(value, path=self.path, text=self.text, name=full)
-        self._asked[key] = inner
-        return inner
+        return Section(value, path=self.path, text=self.text, name=full)
 
     def sections(self, key: str) -> list[Section]:
         """Return the sub-sections of an array of tables (``[[key]]``), empty if absent."""
@@ -267,7 +261,7 @@ def take_axes(section: Section, item: Field[Any]) -> tuple[Any, Any, Any]:
     return x, y, z
 
 
-def declared_settings(kind: type) -> list[tuple[RequestedKey, str]]:
+def declared_settings(kind: type) -> list[tuple[DeclaredKey, str]]:
     """Return the keys that a dataclass declares, as a file has them, each with its meaning, in the order of the fields."""
     found = []
     for item in fields(kind) if is_dataclass(kind) else ():
@@ -280,7 +274,7 @@ def declared_settings(kind: type) -> list[tuple[RequestedKey, str]]:
             parts = [(f"{key}.{letter}", False, default) for letter, default in zip(AXES, data["axes"], strict=True)]
         else:
             parts = [(key, data["required"], None if data["required"] else data["stated"])] if "check" in data else []
-        found += [(RequestedKey(*part, data["check"]), data["meaning"]) for part in parts]
+        found += [(DeclaredKey(*part, data["check"]), data["meaning"]) for part in parts]
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +13,12 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from compgen.controls import AnyController, controller_named
+from compgen.controls import controller_named
 from compgen.data import toml_files
-from compgen.data.machine import Machine, load_machine
 from compgen.effects import Card, Effect
-from compgen.errors import InputError
 from compgen.tables.render import Format, load_format
 
 # The card of a control: what it can express, its settings, limits and sources, and what no document settles.
-
-
-#: A shipped machine with settings for every control; its travel is used where a default depends on one.
-EXAMPLE_MACHINE = "zha-gantry"
 
 
 @dataclass(frozen=True)
@@ -44,13 +38,12 @@ class ControlSetting:
 
 @dataclass(frozen=True)
 class ControlCard:
-    """Everything that ``volcomp controllers NAME`` says; ``problem`` is why not all settings could be found."""
+    """Everything that ``volcomp controllers NAME`` says."""
 
     format: Format
     settings: tuple[ControlSetting, ...]
     anchored: bool
     bidirectional: bool
-    problem: str = ""
 
     def summary(self) -> dict[str, Any]:
         """Return the object that ``--json`` prints."""
@@ -71,59 +64,17 @@ class ControlCard:
         }
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Watching(Machine):
-    """A machine that hands out one section for the settings of ``controller``, so that what is taken can be seen."""
-
-    controller: str
-    section: toml_files.Section
-
-    def controller_settings(self, name: str) -> toml_files.Section:
-        return self.section if name == self.controller else super().controller_settings(name)
-
-
 def control_card(name: str, templates: Path | None = None) -> ControlCard:
-    """Return the card of control ``name``; its settings are those that its reader asks for."""
+    """Return the card of control ``name``; its settings are those that its ``settings_class`` declares.
+
+    A plug-in that reads its section key by key says in ``[settings]`` of its ``format.toml`` what its keys mean.
+    """
     control, card = controller_named(name), load_format(name, templates)
     declared = toml_files.declared_settings(getattr(control, "settings_class", object))
-    meanings = {**{key.key: meaning for key, meaning in declared}, **card.settings}
-    asked, problem = asked_settings(control, card.example_settings)
-    settings = tuple(
-        ControlSetting(
-            item.key,
-            item.required,
-            _default(item),
-            item.allowed,
-            meanings.get(item.key, meanings.get(item.key.partition(".")[0], "")),
-        )
-        for item in asked
-    )
-    return ControlCard(card, settings, control.anchored, control.bidirectional, problem)
-
-
-def _default(item: toml_files.RequestedKey) -> Any:
-    """The default if a machine file could hold it; a reader may take others, in a form of its own."""
-    value = list(item.default) if isinstance(item.default, tuple) else item.default
-    try:
-        item.check(value)
-    except (ValueError, TypeError):
-        return None
-    return value
-
-
-def asked_settings(
-    control: type[AnyController], example: Mapping[str, Any]
-) -> tuple[list[toml_files.RequestedKey], str]:
-    """Return every key that the control asks for on the example machine, and what it complains about."""
-    machine = load_machine(EXAMPLE_MACHINE)
-    data = {**machine.controller_settings(control.name).data, **example}
-    section = toml_files.Section(data, path=None, name=f"controllers.{control.name}")
-    own = {item.name: getattr(machine, item.name) for item in fields(Machine)}
-    try:
-        control.read_settings(_Watching(**own, controller=control.name, section=section))
-    except InputError as error:
-        return section.asked, str(error)
-    return section.asked, ""
+    settings = [ControlSetting(key.key, key.required, key.shown, key.allowed, meaning) for key, meaning in declared]
+    known = {item.key.partition(".")[0] for item in settings}
+    settings += [ControlSetting(key, False, None, "", text) for key, text in card.settings.items() if key not in known]
+    return ControlCard(card, tuple(settings), control.anchored, control.bidirectional)
 
 
 # The card of a control for the terminal.
@@ -142,7 +93,6 @@ def card_text(card: ControlCard, origin: str | None) -> RenderableType:
         *_list("Properties", [f"constant offset: {offset}", f"tables of one direction of travel: {direction}"]),
         *_list("Files", [spec.name for spec in about.files]),
         *_settings(about.name, card.settings),
-        *([Text(f"  not all settings could be found: {card.problem}", style="yellow")] if card.problem else []),
         *_list("Limits", about.limits),
         *_list(f"Format {about.evidence}; what no public document settles", about.unverified),
         *_list("Sources", about.sources),

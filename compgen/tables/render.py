@@ -77,8 +77,7 @@ class Format:
     """The card of a control's format as ``templates/<name>/format.toml`` has it.
 
     ``evidence`` is ``"documented"`` or ``"unverified"``; ``unverified`` lists what no public document settles.
-    ``settings`` says what each key of ``[controllers.<name>]`` means; ``example_settings`` are some that the control
-    takes, where keys have no default.
+    ``settings`` says what the keys of ``[controllers.<name>]`` mean that the control does not declare.
     """
 
     name: str
@@ -91,7 +90,6 @@ class Format:
     unverified: tuple[str, ...]
     sources: tuple[str, ...]
     settings: Mapping[str, str] = field(default_factory=dict)
-    example_settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _texts(value: Any) -> tuple[str, ...]:
@@ -188,7 +186,6 @@ def _read_format(path: Path, name: str) -> Format:
         unverified=root.take("unverified", _texts, ()),
         sources=root.take("sources", _texts),
         settings=_meanings(root.section("settings", required=False)),
-        example_settings=root.take("example_settings", toml_files.table, {}),
     )
     root.finish()
     if not files or len({spec.name.lower() for spec in files}) != len(files):
