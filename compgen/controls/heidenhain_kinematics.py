@@ -36,12 +36,6 @@ MOST_COMPTAB = 100
 MARGIN_MM = Decimal(10)
 
 
-def _prefix(value: Any) -> str:
-    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9_]{1,12}", value, re.ASCII):
-        raise ValueError("a name of letters and digits is expected")
-    return value
-
-
 @dataclass(frozen=True, kw_only=True)
 class DraftSettings:
     """Settings ``[controllers.heidenhain-kinematics]``; rotations are named A, B, C on the control."""
@@ -54,7 +48,7 @@ class DraftSettings:
     )
     axis_names: tuple[str, str, str] = axis_setting(name_on_control, AXES, meaning="names of X, Y, Z on the control")
     prefixes: tuple[str, str, str] = axis_setting(
-        _prefix,
+        name_on_control,
         AXES,
         key="comptab_prefix",
         differ="{}: expected three different names",
@@ -129,12 +123,6 @@ def _once(table: TextTable, row: Row, name: str, known: Mapping[str, Decimal]) -
     if name in known:
         raise table.file.fail(f"{name} is given a second time", row.line)
     return table.number(row, "COMPTAB")
-
-
-def _check_inverse(table: TextTable, row: Row, constant: Decimal | None) -> None:
-    if constant is None or table.number(row, "COMPTAB") != -constant:
-        due = "no such constant stands before" if constant is None else f"expected {-constant}"
-        raise table.file.fail(f"takes {row.cells['DOC'][1:][:10]} back behind its axis: {due}", row.line)
 
 
 def _positions(table: TextTable) -> tuple[Decimal, ...]:
@@ -252,7 +240,10 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
             if row.cells.get("KEY") == "MachAxis":
                 continue
             if name.startswith("-"):
-                _check_inverse(chains[0], row, constants.get(name[1:]))
+                constant = constants.get(name[1:])
+                if constant is None or chains[0].number(row, "COMPTAB") != -constant:
+                    due = "there is no such constant before it" if constant is None else f"expected {-constant}"
+                    raise chains[0].file.fail(f"takes {name[1:][:10]} back behind its axis: {due}", row.line)
                 continue
             if name in SQUARENESS_NAMES:
                 constants[name] = _once(chains[0], row, name, constants)

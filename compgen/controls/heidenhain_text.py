@@ -92,7 +92,12 @@ def read_table(file: SourceFile) -> TextTable:
         raise file.fail("the table is in inches; only tables in mm are read", 1)
     if unit != "MM":
         raise file.fail("the first line has no unit; expected MM after the name", 1)
-    header = _header_index(file, lines)
+    begins = [(line.split(maxsplit=1) or [""])[0] for line in lines[:MOST_BEFORE_HEADER]]
+    before_end = begins[1 : begins.index(END, 1) if END in begins[1:] else None]
+    if NUMBER_COLUMN not in before_end:
+        message = f"no header row of column names that begins with {NUMBER_COLUMN}"
+        raise file.fail(message, min(len(lines), 2))
+    header = 1 + before_end.index(NUMBER_COLUMN)
     columns = _columns(file, lines[header], header + 1)
     rows: list[Row] = []
     for number, line in enumerate(lines[header + 1 :], start=header + 2):
@@ -106,16 +111,6 @@ def read_table(file: SourceFile) -> TextTable:
         if text and not text.startswith(";"):
             rows.append(_row(file, columns, line, number, len(rows)))
     raise file.fail(f"the last line {END} is missing: the file is truncated", len(lines))
-
-
-def _header_index(file: SourceFile, lines: Sequence[str]) -> int:
-    for index in range(1, min(len(lines), MOST_BEFORE_HEADER)):
-        words = lines[index].split(maxsplit=1)
-        if words and words[0] == NUMBER_COLUMN:
-            return index
-        if words and words[0] == END:
-            break
-    raise file.fail(f"no header row of column names that begins with {NUMBER_COLUMN}", min(len(lines), 2))
 
 
 def _columns(file: SourceFile, header: str, line: int) -> tuple[TableColumn, ...]:
@@ -140,7 +135,14 @@ def _row(file: SourceFile, columns: Sequence[TableColumn], line: str, number: in
     if len(found) == len(columns):
         cells = {column.name: match.group() for column, match in zip(columns, found, strict=True)}
     else:
-        cells = _by_field(file, columns, found, number)
+        cells = {}
+        for match in found:
+            column = next((item for item in reversed(columns) if item.start <= match.start()), columns[0])
+            if column.name in cells or (column.width and match.end() > column.start + column.width):
+                what = one_line(match.group())[:40]
+                message = f"{what!r} is not within the field of one column (columns start as in the header)"
+                raise file.fail(message, number)
+            cells[column.name] = match.group()
     counted = cells.get(NUMBER_COLUMN, "")
     if not re.fullmatch(r"\d{1,6}", counted, re.ASCII) or int(counted) != due:
         message = (
@@ -148,21 +150,6 @@ def _row(file: SourceFile, columns: Sequence[TableColumn], line: str, number: in
         )
         raise file.fail(message, number)
     return Row(cells, number)
-
-
-def _by_field(
-    file: SourceFile, columns: Sequence[TableColumn], found: Sequence[re.Match[str]], number: int
-) -> dict[str, str]:
-    cells: dict[str, str] = {}
-    for match in found:
-        column = next((item for item in reversed(columns) if item.start <= match.start()), columns[0])
-        if column.name in cells or (column.width and match.end() > column.start + column.width):
-            what = one_line(match.group())[:40]
-            raise file.fail(
-                f"{what!r} does not stand in the field of one column (columns start as in the header)", number
-            )
-        cells[column.name] = match.group()
-    return cells
 
 
 # --- writing: layouts of our own, and those of a table saved on a control ----------------------------------------------

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from compgen.controls.shared.base import (
     Controller,
@@ -137,7 +136,9 @@ class CompTable:
     def at(self, position_mm: FloatArray, direction: int) -> FloatArray:
         """Return the correction at joint positions (m,) in the direction +1 or -1, bit for bit as the control."""
         trims = (self.forward if direction > 0 else self.reverse).astype(np.float32)
-        slopes = _slopes(self.nominal, trims)
+        # slopes behind each row: float32 of the float32 differences; zero behind the last
+        differences = (trims[1:] - trims[:-1]).astype(np.float64)
+        slopes = np.append((differences / np.diff(self.nominal)).astype(np.float32), np.float32(0.0))
         position = np.asarray(position_mm, dtype=np.float64) / self.mm_per_unit
         row = np.searchsorted(self.nominal, position, side="right") - 1
         inside = np.clip(row, 0, len(trims) - 1)
@@ -148,12 +149,6 @@ class CompTable:
     def step_mm(self) -> FloatArray:
         """Size of the step between forward and reverse at each row, shape (n,), mm."""
         return np.abs(self.forward_mm - self.reverse_mm)
-
-
-def _slopes(nominal: FloatArray, trims: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Slopes behind each row, float32 of the float32 differences; zero behind the last."""
-    differences = (trims[1:] - trims[:-1]).astype(np.float64)
-    return np.append((differences / np.diff(nominal)).astype(np.float32), np.float32(0.0))
 
 
 def standstill_outcome(step_mm: float, acceleration_mm_s2: float, period_s: float) -> str:
@@ -274,7 +269,8 @@ def parameters(
     for axis, table in sorted(tables.items()):
         section = f"[JOINT_{axis}]"
         rows.append({"name": f"{section} COMP_FILE", "value": files[axis], "meaning": f"the file of {AXES[axis]}"})
-        rows.append({"name": f"{section} COMP_FILE_TYPE", "value": str(file_type), "meaning": _type_meaning(file_type)})
+        columns = "forward trim, reverse trim" if file_type == 1 else "actual forward, actual reverse"
+        rows.append({"name": f"{section} COMP_FILE_TYPE", "value": str(file_type), "meaning": f"nominal, {columns}"})
         rows.append(
             {
                 "name": f"{section} BACKLASH",
@@ -284,10 +280,10 @@ def parameters(
         )
         steps = table.step_mm[table.step_mm > _NO_STEP_MM]
         if len(steps):
-            low, high = (
-                value / table.mm_per_unit
-                for value in _lost_between(float(steps.min()), float(steps.max()), servo_period_us)
-            )
+            # accelerations between which some of the steps are in the dead zone
+            square = (servo_period_us * _SECONDS_PER_US) ** 2
+            low = float(steps.min()) / (RAMPED * square) / table.mm_per_unit
+            high = float(steps.max()) / (AT_ONCE * square) / table.mm_per_unit
             rows.append(
                 {
                     "name": f"{section} MAX_ACCELERATION",
@@ -297,18 +293,6 @@ def parameters(
                 }
             )
     return rows
-
-
-def _type_meaning(file_type: int) -> str:
-    if file_type == 1:
-        return "nominal, forward trim, reverse trim"
-    return "nominal, actual forward, actual reverse"
-
-
-def _lost_between(least_mm: float, largest_mm: float, servo_period_us: float) -> tuple[float, float]:
-    """Accelerations between which some of the steps lie in the dead zone, mm/s^2."""
-    square = (servo_period_us * _SECONDS_PER_US) ** 2
-    return least_mm / (RAMPED * square), largest_mm / (AT_ONCE * square)
 
 
 def dead_zone_warnings(

@@ -615,14 +615,30 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> VolTable:
         """Return curves and terms, or the grid made of them, rounded as they are written."""
         ordered = sorted(basis, key=lambda term: ERROR_INDEX[term.name])
-        curves = tuple(self._curve_of_term(term, values[term.name]) for term in ordered)
+        curves = []
+        for term in ordered:
+            axis, nodes, found = term.axis, term.nodes_mm, np.asarray(values[term.name])
+            if axis is None:  # a squareness is a constant: two equal nodes at the ends of the travel of its axis
+                axis = AXES.index(term.name[-1])
+                nodes, found = np.array(self.machine.axes[axis].range_mm), np.repeat(found[0], 2)
+            curves.append(VolCurve(term.name, axis, float(nodes[0]), float(nodes[1] - nodes[0]), found))
         terms = tuple(
             VolTerm(part.output, term.name, float(-part.sign), LEVERS[0 if part.lever is None else part.lever + 1])
             for term in ordered
             for part in term.carrier
         )
-        table = as_written(VolTable(curves, terms, unit=self.settings.machine_units))
-        return table if self.settings.form == "curves" else as_written(self._as_grid(table))
+        table = as_written(VolTable(tuple(curves), terms, unit=self.settings.machine_units))
+        if self.settings.form == "curves":
+            return table
+        # the errors of the curves at the vertices of the grid of their nodes, with the tool offset of the machine file
+        lines = []
+        for axis in range(3):
+            moving = [curve for curve in table.curves if curve.axis == axis and not re.match("E[ABC]0", curve.name)]
+            lines.append(moving[0].nodes_mm if moving else np.array(self.machine.axes[axis].range_mm))
+        vertices = np.array(list(product(*lines)))
+        errors = table.error(vertices, tool_of(self.machine, None)).reshape(*(len(line) for line in lines), 3)
+        x, y, z = ((float(line[0]), float(line[1] - line[0])) for line in lines)
+        return as_written(VolTable((), (), VolGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), errors), table.unit))
 
     def context(self, tables: VolTable) -> dict[str, Any]:
         """Return curves, terms or grid as they are written, the checksum, and what INI and HAL need."""
@@ -743,27 +759,6 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         if table.grid is not None:
             found.append("a grid is made for one tool offset: with another tool, use form = 'curves'")
         return found
-
-    def _curve_of_term(self, term: Term, values: FloatArray) -> VolCurve:
-        """Return a curve; a squareness is a constant, written as two equal nodes at the ends of the travel of its axis."""
-        if term.axis is None:
-            axis = AXES.index(term.name[-1])
-            low, high = self.machine.axes[axis].range_mm
-            return VolCurve(term.name, axis, low, high - low, np.repeat(values[0], 2))
-        nodes = term.nodes_mm
-        return VolCurve(term.name, term.axis, float(nodes[0]), float(nodes[1] - nodes[0]), np.asarray(values))
-
-    def _as_grid(self, table: VolTable) -> VolTable:
-        """Return the errors of curves at the vertices of the grid of their nodes, with the machine's own tool offset."""
-        lines = []
-        for axis in range(3):
-            moving = [curve for curve in table.curves if curve.axis == axis and not re.match("E[ABC]0", curve.name)]
-            low, high = self.machine.axes[axis].range_mm
-            lines.append(moving[0].nodes_mm if moving else np.array([low, high]))
-        vertices = np.array(list(product(*lines)))
-        values = table.error(vertices, tool_of(self.machine, None)).reshape(*(len(line) for line in lines), 3)
-        x, y, z = ((float(line[0]), float(line[1] - line[0])) for line in lines)
-        return VolTable((), (), VolGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), values), table.unit)
 
 
 def _grid_lines(grid: VolGrid) -> list[FloatArray]:

@@ -132,10 +132,6 @@ def _read(source: SourceFile) -> FieldGrid | ErrorTable:
     header = next((line for line in text.split("\n") if line.strip() and not line.lstrip().startswith("#")), "")
     if "error" in [name.strip() for name in header[:1000].split(",")]:
         return errors_of_table(csv_table(source.path, text, ERROR_COLUMNS, ("u_value",)))
-    return _field_csv(source)
-
-
-def _field_csv(source: SourceFile) -> FieldGrid:
     table = csv_table(source.path, source.text, (*POSITION_COLUMNS, *VALUE_COLUMNS))
     places = [table.numbers(name) for name in POSITION_COLUMNS]
     values = np.column_stack([table.numbers(name) for name in VALUE_COLUMNS])
@@ -164,7 +160,15 @@ def _read_json(source: SourceFile) -> FieldGrid | ErrorTable:
         raise source.fail(f"is not usable JSON: {one_line(error)[:200]}", 1) from None
     if not isinstance(data, dict) or data.get("schema") not in (FIELD_SCHEMA, CURVE_SCHEMA) or data.get("version") != 1:
         raise source.fail(f'"schema" must be "{FIELD_SCHEMA}" or "{CURVE_SCHEMA}", and "version" 1', 1)
-    return _field_json(source, data) if data["schema"] == FIELD_SCHEMA else _curves_json(source, data)
+    if data["schema"] == CURVE_SCHEMA:
+        return _curves_json(source, data)
+    lines = _object(source, data, "nodes_mm", "nodes_mm")
+    x, y, z = (_ascending(source, lines.get(letter), f"nodes_mm.{letter}") for letter in ("x", "y", "z"))
+    values = _array(source, data.get("correction_um"), "correction_um", columns=3)
+    if len(values) != len(x) * len(y) * len(z):
+        due = f"expected {len(x)} x {len(y)} x {len(z)} vertices"
+        raise _fail(source, "correction_um", f"has {len(values)} entries; {due}")
+    return FieldGrid((x, y, z), values.reshape(len(x), len(y), len(z), 3))
 
 
 def _fail(source: SourceFile, key: str, message: str) -> InputError:
@@ -204,16 +208,6 @@ def _object(source: SourceFile, data: Mapping[str, Any], key: str, path: str) ->
     if not isinstance(value, dict):
         raise _fail(source, path, "is missing or no object")
     return value
-
-
-def _field_json(source: SourceFile, data: Mapping[str, Any]) -> FieldGrid:
-    lines = _object(source, data, "nodes_mm", "nodes_mm")
-    x, y, z = (_ascending(source, lines.get(letter), f"nodes_mm.{letter}") for letter in ("x", "y", "z"))
-    values = _array(source, data.get("correction_um"), "correction_um", columns=3)
-    if len(values) != len(x) * len(y) * len(z):
-        due = f"expected {len(x)} x {len(y)} x {len(z)} vertices"
-        raise _fail(source, "correction_um", f"has {len(values)} entries; {due}")
-    return FieldGrid((x, y, z), values.reshape(len(x), len(y), len(z), 3))
 
 
 def _curves_json(source: SourceFile, data: Mapping[str, Any]) -> ErrorTable:
@@ -279,7 +273,11 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> NeutralTables:
         """Return the curves, and the field that they give with the machine's tool, rounded as written."""
         curves = curves_from(basis, values)
-        return NeutralTables(self._field_from(curves, self.settings.loss_mm, self.settings.max_nodes), curves)
+        x, y, z = (self._nodes_mm(curves, axis) for axis in range(3))
+        position_mm = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
+        added = self._curve_correction(curves, position_mm.reshape(-1, 3), None) / MM_PER_UM
+        flat = np.array([float(fixed(value, FIELD_DIGITS)) for value in added.ravel().tolist()])
+        return NeutralTables(FieldGrid((x, y, z), flat.reshape(position_mm.shape)), curves)
 
     def context(self, tables: NeutralTables) -> dict[str, Any]:
         """Return field and curves in the units of the files, and the signs with worked numbers."""
@@ -360,15 +358,7 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
         """Return minus E = C P of the curves (squareness reference X) at positions (n, 3): shape (n, 3), mm."""
         return -volumetric_error(replace(self.machine, squareness_reference="X"), curves, position_mm, tool_mm) + 0.0
 
-    def _field_from(self, curves: ErrorTable, loss_mm: float, most: int) -> FieldGrid:
-        """Return the field of the curves with the machine's tool, on nodes between which hardly anything is lost."""
-        lines = [self._nodes_mm(curves, axis, loss_mm, most) for axis in range(3)]
-        position_mm = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
-        added = self._curve_correction(curves, position_mm.reshape(-1, 3), None) / MM_PER_UM
-        flat = np.array([float(fixed(value, FIELD_DIGITS)) for value in added.ravel().tolist()])
-        return FieldGrid((lines[0], lines[1], lines[2]), flat.reshape(position_mm.shape))
-
-    def _nodes_mm(self, curves: ErrorTable, axis: int, loss_mm: float, most: int) -> FloatArray:
+    def _nodes_mm(self, curves: ErrorTable, axis: int) -> FloatArray:
         """Nodes of the curves of an axis, divided where an angle acts at its own axis' travel (a parabola in between)."""
         own = [curve for name, curve in curves.curves.items() if error_named(name).axis == axis]
         nodes = np.unique(
@@ -381,10 +371,10 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
             error = error_named(name)
             if error.axis == axis and error.kind == "angular" and error.direction != axis:
                 bent = np.maximum(bent, 0.25 * np.abs(np.diff(curve.at(nodes))) * np.diff(nodes))
-        loss = loss_mm
+        loss = self.settings.loss_mm
         while True:
             parts = np.maximum(1, np.ceil(np.sqrt(bent / loss))).astype(int)
-            if np.sum(parts) < most or np.all(parts == 1):
+            if np.sum(parts) < self.settings.max_nodes or np.all(parts == 1):
                 break
             loss *= 2.0
         pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(nodes[:-1], nodes[1:], parts, strict=True)]

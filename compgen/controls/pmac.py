@@ -221,17 +221,40 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         curves = [self._curve(errors, output, axis) for output in range(3) for axis in range(3)]
         pitch = [term for term in curves if term.axis == term.carrier[0].output]
         groups = [[term] for term in curves if term.axis != term.carrier[0].output]
-        if self.settings.two_dimensional:
-            groups += self._sheets(errors)
-        sizes = [sum(self._size(term) ** 2 for term in group) for group in groups]
+        # products by output and pair of axes, levers from the motor's zero; each group fits one two-dimensional table
+        sheets: dict[tuple[int, int, int], list[Term]] = {}
+        for output in range(3) if self.settings.two_dimensional else ():
+            rings = [self._ring_of(k, self._step_mm(errors, k, output)) for k in range(3)]
+            nodes = [ring.nodes_mm(self.settings) for ring in rings]
+            for term in product_terms(self.machine, errors, nodes, self.settings.home_mm):
+                if term.carrier[0].output == output:
+                    sheets.setdefault((output, *_pair(term)), []).append(term)
+        groups += [group for _, group in sorted(sheets.items())]
+        sizes = []  # squared rms over the volume without a constant
+        for group in groups:
+            levers = [term.carrier[0].lever for term in group]
+            lengths = [1.0 if k is None or k > 2 else self.machine.axes[k].length_mm / math.sqrt(12.0) for k in levers]
+            sizes.append(sum((float(np.std(t.start)) * length) ** 2 for t, length in zip(group, lengths, strict=True)))
         ranked = sorted(range(len(groups)), key=lambda k: -sizes[k])[: len(self.settings.free_motors)]
         kept = [groups[k] for k in sorted(ranked) if sizes[k] > NOTHING_MM**2]
         terms = pitch + [term for group in kept for term in group]
         return [continued(term, self.machine.axes[term.axis or 0].range_mm) for term in terms]
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> PmacTables:
-        """Return the tables in whole 1/16 counts."""
-        return PmacTables(tuple(self._tables_from(basis, values)))
+        """Return the tables, from the highest motor to the lowest, in whole 1/16 counts."""
+        free = iter(self.settings.free_motors)
+        found: list[CompTable1D | CompTable2D] = []
+        products: dict[tuple[int, int, int], list[Term]] = {}
+        for term in basis:
+            part = term.carrier[0]
+            if part.lever is not None:
+                products.setdefault((part.output, *_pair(term)), []).append(term)
+                continue
+            owner = self.settings.motors[part.output] if part.output == term.axis else next(free)
+            found.append(self._line(owner, term, np.asarray(values[term.name])))
+        for (output, *pair), terms in products.items():
+            found.append(self._sheet(next(free), output, (pair[0], pair[1]), terms, values))
+        return PmacTables(tuple(sorted(found, key=lambda table: -table.motor)))
 
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
         """Only the reversal of an axis along itself goes into tables."""
@@ -259,7 +282,22 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         """Return the tables with their entries, the sign with a worked number, and what must be set."""
         letters = {motor: AXES[axis] for axis, motor in enumerate(self.settings.motors)}
         return {
-            **self._pmac_notes(tables),
+            "sign_statement": (
+                "Entries are 1/16 count of the target motor, and the control ADDS them to its commanded position: 160 adds 10 "
+                "counts. The first entry stands one spacing above the motor's zero, negative positions stand at the far end "
+                "of the table, the last entry is the value at zero."
+            ),
+            "parameters": self._parameters(tables),
+            "warnings": self._warnings(tables),
+            "motors": [
+                {"letter": letter, "motor": motor, "counts": counts, "home": home}
+                for letter, motor, counts, home in zip(
+                    AXES, self.settings.motors, self.settings.counts_per_mm, self.settings.home_mm, strict=True
+                )
+            ],
+            "has_sheets": any(isinstance(table, CompTable2D) for table in tables.tables),
+            "owners": sorted(table.motor for table in tables.tables),
+            "overwrites": self._overwrites(tables),
             "tables": [table_context(table, letters) for table in tables.tables],
             "backlash": [
                 {
@@ -374,7 +412,17 @@ class Pmac(Controller[PmacSettings, PmacTables]):
                     f"the table of motor {table.motor} spans {span} counts of motor {motor}, the travel needs "
                     f"{needed:g}: positions roll over within the travel"
                 )
-        return found + _end_violations(table)
+        # at the roll-over the last entry is the value at zero, and the far edges are the zero edges
+        if isinstance(table, CompTable1D):
+            if table.entries[-1]:
+                found.append(
+                    f"the table of motor {table.motor} ends with {table.entries[-1]}: the value jumps at zero; expected 0"
+                )
+        elif not np.array_equal(table.values, np.pad(table.values[:-1, :-1], ((0, 1), (0, 1)), mode="wrap")):
+            found.append(
+                f"the far edges of the table of motor {table.motor} are not its zero edges: the value jumps at zero"
+            )
+        return found
 
     def usage(self, tables: PmacTables) -> list[Usage]:
         """Return the motors that own a table against those there are, and the longest table."""
@@ -441,39 +489,6 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         start = term.start - np.interp(home, nodes, term.start)
         return replace(term, start=start, zero_at_mm=float(np.clip(home, nodes[0], nodes[-1])))
 
-    def _sheets(self, errors: ErrorTable) -> list[list[Term]]:
-        """Products by output and pair of axes, levers from the motor's zero; each group fits one two-dimensional table."""
-        groups: dict[tuple[int, int, int], list[Term]] = {}
-        for output in range(3):
-            rings = [self._ring_of(k, self._step_mm(errors, k, output)) for k in range(3)]
-            nodes = [ring.nodes_mm(self.settings) for ring in rings]
-            for term in product_terms(self.machine, errors, nodes, self.settings.home_mm):
-                if term.carrier[0].output == output:
-                    groups.setdefault((output, *_pair(term)), []).append(term)
-        return [group for _, group in sorted(groups.items())]
-
-    def _size(self, term: Term) -> float:
-        """Rms of a term over the volume without a constant, mm."""
-        lever = term.carrier[0].lever
-        factor = 1.0 if lever is None or lever > 2 else self.machine.axes[lever].length_mm / math.sqrt(12.0)
-        return float(np.std(term.start)) * factor
-
-    def _tables_from(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> list[CompTable1D | CompTable2D]:
-        """Return the tables, from the highest motor to the lowest, in whole 1/16 counts."""
-        free = iter(self.settings.free_motors)
-        found: list[CompTable1D | CompTable2D] = []
-        products: dict[tuple[int, int, int], list[Term]] = {}
-        for term in basis:
-            part = term.carrier[0]
-            if part.lever is not None:
-                products.setdefault((part.output, *_pair(term)), []).append(term)
-                continue
-            owner = self.settings.motors[part.output] if part.output == term.axis else next(free)
-            found.append(self._line(owner, term, np.asarray(values[term.name])))
-        for (output, *pair), terms in products.items():
-            found.append(self._sheet(next(free), output, (pair[0], pair[1]), terms, values))
-        return sorted(found, key=lambda table: -table.motor)
-
     def _ring_from(self, axis: int, nodes_mm: FloatArray) -> Ring:
         """Return the ring whose nodes over the travel these are."""
         step = round(abs(self.settings.counts_per_mm[axis]) * float(nodes_mm[1] - nodes_mm[0]))
@@ -504,7 +519,11 @@ class Pmac(Controller[PmacSettings, PmacTables]):
     ) -> CompTable2D:
         """Two-dimensional table with the row motor of the first axis of the pair; the far edges repeat the zero edges."""
         settings = self.settings
-        rings = [self._lever_ring(axis, terms) for axis in pair]
+        rings = []
+        for axis in pair:  # the ring of its functions, or a wide one if the axis is a lever only
+            nodes = next((term.nodes_mm for term in terms if term.axis == axis), None)
+            wide_mm = 0.5 * self.machine.axes[axis].length_mm
+            rings.append(self._ring_of(axis, wide_mm) if nodes is None else self._ring_from(axis, nodes))
         along = [ring.positions_mm(settings) for ring in rings]
         second, first = np.meshgrid(along[1], along[0], indexing="ij")
         position_mm = np.zeros((first.size, 3))
@@ -527,34 +546,6 @@ class Pmac(Controller[PmacSettings, PmacTables]):
             row_desired=settings.desired,
             column_desired=settings.desired,
         )
-
-    def _lever_ring(self, axis: int, terms: Sequence[Term]) -> Ring:
-        """Ring of one axis of a two-dimensional table: that of its functions, or a wide one if it is a lever only."""
-        nodes = next((term.nodes_mm for term in terms if term.axis == axis), None)
-        if nodes is not None:
-            return self._ring_from(axis, nodes)
-        return self._ring_of(axis, 0.5 * self.machine.axes[axis].length_mm)
-
-    def _pmac_notes(self, tables: PmacTables) -> dict[str, Any]:
-        """Return the texts of the context: sign_statement, parameters, warnings, motors."""
-        return {
-            "sign_statement": (
-                "Entries are 1/16 count of the target motor, and the control ADDS them to its commanded position: 160 adds 10 "
-                "counts. The first entry stands one spacing above the motor's zero, negative positions stand at the far end "
-                "of the table, the last entry is the value at zero."
-            ),
-            "parameters": self._parameters(tables),
-            "warnings": self._warnings(tables),
-            "motors": [
-                {"letter": letter, "motor": motor, "counts": counts, "home": home}
-                for letter, motor, counts, home in zip(
-                    AXES, self.settings.motors, self.settings.counts_per_mm, self.settings.home_mm, strict=True
-                )
-            ],
-            "has_sheets": any(isinstance(table, CompTable2D) for table in tables.tables),
-            "owners": sorted(table.motor for table in tables.tables),
-            "overwrites": self._overwrites(tables),
-        }
 
     def _parameters(self, tables: PmacTables) -> list[dict[str, object]]:
         rows: list[tuple[str, object, str]] = [
@@ -674,15 +665,3 @@ def _steps(table: CompTable1D | CompTable2D | BacklashTable) -> list[tuple[int, 
         return [(table.row, table.row_span / columns), (table.column, table.column_span / rows)]
     motor = table.motor if isinstance(table, BacklashTable) else table.source
     return [(motor, table.length / len(table.entries))]
-
-
-def _end_violations(table: CompTable1D | CompTable2D) -> list[str]:
-    """What happens at the roll-over: the last entry is the value at zero, far edges are the zero edges."""
-    if isinstance(table, CompTable1D):
-        if table.entries[-1] == 0:
-            return []
-        return [f"the table of motor {table.motor} ends with {table.entries[-1]}: the value jumps at zero; expected 0"]
-    values = table.values
-    if np.array_equal(values[-1], values[0]) and np.array_equal(values[:, -1], values[:, 0]):
-        return []
-    return [f"the far edges of the table of motor {table.motor} are not its zero edges: the value jumps at zero"]

@@ -182,7 +182,15 @@ class _DownloadReader:
         if define:
             self._define(line, rest, define)
         elif variable:
-            self._variable(line, int(variable.group(1)), int(variable.group(2)))
+            number, value = int(variable.group(1)), int(variable.group(2))
+            self._once(line, f"I{number}", f"I{number} is set")
+            if number == 51 and value in (0, 1):
+                self.enabled = value == 1
+            elif number % 100 == 86 and 1 <= number // 100 <= _MOST_MOTOR and abs(value) <= _LARGEST:
+                self.constants[number // 100] = value
+            else:
+                message = f"I{number}={value} is not part of compensation; expected I51=1 or Ixx86 (backlash)"
+                raise self.source.fail(message, line)
         else:
             shown = one_line(rest)[:60]
             raise self.source.fail(f"{shown!r} is not understood; expected #1, DEFINE COMP 8,4000 or I51=1", line)
@@ -191,18 +199,6 @@ class _DownloadReader:
         if not 1 <= int(word) <= _MOST_MOTOR:
             raise self.source.fail(f"motor #{word} does not exist; use 1 to {_MOST_MOTOR}", line)
         return int(word)
-
-    def _variable(self, line: int, number: int, value: int) -> None:
-        key = f"I{number}"
-        self._once(line, key, f"{key} is set")
-        if number == 51 and value in (0, 1):
-            self.enabled = value == 1
-        elif number % 100 == 86 and 1 <= number // 100 <= _MOST_MOTOR and abs(value) <= _LARGEST:
-            self.constants[number // 100] = value
-        else:
-            raise self.source.fail(
-                f"I{number}={value} is not part of compensation; expected I51=1 or Ixx86 (backlash)", line
-            )
 
     def _once(self, line: int, key: str, what: str) -> None:
         first = self.seen.setdefault(key, line)
@@ -246,17 +242,12 @@ class _DownloadReader:
                 raise self.source.fail(f"{word} is one entry too many for {table.head[:60]!r}", line)
             table.entries.append(int(word))
         if len(table.entries) == table.count:
-            self._close(table)
-
-    def _close(self, table: _Open) -> None:
-        self.open = None
-        values = np.array(table.entries, dtype=np.int64)
-        if table.backlash:
-            self.backlash.append(BacklashTable(table.motor, table.spans[0], values))
-        elif len(table.shape) == 1:
-            self.tables.append(_line(table, values))
-        else:
-            self.tables.append(_sheet(table, values))
+            self.open = None
+            values = np.array(table.entries, dtype=np.int64)
+            if table.backlash:
+                self.backlash.append(BacklashTable(table.motor, table.spans[0], values))
+            else:
+                self.tables.append((_line if len(table.shape) == 1 else _sheet)(table, values))
 
 
 _SYNTAX = {

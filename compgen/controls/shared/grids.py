@@ -264,19 +264,15 @@ def _candidates(machine: Machine, errors: ErrorTable, axis: int, anchor: bool, m
     """Grids within ``most`` nodes by their number: even parts of the travel, and steps that hit the curves' nodes."""
     low, high = machine.axes[axis].range_mm
     length = Decimal(repr(high)) - Decimal(repr(low))
-    steps = {_round_up(length / count) for count in _interval_counts(most)}
+    counts = list(range(1, EVERY_COUNT + 1))
+    while counts[-1] < MOST_INTERVALS:
+        counts.append(int(1.05 * counts[-1]))
+    steps = {_round_up(length / count) for count in counts if count < most}
     common = common_step(machine, errors, axis, anchor=anchor)
     parts = (common / part for part in range(1, 11))
     steps |= {step for step in parts if step % STEP_QUANTUM == 0 and length / step <= most}
     grids = [_grid(machine, axis, step, anchor) for step in steps]
     return sorted((grid for grid in grids if grid.count <= most), key=lambda grid: (grid.count, grid.step))
-
-
-def _interval_counts(most: int) -> list[int]:
-    counts = list(range(1, EVERY_COUNT + 1))
-    while counts[-1] < MOST_INTERVALS:
-        counts.append(int(1.05 * counts[-1]))
-    return [count for count in counts if count < most]
 
 
 def common_step(machine: Machine, errors: ErrorTable, axis: int, *, anchor: bool) -> Decimal:

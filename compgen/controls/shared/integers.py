@@ -187,7 +187,10 @@ def _windows(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[IntA
     gain over all curves within the limit. Both sections of a node hold at least their smallest eigenvalue of it.
     """
     curve, gap = _reachable(wanted, sections, limit)
-    rounded = _clamped(curve, limit)
+    rounded = np.floor(curve + 0.5).astype(np.int64)
+    rounded[0] = 0
+    for k in range(1, len(rounded)):  # no step larger than the limit
+        rounded[k] = np.clip(rounded[k], rounded[k - 1] - limit, rounded[k - 1] + limit)
     room = max(_square(rounded - wanted, sections) - _square(curve - wanted, sections) + gap, 0.0)
     mean, half = 0.5 * (sections[:, 0] + sections[:, 2]), 0.5 * (sections[:, 0] - sections[:, 2])
     least = np.maximum(mean - np.hypot(half, sections[:, 1]), 0.0)
@@ -199,15 +202,6 @@ def _windows(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[IntA
         low[k] = max(np.ceil(max(curve[k] - radius[k], -1e15)), low[k - 1] - limit)
         high[k] = min(np.floor(min(curve[k] + radius[k], 1e15)), high[k - 1] + limit)
     return low, high
-
-
-def _clamped(curve: FloatArray, limit: int) -> IntArray:
-    """Round a curve (n,) from its first value 0 on, no step larger than the limit."""
-    counts = np.floor(curve + 0.5).astype(np.int64)
-    counts[0] = 0
-    for k in range(1, len(counts)):
-        counts[k] = np.clip(counts[k], counts[k - 1] - limit, counts[k - 1] + limit)
-    return counts
 
 
 def _reachable(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[FloatArray, float]:

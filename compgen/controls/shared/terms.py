@@ -87,22 +87,13 @@ def _one_dimensional_start(
             if part.lever == axis and part.error in errors.squareness:
                 start -= part.sign * errors.squareness[part.error][0] * nodes_mm
         elif error_named(part.error).axis == axis and part.error in errors.curves:
-            start -= (
-                part.sign
-                * errors.curves[part.error].at(nodes_mm)
-                * _lever_at(machine, part.lever, axis, nodes_mm, origin_mm)
-            )
+            lever: FloatArray | float = 1.0
+            if part.lever is not None and part.lever >= 3:
+                lever = machine.tool_offset_mm[part.lever - 3]
+            elif part.lever is not None:  # the travel of the axis itself, or the fixed place of another one
+                lever = nodes_mm if part.lever == axis else float(origin_mm[part.lever])
+            start -= part.sign * errors.curves[part.error].at(nodes_mm) * lever
     return start
-
-
-def _lever_at(
-    machine: Machine, lever: int | None, axis: int, nodes_mm: FloatArray, origin_mm: FloatArray
-) -> FloatArray | float:
-    if lever is None:
-        return 1.0
-    if lever >= 3:
-        return machine.tool_offset_mm[lever - 3]
-    return nodes_mm if lever == axis else float(origin_mm[lever])
 
 
 def product_terms(
@@ -160,18 +151,14 @@ def error_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatAr
             start = start - fold * nodes
         straightness = error_named(name).is_straightness
         keep_mm = _kept_mm(machine, axis, straightness=straightness)
-        zeros_mm = _zero_ends_mm(nodes, start) if straightness and set(SQUARENESS_NAMES) <= names else ()
-        if zeros_mm:
+        # a straightness that is zero at both ends: its line is in the squareness, which the control has
+        at_ends = straightness and set(SQUARENESS_NAMES) <= names and len(nodes) >= 3
+        at_ends = at_ends and np.max(np.abs(start[[0, -1]])) <= ZERO_END_MM
+        zeros_mm = (float(nodes[0]), float(nodes[-1])) if at_ends else ()
+        if at_ends:
             start = np.concatenate([[0.0], start[1:-1], [0.0]])
         terms.append(Term(name, axis, nodes, tuple(carrier), start, keep_mm=keep_mm, zeros_mm=zeros_mm))
     return terms
-
-
-def _zero_ends_mm(nodes_mm: FloatArray, start: FloatArray) -> tuple[float, ...]:
-    """Both ends of a straightness that is zero there: its line then stands in the squareness, which the control has."""
-    if len(nodes_mm) < 3 or np.max(np.abs(start[[0, -1]])) > ZERO_END_MM:
-        return ()
-    return float(nodes_mm[0]), float(nodes_mm[-1])
 
 
 def _kept_mm(machine: Machine, axis: int, *, straightness: bool) -> tuple[float, ...]:
