@@ -9,48 +9,29 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from compgen import effects
+from compgen import effects, tables
 from compgen.controls import controller_named
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.display import Bars, Drawable, Overview, Panel
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, format_errors, format_reversal
-from compgen.data.files import OutputFolder, read_bytes, sha256_of, working_folder
+from compgen.data.files import OutputFolder, Provenance, read_bytes, sha256_of, working_folder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
-from compgen.fit import FitOptions, FitResult, fit
 from compgen.foreign.opening import open_measurement
 from compgen.identify import Identification, IdentifyOptions, covariance
 from compgen.identify.any_measurement import Measurement, describe, evidence_files, identify_measurement
 from compgen.identify.reversal_errors import SIGNIFICANT
-from compgen.tables import (
-    REJECTED_PREFIX,
-    Export,
-    Provenance,
-    Verification,
-    export,
-    read_tables,
-    set_aside_superseded,
-    usable_format,
-    verify,
-)
-from compgen.tables.safety import SafetyLimits
-from compgen.tables.signs import check_files
-from compgen.tables.verification import (
-    MISFIT_CODES,
-    blocking_reasons,
-    measurement_objections,
-    taken_away_um,
-    verification_files,
-)
 
 if TYPE_CHECKING:
+    from compgen.fit import FitOptions, FitResult
     from compgen.identify.monte_carlo import SelfCheck
+    from compgen.tables import Export, SafetyLimits, Verification
     from compgen.tables.active import ActiveTables
 
 Progress = Callable[[str], None]
@@ -93,6 +74,18 @@ class RunResult(Drawable):
     def accepted(self) -> bool:
         """Whether all tables may be loaded."""
         return all(result.verification.accepted for result in self.results)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the object that ``volcomp run --json`` prints; with one control its ``result.json`` plus the rest."""
+        summaries = [item.verification.summary() for item in self.results]
+        common = {
+            "accepted": self.accepted,
+            "identify": self.identification.summary(),
+            "paths": [str(path) for item in self.results for path in item.paths],
+        }
+        if len(summaries) == 1:
+            return {**summaries[0], **common}
+        return {**common, "controllers": {item["controller"]: item for item in summaries}}
 
     def overview(self) -> Overview:
         """The verdict on the tables of each control."""
@@ -181,27 +174,18 @@ def identified_reversal(result: Identification) -> ReversalCurves | None:
 
     Backlash of the machine file that was taken out of the readings is part of them.
     """
-    found, taken_out = _found_reversal(result), result.corrections.get("effects", {})
+    found = result.reversal_curves
+    # a reversal belongs to curves that are the means of both directions, so the readings must have been brought to that mean
+    if found is None and result.reversal is not None and result.reversal.removed:
+        curves = {}
+        for name, axis in result.reversal.axes.items():
+            for component, (value, u) in enumerate(zip(axis.vector_mm, axis.u_mm, strict=True)):
+                if abs(value) > SIGNIFICANT * u and abs(value) >= WORTH_MM:
+                    key = (AXES.index(name), component)
+                    curves[key] = Curve(np.zeros(1), np.array([value]), np.array([u]))
+        found = ReversalCurves(curves, {"machine": result.errors.metadata.get("machine", "")}) if curves else None
+    taken_out = result.corrections.get("effects", {})
     return effects.with_effects_reversal(result.layout.machine, found, taken_out) if taken_out else found
-
-
-def _found_reversal(result: Identification) -> ReversalCurves | None:
-    """Return the reversals that the readings show.
-
-    They belong to curves that are the means of both directions, so none is returned where the readings were not
-    brought to that mean.
-    """
-    if result.reversal_curves is not None:
-        return result.reversal_curves
-    if result.reversal is None or not result.reversal.removed:
-        return None
-    curves = {}
-    for name, axis in result.reversal.axes.items():
-        for component, (value, u) in enumerate(zip(axis.vector_mm, axis.u_mm, strict=True)):
-            if abs(value) > SIGNIFICANT * u and abs(value) >= WORTH_MM:
-                key = (AXES.index(name), component)
-                curves[key] = Curve(np.zeros(1), np.array([value]), np.array([u]))
-    return ReversalCurves(curves, {"machine": result.errors.metadata.get("machine", "")}) if curves else None
 
 
 def fit_files(result: FitResult) -> dict[str, str]:
@@ -240,7 +224,7 @@ def export_and_verify(  # noqa: PLR0913  (options by keyword)
     limit that binds) is a reason too.
     """
     OutputFolder(folder)
-    exported = export(
+    exported = tables.export(
         machine,
         fitted,
         controller,
@@ -250,7 +234,7 @@ def export_and_verify(  # noqa: PLR0913  (options by keyword)
         reversal=reversal,
     )
     verification = verified_export(machine, exported, identified, reversal, limits)
-    beside = check_files(machine, exported, identified, templates, reversal)
+    beside = tables.check_files(machine, exported, identified, templates, reversal)
     return _write_results(OutputFolder(folder), {"": (exported, verification, beside)})[0][0]
 
 
@@ -271,22 +255,13 @@ def verified_export(
         names = exported.add_to(output, accepted=True)
         paths = output.commit()
         try:
-            tables = read_tables(machine, [paths[name] for name in names], exported.controller)
+            parsed = tables.read_tables(machine, [paths[name] for name in names], exported.controller)
         except InputError as error:
             name = Path(error.file).name if error.file else None
             message = f"the rendered file cannot be read back, so its template is wrong: {error.message}"
             raise InputError(message, file=name, line=error.line) from error
-        result = verify(machine, tables, identified, reversal=reversal, limits=limits, covariance=known)
+        result = tables.verify(machine, parsed, identified, reversal=reversal, limits=limits, covariance=known)
         return replace(result, reasons=tuple(dict.fromkeys([*result.reasons, *exported.violations])))
-
-
-def _with_objections(verification: Verification, identification: Identification, *, allow_misfit: bool) -> Verification:
-    """Add what speaks against the measurement; what blocks is a reason against the tables, too."""
-    before, after = verification.before_rigid_removed, verification.after_rigid_removed
-    taken = taken_away_um(before.rms_um, after.rms_um) if verification.accepted else None  # else the tables are wrong
-    found = measurement_objections(identification, taken, allow_misfit=allow_misfit)
-    reasons = [*verification.reasons, *blocking_reasons(found)]
-    return replace(verification, objections=found, reasons=tuple(dict.fromkeys(reasons)))
 
 
 def identify_bare(
@@ -330,15 +305,15 @@ def _write_results(
     """
     results = []
     for sub_folder, (exported, verification, beside) in checked.items():
-        prefix = "" if verification.accepted else REJECTED_PREFIX
+        prefix = "" if verification.accepted else tables.REJECTED_PREFIX
         verification = replace(
             verification, files=tuple((prefix + name, digest) for name, digest in verification.files)
         )
-        files = {**beside, **verification_files(verification)}
+        files = {**beside, **tables.verification_files(verification)}
         names = exported.add_to(output, sub_folder, accepted=verification.accepted, beside=files)
         paths = tuple(output.folder / name for name in names)
         results.append(ControllerResult(exported, verification, paths))
-    earlier_report = set_aside_superseded(output, list(checked))
+    earlier_report = tables.set_aside_superseded(output, list(checked))
     output.commit()
     return results, tuple(earlier_report)
 
@@ -418,13 +393,15 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     >>> [name for name in names if name.startswith("volcomp0")]
     ['volcomp0.csv', 'volcomp0.lis']
     """
+    from compgen.fit import FitOptions, fit
+
     sub_folders = {name: name if len(set(controllers)) > 1 else "" for name in controllers}
     if not sub_folders:
         raise InputError("no controller was given; name at least one")
     for name, sub_folder in sub_folders.items():  # wrong settings are found before the work begins
         OutputFolder(Path(folder) / sub_folder)
         controller_named(name).read_settings(machine)
-        usable_format(name, templates, allow_unverified=allow_unverified)
+        tables.usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
     measurement = open_measurement(measurements, instrument)
     provenance = provenance_of(machine.source, *measurements, instrument)
@@ -441,7 +418,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     checked: dict[str, tuple[Export, Verification, Mapping[str, str]]] = {}
     for name, sub_folder in sub_folders.items():
         progress(f"exporting, reading back and verifying: {name}")
-        exported = export(
+        exported = tables.export(
             machine,
             fitted.errors,
             name,
@@ -451,10 +428,17 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
             reversal=reversal,
         )
         verification = verified_export(machine, exported, identification.errors, reversal, limits, known)
-        verification = _with_objections(verification, identification, allow_misfit=allow_misfit)
-        if any(item.code in MISFIT_CODES for item in verification.objections):
+        # what speaks against the measurement; what blocks is a reason against the tables, too
+        before, after = verification.before_rigid_removed, verification.after_rigid_removed
+        taken = (
+            tables.taken_away_um(before.rms_um, after.rms_um) if verification.accepted else None
+        )  # else they are wrong
+        found = tables.measurement_objections(identification, taken, allow_misfit=allow_misfit)
+        reasons = dict.fromkeys([*verification.reasons, *tables.blocking_reasons(found)])
+        verification = replace(verification, objections=found, reasons=tuple(reasons))
+        if any(item.code in tables.MISFIT_CODES for item in verification.objections):
             verification = replace(verification, next_command=diagnosis)
-        beside = check_files(machine, exported, identification.errors, templates, reversal)
+        beside = tables.check_files(machine, exported, identification.errors, templates, reversal)
         checked[sub_folder] = exported, verification, beside
     evidence = evidence_files(machine, measurement, identification)
     output = OutputFolder(folder)

@@ -31,7 +31,7 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions
 from compgen.identify import IdentifyOptions
 from compgen.pipeline import run
-from compgen.report.terminal import identification_table, run_json, verification_table
+from compgen.report.terminal import identification_table, verification_table
 from compgen.tables.safety import SafetyLimits
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def run_command(
 
         explain_run(machine, result, out, templates)
     if as_json:
-        print_json({**run_json(result), "report": None if report is None else str(report)})
+        print_json({**result.summary(), "report": None if report is None else str(report)})
     else:
         stdout.print(identification_table(result.identification))
         stdout.print(verification_table([item.verification for item in result.results]))

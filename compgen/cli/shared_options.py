@@ -22,10 +22,8 @@ from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machin
 from compgen.data.messages import nearest
 from compgen.data.names import AXES
 from compgen.errors import CompgenWarning, InputError
-from compgen.fit import FitOptions
 from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
 from compgen.resources import data_folder
-from compgen.tables.safety import SafetyLimits
 
 if TYPE_CHECKING:
     from compgen.kinematics.parallel import Map
@@ -202,28 +200,28 @@ def _number(option: str, name: str, text: str) -> float:
         raise InputError(f"{text!r} for {name} is not a number; give one above 0", field=option) from None
 
 
-def _positive(step_um: float) -> float:
-    if not step_um > 0.0:
-        raise InputError(f"--max-step-um is {step_um:g}; expected a number of um above zero")
-    return step_um
-
-
 #: The options of an identification: noise of the readings, inputs that they share, and the method.
 identify_options = options_of(
     IdentifyOptions, "options", read={"stations": lambda given: given if given == "nominal" else read_stations(given)}
 )
 
 
-#: Smoothness, bounds and loss of the fit; the command receives ``fitting``.
-fitting_options = options_of(
-    FitOptions,
-    "fitting",
-    build=lambda robust, **bounds: FitOptions.from_file_units(*bounds.values(), robust=robust),
-)
+def fitting_options(command: Command) -> Command:
+    """Add smoothness, bounds and loss of the fit; the command receives ``fitting``."""
+    from compgen.fit import FitOptions
+
+    return options_of(
+        FitOptions,
+        "fitting",
+        build=lambda robust, **bounds: FitOptions.from_file_units(*bounds.values(), robust=robust),
+    )(command)
 
 
-#: --max-step-um; the command receives ``limits``.
-limits_option = options_of(SafetyLimits, "limits", read={"max_step_um": _positive})
+def limits_option(command: Command) -> Command:
+    """Add --max-step-um; the command receives ``limits``."""
+    from compgen.tables.safety import SafetyLimits
+
+    return options_of(SafetyLimits, "limits")(command)
 
 
 # Where the fit and the verification find the covariance of an errors file.

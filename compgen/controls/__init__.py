@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, MutableMapping
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from compgen.controls.shared.base import AnyController, Controller, Monomial, SourceFile, Term
 from compgen.data.files import read_text
 from compgen.data.messages import nearest
 from compgen.errors import InputError
-from compgen.resources import data_folder
+from compgen.resources import data_folder, load_on_first_use
+
+if TYPE_CHECKING:
+    from compgen.controls.shared.base import AnyController, Controller, Monomial, SourceFile, Term
 
 
-class Controls(MutableMapping[str, type[AnyController]]):
+class Controls(MutableMapping[str, "type[AnyController]"]):
     """The class of every control by its name; the module of a built-in one is imported when its class is asked for."""
 
     def __init__(self, built_in: Mapping[str, str]) -> None:
@@ -107,3 +110,5 @@ def _hint(name: str) -> str:
 
 
 __all__ = ["CONTROLLERS", "AnyController", "Controller", "Monomial", "SourceFile", "Term", "controller_named"]
+
+load_on_first_use(__name__, ["AnyController", "Controller", "Monomial", "SourceFile", "Term"])

@@ -18,6 +18,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,13 @@ _locks: dict[Path, int] = {}
 def sha256_of(content: bytes) -> str:
     """Return the SHA-256 of ``content`` as hexadecimal text."""
     return hashlib.sha256(content).hexdigest()
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where the errors came from: (name, SHA-256) of every input file, for manifest and file headers."""
+
+    inputs: Sequence[tuple[str, str]] = ()
 
 
 def json_values(value: Any) -> Any:

@@ -17,7 +17,6 @@ from compgen.data.messages import nearest
 from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError
 from compgen.identify.adjust.grid_problem import GridProblem
-from compgen.identify.adjust.problem import LengthProblem
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.adjust.starts import station_start
 from compgen.identify.adjust.unknowns import IntArray, KnownPositions, State
@@ -25,6 +24,7 @@ from compgen.kinematics.first_order import tool_of
 
 if TYPE_CHECKING:
     from compgen.data.deviations import Deviations
+    from compgen.identify.adjust.problem import LengthProblem
 
 # Stations whose machine coordinates are known beforehand: from a file, or located with the machine taken as perfect.
 #

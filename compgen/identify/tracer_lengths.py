@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
-from compgen.identify.adjust.problem import LengthProblem, length_problem
 from compgen.identify.adjust.propagation import Adjustment
 from compgen.identify.adjust.rank import Rank, describe_rank, determined_factor, unknown_names
 from compgen.identify.adjust.residual_tests import EXPLAINS, Cause, drift_of_repeats, labels_of, split_labels
@@ -62,10 +61,13 @@ from compgen.identify.options import (
 from compgen.identify.reference_conditions import identify_at_reference
 from compgen.kinematics.kernel_switch import one_thread
 
+if TYPE_CHECKING:
+    from compgen.identify.adjust.problem import LengthProblem
+
 # The readings of an identification with the problem that they pose, and start values in closed form.
 
 
-AnyProblem = GridProblem | LengthProblem
+AnyProblem: TypeAlias = "GridProblem | LengthProblem"
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,11 @@ def problem_of(
     """Return the least-squares problem of the readings: on a grid of levels where they form one, else point by point."""
     tool_mm = common_tool(machine, lengths.tool_mm)
     on_grid = grid_problem(layout, lengths.position_mm, tool_mm, lengths.station, group, lengths.length_mm)
-    return on_grid or length_problem(machine, lengths, layout, group)
+    if on_grid:
+        return on_grid
+    from compgen.identify.adjust.problem import length_problem
+
+    return length_problem(machine, lengths, layout, group)
 
 
 def dead_lengths_of(lengths: Lengths) -> IntArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich import box
@@ -15,21 +15,20 @@ from rich.text import Text
 from compgen.data.csv_files import FloatArray
 from compgen.data.messages import number_text, one_line, um_text
 from compgen.data.names import COVERAGE, error_named
-from compgen.fit import FitResult
-from compgen.identify import Identification
-from compgen.pipeline import RunResult
-from compgen.tables import Residuals, Verification
-from compgen.tables.signs import ACCEPTED, REJECTED, SAME, CrashTest
 
 if TYPE_CHECKING:
     from compgen.accuracy.compare import Comparison
     from compgen.accuracy.evaluate import Accuracy
     from compgen.accuracy.figure import ComparedFigure, Figure
+    from compgen.fit import FitResult
+    from compgen.identify import Identification
     from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate
+    from compgen.tables import Residuals, Verification
     from compgen.tables.active import MergeReport
     from compgen.tables.diff import TableDifference
+    from compgen.tables.signs import CrashTest
 
-# Readable summaries for the terminal, and the JSON of ``volcomp run``.
+# Readable summaries for the terminal.
 
 
 #: Further reasons and rejected readings are in the JSON files only.
@@ -220,19 +219,6 @@ def verification_table(results: Sequence[Verification]) -> Group:
     return Group(table, Text(legend), *(Text(text) for text in judged), *notes)
 
 
-def run_json(result: RunResult) -> dict[str, Any]:
-    """Return the object that ``volcomp run --json`` prints; with one control its ``result.json`` plus the rest."""
-    summaries = [item.verification.summary() for item in result.results]
-    common = {
-        "accepted": result.accepted,
-        "identify": result.identification.summary(),
-        "paths": [str(path) for item in result.results for path in item.paths],
-    }
-    if len(summaries) == 1:
-        return {**summaries[0], **common}
-    return {**common, "controllers": {item["controller"]: item for item in summaries}}
-
-
 # Readable summaries of accuracy figures, and of before against after.
 
 
@@ -357,6 +343,8 @@ MOST_COMPONENTS = 12
 
 def crash_table(results: Sequence[CrashTest]) -> Group:
     """Return how many wrong tables of every kind were rejected, by control, and every one that was not."""
+    from compgen.tables.signs import ACCEPTED, REJECTED, SAME
+
     table = Table(
         box=box.SIMPLE, pad_edge=False, title="wrong tables: rejected / same / accepted", title_justify="left"
     )
@@ -375,26 +363,19 @@ def crash_table(results: Sequence[CrashTest]) -> Group:
         ]
         verdict = Text("passed", "green") if item.passed else Text("FAILED", "bold red")
         table.add_row(item.controller, *counts, verdict)
-        notes += _crash_notes(item)
+        name = item.controller
+        notes += [Text(f"{name}: the right tables are not accepted: {reason}", "red") for reason in item.baseline]
+        for trial in item.trials:
+            what, size_um = f"{trial.kind} {trial.name}", trial.difference_um
+            if trial.outcome == ACCEPTED:
+                notes.append(Text(f"{name}: ACCEPTED although wrong by {size_um:.2f} um: {what}", "red"))
+            elif trial.outcome == SAME:
+                notes.append(Text(f"{name}: {what} changes {size_um:.3f} um at most", "yellow"))
     legend = (
         "same: the wrong table differs from the right one by no more than the verification is meant to see (resolution of "
         "the format and 0.2 um), so that it does not count"
     )
     return Group(table, *notes, Text(legend))
-
-
-def _crash_notes(item: CrashTest) -> list[Text]:
-    notes = [Text(f"{item.controller}: the right tables are not accepted: {reason}", "red") for reason in item.baseline]
-    for trial in item.trials:
-        if trial.outcome == ACCEPTED:
-            text = (
-                f"{item.controller}: ACCEPTED although wrong by {trial.difference_um:.2f} um: {trial.kind} {trial.name}"
-            )
-            notes.append(Text(text, "red"))
-        elif trial.outcome == SAME:
-            text = f"{item.controller}: {trial.kind} {trial.name} changes {trial.difference_um:.3f} um at most"
-            notes.append(Text(text, "yellow"))
-    return notes
 
 
 def difference_table(result: TableDifference) -> Group:

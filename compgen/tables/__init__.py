@@ -1,24 +1,34 @@
 """From errors to the tables of a control: synthesised, rendered, read back from their text and judged."""
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-from compgen.kinematics.gauge import without_rigid_motion
-from compgen.resources import program_version
-from compgen.tables.export import (
-    REJECTED_PREFIX,
-    REPORT_FILES,
-    Export,
-    Provenance,
-    export,
-    set_aside_superseded,
-    usable_format,
-)
-from compgen.tables.judge import Residuals, residuals
-from compgen.tables.render import Format, load_format
-from compgen.tables.synthesis import Projector, projector, synthesize, wanted_correction
-from compgen.tables.verification import ReadTables, Verification, parse_tables, read_tables, verify
+from compgen.resources import load_on_first_use
+
+if TYPE_CHECKING:
+    from compgen.data.files import Provenance
+    from compgen.kinematics.gauge import without_rigid_motion
+    from compgen.resources import program_version
+    from compgen.tables.export import REJECTED_PREFIX, REPORT_FILES, Export, export, set_aside_superseded, usable_format
+    from compgen.tables.judge import Residuals, residuals
+    from compgen.tables.render import Format, load_format
+    from compgen.tables.safety import SafetyLimits
+    from compgen.tables.signs import check_files
+    from compgen.tables.synthesis import Projector, projector, synthesize, wanted_correction
+    from compgen.tables.verification import (
+        MISFIT_CODES,
+        ReadTables,
+        Verification,
+        blocking_reasons,
+        measurement_objections,
+        parse_tables,
+        read_tables,
+        taken_away_um,
+        verification_files,
+        verify,
+    )
 
 __all__ = [
+    "MISFIT_CODES",
     "REJECTED_PREFIX",
     "REPORT_FILES",
     "Export",
@@ -27,18 +37,26 @@ __all__ = [
     "Provenance",
     "ReadTables",
     "Residuals",
+    "SafetyLimits",
     "Verification",
+    "blocking_reasons",
+    "check_files",
     "export",
     "load_format",
+    "measurement_objections",
+    "parse_tables",
     "program_version",
     "projector",
-    "parse_tables",
     "read_tables",
     "residuals",
     "set_aside_superseded",
     "synthesize",
+    "taken_away_um",
     "usable_format",
+    "verification_files",
     "verify",
     "wanted_correction",
     "without_rigid_motion",
 ]
+
+load_on_first_use(__name__, __all__)

@@ -14,7 +14,7 @@ from compgen.controls import CONTROLLERS, AnyController, SourceFile, controller_
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview, shortened
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves, format_errors, format_reversal, reversal_name
-from compgen.data.files import OutputFolder, sha256_of
+from compgen.data.files import OutputFolder, Provenance, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
@@ -208,13 +208,6 @@ class Export(Displayed):
         rows = tuple((name, str(len(text.encode()))) for name, text in self.files.items())
         title = f"{self.controller}: {shortened(tuple(self.files))}"
         return Overview(title, ("file", "bytes"), rows, (*self.violations, *self.warnings))
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """Where the errors came from: (name, SHA-256) of every input file, for manifest and file headers."""
-
-    inputs: Sequence[tuple[str, str]] = field(default_factory=tuple)
 
 
 def usable_format(controller: str, templates: Path | None = None, *, allow_unverified: bool = False) -> Format:

@@ -18,6 +18,7 @@ from compgen.data.declared import option
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import InputError
 
 #: A step between neighbouring nodes that the slope of the best table does not explain is absurd from here on, um.
 UNEXPLAINED_STEP_UM = 500.0
@@ -46,6 +47,10 @@ class SafetyLimits:
         "No step of the correction between neighbouring table nodes may be larger than this, um; default: 500 um beyond "
         "what the slope of the errors explains.",
     )
+
+    def __post_init__(self) -> None:
+        if self.max_step_um is not None and not self.max_step_um > 0.0:
+            raise InputError(f"--max-step-um is {self.max_step_um:g}; expected a number of um above zero")
 
 
 @dataclass(frozen=True)

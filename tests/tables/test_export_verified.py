@@ -31,7 +31,7 @@ def test_the_result_of_the_round_trip_is_beside_the_tables(words, tmp_path, caps
 
 def test_tables_that_are_read_back_wrong_are_not_accepted(words, tmp_path, monkeypatch, capsys):
     """An exporter that turns every sign: only what is read back shows it."""
-    right = compgen.pipeline.export
+    right = compgen.export
 
     def turned(machine, errors, controller, **options):
         curves = {name: replace(curve, value=-curve.value) for name, curve in errors.curves.items()}

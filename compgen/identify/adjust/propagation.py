@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,12 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import InputError
-from compgen.identify.adjust.problem import CHUNK_POSES, LengthProblem, length_problem
 from compgen.identify.adjust.solver import Factor
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State
 from compgen.kinematics.exact_chain import exact_columns
+
+if TYPE_CHECKING:
+    from compgen.identify.adjust.problem import LengthProblem
 
 # What an identification leaves behind for later: the optimum, its factor, and the joint covariance.
 
@@ -186,6 +188,8 @@ def responses(
     InputError
         if a temperature uncertainty is given and the machine file has no expansion coefficient for an axis.
     """
+    from compgen.identify.adjust.problem import length_problem
+
     linear = _Linear(machine, length_problem(machine, lengths, layout, adjustment.group), adjustment)
     found = {}
     for name, value in inputs.items():
@@ -267,6 +271,8 @@ class _Linear:
 
     def _chunks(self) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
         """Poses, tips (m, 3) and derivatives of the tips by the unknown errors (m, 3, size)."""
+        from compgen.identify.adjust.problem import CHUNK_POSES
+
         problem, errors = self.problem, self.adjustment.state.errors
         for first in range(0, len(problem.position_mm), CHUNK_POSES):
             poses = slice(first, first + CHUNK_POSES)
