@@ -158,7 +158,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArr
 
 def leftover(design: Design, chosen: Chosen) -> FloatArray:
     """Whitened residual without base model and chosen set, scaled to the degrees of freedom that are left, (N,)."""
-    basis = orthonormal(design.directions[:, design.coordinates(chosen.members)]) if chosen.members else None
+    basis = orthonormal(design.directions(chosen.members)) if chosen.members else None
     left = design.residual if basis is None else design.residual - basis @ (basis.T @ design.residual)
     used = design.count - design.freedom + (0 if basis is None else basis.shape[1])
     return np.asarray(left * np.sqrt(design.count / max(design.count - used, 1)))
@@ -186,7 +186,7 @@ def homogeneity(design: Design, chosen: Chosen, member: int, layout: Measurement
         parts.append(c.approach)
     columns = shape[:, None] * np.hstack(parts)
     white = design.projected(columns)
-    members = design.directions[:, design.coordinates(chosen.members)]
+    members = design.directions(chosen.members)
     basis = orthonormal(members)
     white -= basis @ (basis.T @ white)
     residual = design.residual - basis @ (basis.T @ design.residual)
@@ -246,60 +246,64 @@ def analyse(
     show : is told each step in words.
     """
     show("building the catalogue")
-    wider = wider_of(fit)
-    if wider:
-        show("choosing the curves of the base model")
-        taken = needed(fit, wider, only, sigma_mm)
-        fit = widened(fit, taken) if taken else fit
-    named, missing = named_groups(fit.readings, only)
-    groups = [*base_groups(fit.readings), *named, *generic_groups(fit.readings, fit.observed.layout)]
-    fixed = [group for group in named if group.scans == 1]
-    show("fitting the noise")
     repeats = has_repeats(fit.observed.layout)
+    wider = wider_of(fit)
+    groups, missing, fixed = _groups_of(fit, only)
+    show("fitting the noise")
     noise = noise_of(fit, fixed if repeats else [], sigma_mm=sigma_mm)
     show(f"comparing {len(groups)} groups")
-    design, rules, chosen = _searched(fit, groups, noise, most_named)
+    design = design_of(fit, [*groups, *(item.group for item in wider)], whitener(fit.observed.layout, noise))
+    taken = needed(design, wider) if wider else []
+    if taken:
+        show("fitting the wider curves that the readings ask for")
+        fit = widened(fit, taken)
+        groups, missing, fixed = _groups_of(fit, only)
+        noise = noise_of(fit, fixed if repeats else [], sigma_mm=sigma_mm)
+        design = design_of(fit, groups, whitener(fit.observed.layout, noise))
+    design = design.first(len(groups))
+    rules = rules_of(design, most_named)
+    chosen = search(design, rules)
     more = [design.groups[g] for g in chosen.members if design.groups[g].slow or noise.source != "repeats"]
     if more:
         show("fitting the noise together with what was found")
         noise = noise_of(fit, [*fixed, *more] if repeats else more, sigma_mm=sigma_mm, before=noise)
-        design, rules, chosen = _searched(fit, groups, noise, most_named)
+        del design  # before the next one is built: it is large
+        design = design_of(fit, groups, whitener(fit.observed.layout, noise))
+        rules = rules_of(design, most_named)
+        chosen = search(design, rules)
     show("weighing the evidence")
     ratio = run_ratio(fit, [*fixed, *more], noise, RUN_RATIO)
     evidence = evidence_of(design, chosen, noise, ratio, fit.observed.layout)
     return Analysis(fit, noise, design, rules, chosen, evidence, tuple(missing))
 
 
-def needed(fit: BaseFit, wider: Sequence[Wider], only: Sequence[str], sigma_mm: FloatArray | None) -> list[Wider]:
+def _groups_of(fit: BaseFit, only: Sequence[str]) -> tuple[list[Group], list[str], list[Group]]:
+    """All groups of the search, names that lack a covariate, and the named groups that have no scan position."""
+    named, missing = named_groups(fit.readings, only)
+    groups = [*base_groups(fit.readings), *named, *generic_groups(fit.readings, fit.observed.layout)]
+    return groups, missing, [group for group in named if group.scans == 1]
+
+
+def needed(design: Design, wider: Sequence[Wider]) -> list[Wider]:
     """Return the wider bases that are worth their columns in addition to the names, and that no single smooth term replaces.
 
     A machine whose curves are steeper has them in several errors of an axis; what acts in one direction alone is
     something else.
     """
-    named, _ = named_groups(fit.readings, only)
-    fixed = [group for group in named if group.scans == 1]
-    noise = noise_of(fit, fixed if has_repeats(fit.observed.layout) else [], sigma_mm=sigma_mm)
-    along = [group for group in generic_groups(fit.readings, fit.observed.layout) if len(group.covariates) == 1]
-    along = [group for group in along if group.covariates[0] in ("x", "y", "z")]
-    groups = [*base_groups(fit.readings), *(item.group for item in wider), *named, *along]
-    design = design_of(fit, groups, whitener(fit.observed.layout, noise))
-    chosen = search(design, replace(rules_of(design, MOST_NAMED), generic=False)).members
+    groups = design.groups
+    along = [g for g, group in enumerate(groups) if group.covariates in (("x",), ("y",), ("z",))]
+    trials = {group.name for g, group in enumerate(groups) if group.tier != "generic" or g in along}
+    chosen = search(design, replace(rules_of(design, MOST_NAMED), generic=False, trials=len(trials))).members
     found = []
     for item in wider:
         place = next((g for g in chosen if groups[g].name == item.group.name), None)
         if place is None:
             continue
         left = remainder_of(design, [g for g in chosen if g != place])
-        single = [g for g, group in enumerate(groups) if group.covariates == ("xyz"[item.axis],) and design.size(g)]
+        single = [g for g in along if groups[g].covariates == ("xyz"[item.axis],) and design.size(g)]
         if max(gains(design, left, single), default=0.0) < ONE_TERM * float(gains(design, left, [place])[0]):
             found.append(item)
     return found
-
-
-def _searched(fit: BaseFit, groups: Sequence[Group], noise: Noise, most_named: int) -> tuple[Design, Rules, Chosen]:
-    design = design_of(fit, groups, whitener(fit.observed.layout, noise))
-    rules = rules_of(design, most_named)
-    return design, rules, search(design, rules)
 
 
 def white_rms(analysis: Analysis) -> float:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.names import AXES
@@ -34,6 +35,60 @@ Tier = Literal["named", "generic", "base"]
 
 
 @dataclass(frozen=True)
+class Placed:
+    """Columns (n, k) = place @ values; a term of position or time has one row of ``values`` (T, k) for each stop.
+
+    ``place`` (n, T), with the direction of each reading as its entries, is None where ``values`` are the columns.
+    """
+
+    values: FloatArray
+    place: csr_array | None = None
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return int(self.values.shape[1])
+
+    def columns(self) -> FloatArray:
+        """All columns, (n, k)."""
+        return self.values if self.place is None else np.asarray(self.place @ self.values)
+
+    def products(self, vectors: FloatArray, summed: dict[int, FloatArray]) -> FloatArray:
+        """Products (k, q) with vectors (n, q); ``summed`` keeps those with ``place``, which other terms share."""
+        if self.place is None:
+            return np.asarray(self.values.T @ vectors)
+        if id(self.place) not in summed:
+            summed[id(self.place)] = np.asarray(self.place.T @ vectors)
+        return np.asarray(self.values.T @ summed[id(self.place)])
+
+
+@dataclass(frozen=True)
+class Scanned:
+    """Columns of neighbouring scan positions, ``each`` at a time: a step differs from the next in a few readings only.
+
+    ``changes`` (n, k): the columns of the first position, then what each position changes in those of the one before.
+    """
+
+    changes: csr_array
+    each: int
+
+    @property
+    def width(self) -> int:
+        """Number of columns."""
+        return int(self.changes.shape[1])
+
+    def columns(self) -> FloatArray:
+        """All columns, (n, k)."""
+        dense = self.changes.toarray().reshape(self.changes.shape[0], -1, self.each)
+        return np.asarray(np.cumsum(dense, axis=1, out=dense).reshape(len(dense), -1))
+
+    def products(self, vectors: FloatArray, _: dict[int, FloatArray]) -> FloatArray:
+        """Products (k, q) with vectors (n, q)."""
+        found = np.asarray(self.changes.T @ vectors)
+        return np.asarray(np.cumsum(found.reshape(-1, self.each, found.shape[1]), axis=0).reshape(found.shape))
+
+
+@dataclass(frozen=True)
 class Group:
     """Columns (n, k) that enter together.
 
@@ -41,7 +96,7 @@ class Group:
     ----------
     name : of the effect, or a description of the smooth term.
     tier : ``"named"``, ``"generic"``, or ``"base"`` for what belongs to the base model and is never reported.
-    columns : change of every reading per unit, (n, k).
+    source, place : where the columns come from, and which of them belong to this group; change of every reading per unit.
     effect : the effect of the catalogue, with its scan position fixed.
     scans : number of scan positions among which this is one.
     position : its scan position.
@@ -52,7 +107,8 @@ class Group:
 
     name: str
     tier: Tier
-    columns: FloatArray
+    source: Placed | Scanned
+    place: slice | None = None
     effect: Effect | None = None
     scans: int = 1
     position: float | None = None
@@ -61,35 +117,65 @@ class Group:
     slow: bool = False
     predicts: bool = True
 
+    @property
+    def columns(self) -> FloatArray:
+        """Change of every reading per unit, (n, k); computed anew."""
+        return self.source.columns()[:, self.place or slice(None)]
 
-def named_groups(readings: Readings, only: Sequence[str] = (), most_scans: int = 400) -> tuple[list[Group], list[str]]:
+
+#: Most scan positions of an effect.
+MOST_SCANS = 400
+#: Scan positions whose columns are kept together, and the share of changed readings below which the changes are kept.
+TOGETHER, LEAST_CHANGED = 64, 0.2
+
+
+def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Group], list[str]]:
     """Return the groups of the catalogue, one for each scan position, and the names that lack a covariate."""
     groups: list[Group] = []
     missing: list[str] = []
     for name, effect in catalogue(readings.stations).items():
         if (only and name not in only) or readings.kind not in effect.card.kinds:
             continue
-        found = _of_effect(name, effect, readings, most_scans)
-        groups += found
-        if not found:
+        positions = list(effect.positions(readings))
+        before = len(groups)
+        if len(positions) > MOST_SCANS:
+            positions = [positions[k] for k in np.linspace(0, len(positions) - 1, MOST_SCANS).astype(int)]
+        choices: list[float | None] = [*positions] if positions else [None]
+        for first in range(0, len(choices), TOGETHER):
+            found = []
+            for position in choices[first : first + TOGETHER]:
+                fixed = effect if position is None else effect.at(position)
+                columns = fixed.columns(readings)
+                if columns is not None and np.isfinite(columns).all() and np.any(columns):
+                    found.append((position, fixed, columns))
+            if not found:
+                continue
+            dense = np.hstack([columns for _, _, columns in found])
+            ends = np.cumsum([0, *(columns.shape[1] for _, _, columns in found)]).tolist()
+            source: Placed | Scanned = Placed(dense)
+            if len(set(np.diff(ends))) == 1 < len(found):  # a degree that is scanned changes the number of columns
+                changes = dense.copy()
+                changes[:, ends[1] :] -= dense[:, : -ends[1]]
+                if np.count_nonzero(changes) < LEAST_CHANGED * changes.size:
+                    source = Scanned(csr_array(changes), ends[1])
+            for k, (position, fixed, _) in enumerate(found):
+                place, card = slice(ends[k], ends[k + 1]), fixed.card
+                groups.append(
+                    Group(
+                        name,
+                        "named",
+                        source,
+                        place,
+                        fixed,
+                        max(len(positions), 1),
+                        position,
+                        card.covariates,
+                        slow=len(positions) > 1,
+                    )
+                )
+        if len(groups) == before:
             missing.append(name)
     return groups, missing
-
-
-def _of_effect(name: str, effect: Effect, readings: Readings, most_scans: int) -> list[Group]:
-    positions = list(effect.positions(readings))
-    if len(positions) > most_scans:
-        positions = [positions[k] for k in np.linspace(0, len(positions) - 1, most_scans).astype(int)]
-    found = []
-    choices: list[float | None] = [*positions] if positions else [None]
-    for position in choices:
-        fixed = effect if position is None else effect.at(position)
-        columns = fixed.columns(readings)
-        if columns is None or not np.isfinite(columns).all() or not np.any(columns):
-            continue
-        scans = max(len(positions), 1)
-        found.append(Group(name, "named", columns, fixed, scans, position, fixed.card.covariates, slow=scans > 1))
-    return found
 
 
 def check_names(names: Sequence[str], stations: Sequence[str]) -> None:
@@ -252,27 +338,23 @@ TERMS: Sequence[Callable[[Covariates], Iterator[Term]]] = (
 )
 
 
-def _length_terms(c: Covariates, station: int) -> Iterator[Term]:
-    """Terms of one station that act along its beam."""
-    r = c.readings
-    here = (r.station == station).astype(np.float64)[:, None]
-    range_mm = _scaled(r.range_mm)
-    u = r.direction
+def _station_terms(c: Covariates) -> Iterator[Term]:
+    """Terms that act along the beam of one station."""
+    range_mm, u = _scaled(c.readings.range_mm), c.readings.direction
     azimuth = np.arctan2(u[:, 1], u[:, 0])
     waves = np.column_stack([f(k * azimuth) for k in range(1, 7) for f in (np.cos, np.sin)])
-    yield "range", ("range",), here * legendre(range_mm, 4)[:, 1:], False, True
-    yield "beam azimuth", ("azimuth",), here * waves, False, True
-    yield "beam elevation", ("elevation",), here * legendre(u[:, 2], 5)[:, 1:], False, True
+    yield "range", ("range",), legendre(range_mm, 4)[:, 1:], False, True
+    yield "beam azimuth", ("azimuth",), waves, False, True
+    yield "beam elevation", ("elevation",), legendre(u[:, 2], 5)[:, 1:], False, True
     if c.temperature:
         warm = np.column_stack(list(c.temperature.values()))
-        yield "temperatures", ("temperature",), here * warm, True, True
-        yield "range with temperatures", ("range", "temperature"), here * range_mm[:, None] * warm, True, True
-    yield "position", ("x", "y", "z"), here * c.quadratic[:, 1:], False, True
-    yield "time", ("time",), here * legendre(c.time, 4)[:, 1:], True, True
+        yield "temperatures", ("temperature",), warm, True, True
+        yield "range with temperatures", ("range", "temperature"), range_mm[:, None] * warm, True, True
+    yield "position", ("x", "y", "z"), c.quadratic[:, 1:], False, True
+    yield "time", ("time",), legendre(c.time, 4)[:, 1:], True, True
     moved = legendre(c.time, 2)[:, 1:]
-    yield "time with beam", ("time", "beam"), here * _times(moved, np.column_stack([u, range_mm])), True, True
-    for _, covariates, columns, slow, predicts in _line_terms(c):
-        yield "offset of each line", covariates, here * columns, slow, predicts
+    yield "time with beam", ("time", "beam"), _times(moved, np.column_stack([u, range_mm])), True, True
+    yield from _line_terms(c)
 
 
 def _common_length_terms(c: Covariates) -> Iterator[Term]:
@@ -301,28 +383,45 @@ def _common_length_terms(c: Covariates) -> Iterator[Term]:
 def generic_groups(readings: Readings, layout: MeasurementLayout) -> list[Group]:
     """Return the generic tier for the readings."""
     c = covariates_of(readings, layout)
-    groups = []
-    for source in TERMS:
-        for text, covariates, columns, slow, predicts in source(c):
-            for k, letter in enumerate(AXES):
-                along = readings.direction[:, [k]]
-                if np.any(along):
-                    name = f"{text} in d{letter}"
-                    groups.append(_group(name, covariates, f"d{letter}", along * columns, slow, predicts))
+    stop, count = layout.stop, len(readings)
+    first = np.unique(stop, return_index=True)[1]
+    places: dict[tuple[str, bool], csr_array] = {}
+
+    def groups_of(term: Term, ways: Sequence[tuple[str, str, tuple[str, ...], FloatArray]]) -> list[Group]:
+        # one group for each way (ending of the name, direction, further covariates, weight of each reading) of a term
+        text, covariates, columns, slow, predicts = term
+        groups = []
+        by_stop = columns[first]
+        same = np.array_equal(by_stop[stop], columns)
+        for ending, direction, more, weight in ways:
+            rows = np.flatnonzero(weight)
+            at = stop[rows] if same else np.arange(len(rows))
+            key = ending, same
+            if key not in places:
+                shape = (count, layout.stops if same else len(rows))
+                places[key] = csr_array((weight[rows], (rows, at)), shape=shape)
+            source = Placed(by_stop if same else columns[rows], places[key])
+            groups.append(
+                Group(
+                    text + ending, "generic", source, covariates=(*covariates, *more), direction=direction, slow=slow,
+                    predicts=predicts,
+                )
+            )  # fmt: skip
+        return groups
+
+    axes = [(f" in d{AXES[k]}", f"d{AXES[k]}", (), readings.direction[:, k]) for k in range(3)]
+    axes = [way for way in axes if np.any(way[3])]
+    groups = [group for terms in TERMS for term in terms(c) for group in groups_of(term, axes)]
     if readings.kind == "lengths":
-        for text, covariates, columns, slow, predicts in _common_length_terms(c):
-            groups.append(_group(f"{text} (all stations)", covariates, "length", columns, slow, predicts))
-        for station, name in enumerate(readings.stations):
-            for text, covariates, columns, slow, predicts in _length_terms(c, station):
-                label = (*covariates, f"station_{name}")
-                groups.append(_group(f"{text} of {name}", label, "length", columns, slow, predicts))
+        every = [(" (all stations)", "length", (), np.ones(count))]
+        groups += [group for term in _common_length_terms(c) for group in groups_of(term, every)]
+        beams = [
+            (f" of {name}", "length", (f"station_{name}",), (readings.station == k).astype(np.float64))
+            for k, name in enumerate(readings.stations)
+        ]
+        of_terms = [groups_of(term, beams) for term in _station_terms(c)]
+        groups += [group for of_station in zip(*of_terms, strict=True) for group in of_station]
     return groups
-
-
-def _group(
-    name: str, covariates: tuple[str, ...], direction: str, columns: FloatArray, slow: bool, predicts: bool
-) -> Group:
-    return Group(name, "generic", columns, covariates=covariates, direction=direction, slow=slow, predicts=predicts)
 
 
 def base_groups(readings: Readings) -> list[Group]:
@@ -332,7 +431,7 @@ def base_groups(readings: Readings) -> list[Group]:
     if readings.kind == "axis" or np.abs(spread).max() < 1e-6:
         return []
     columns = np.cross(tools, readings.direction)  # u . (eps x t) = eps . (t x u)
-    return [Group("tilt of the tool", "base", columns)]
+    return [Group("tilt of the tool", "base", Placed(columns))]
 
 
 # How rich the base model is: smooth curves first; steeper ones and nodes are searched like everything else.
@@ -377,7 +476,7 @@ def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
             if added and gain > added + CHANCE * np.sqrt(2.0 * added) and evidence > least:
                 best, least = (basis, columns), evidence
         if best is not None:
-            found.append(Wider(axis, best[0], Group(f"wider curves of {AXES[axis]}", "base", best[1])))
+            found.append(Wider(axis, best[0], Group(f"wider curves of {AXES[axis]}", "base", Placed(best[1]))))
     return tuple(found)
 
 

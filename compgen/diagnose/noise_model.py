@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import lapack, solve_triangular
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, eye_array
 
 from compgen.data.csv_files import FloatArray
 from compgen.diagnose.base_fit import BaseFit
@@ -131,9 +131,9 @@ def difference_matrix(layout: MeasurementLayout, block: Block) -> csr_array:
 
 @dataclass(frozen=True)
 class _Part:
-    """One block in its differences: kernels (d, d), data (c, d), fixed effects (c, d, q)."""
+    """One block in its differences: kernels (K, d, d), data (c, d), fixed effects (c, d, q)."""
 
-    kernels: list[FloatArray]
+    kernels: FloatArray
     data: FloatArray
     fixed: FloatArray
 
@@ -152,81 +152,47 @@ class Reml:
         theta = np.exp(log_variance)
         count = len(TAU) + 2
         own, shared = theta[1 : 1 + count], theta[1 + count :] if self.common else np.zeros(count)
-        solved = [self._solve(part, theta[0], own, shared) for part in self.parts]
-        normal = sum((piece[2] for piece in solved), np.zeros((self.fixed, self.fixed)))
-        right = sum((piece[3] for piece in solved), np.zeros(self.fixed))
-        logdet = sum(piece[4] for piece in solved)
-        quadratic = sum(piece[5] for piece in solved)
-        inverse = np.zeros_like(normal)
-        beta = np.zeros(self.fixed)
+        normal, right = np.zeros((self.fixed, self.fixed)), np.zeros(self.fixed)
+        logdet = quadratic = 0.0
+        # the mean of the channels and their contrasts, each with its kernels, channels and inverse covariance
+        solved: list[tuple[_Part, int, FloatArray, FloatArray, FloatArray]] = []
+        for part in self.parts:
+            channels, size = part.data.shape
+            split = channels > 1 and bool(shared.any())
+            for mine, times in ((slice(0, 1), channels), (slice(1, None), 0)) if split else ((slice(None), 0),):
+                covariance = np.tensordot(own + times * shared, part.kernels, 1)
+                covariance.flat[:: size + 1] += theta[0]
+                factor, failed = lapack.dpotrf(covariance.T, lower=1, clean=1, overwrite_a=1)
+                if failed:
+                    raise np.linalg.LinAlgError("the covariance is not positive definite")
+                logdet += 2.0 * len(part.data[mine]) * float(np.log(np.diag(factor)).sum())
+                lower = lapack.dpotri(factor, lower=1, overwrite_c=1)[0]
+                inverse = np.asarray(lower + lower.T)
+                inverse.flat[:: size + 1] *= 0.5
+                weighted, data = inverse @ part.fixed[mine], part.data[mine] @ inverse
+                normal += np.einsum("cdq,cdr->qr", part.fixed[mine], weighted, optimize=True)
+                right += np.einsum("cdq,cd->q", weighted, part.data[mine])
+                quadratic += float(np.sum(part.data[mine] * data))
+                solved.append((part, channels if times or not split else 0, inverse, weighted, data))
+        beta, between = right, normal
         if self.fixed:
-            inverse = np.linalg.inv(normal)
-            beta = inverse @ right
+            between = np.linalg.inv(normal)
+            beta = between @ right
             quadratic -= float(right @ beta)
             logdet += float(np.linalg.slogdet(normal)[1])
         gradient = np.zeros(len(log_variance))
-        for part, piece in zip(self.parts, solved, strict=True):
-            self._add_gradient(gradient, part, piece, inverse, beta)
-        return 0.5 * (logdet + quadratic), gradient * theta, quadratic
-
-    @staticmethod
-    def _solve(part: _Part, white: float, own: FloatArray, shared: FloatArray) -> tuple:  # type: ignore[type-arg]
-        channels, size = part.data.shape
-        contrast = white * np.eye(size)
-        for theta, kernel in zip(own, part.kernels, strict=True):
-            contrast += theta * kernel
-        matrices = [contrast]
-        if channels > 1 and shared.any():
-            mean = contrast.copy()
-            for theta, kernel in zip(shared, part.kernels, strict=True):
-                mean += channels * theta * kernel
-            matrices = [mean, contrast]
-        inverses, logdets = zip(*(_inverse(matrix) for matrix in matrices), strict=True)
-        which = [0, *[len(matrices) - 1] * (channels - 1)]
-        weighted = np.stack([inverses[which[c]] @ part.fixed[c] for c in range(channels)])
-        data = np.stack([inverses[which[c]] @ part.data[c] for c in range(channels)])
-        normal = np.einsum("cdq,cdr->qr", part.fixed, weighted, optimize=True)
-        right = np.einsum("cdq,cd->q", weighted, part.data)
-        logdet = float(sum(logdets[which[c]] for c in range(channels)))
-        quadratic = float(np.sum(part.data * data))
-        return inverses, weighted, normal, right, logdet, quadratic, data, which
-
-    def _add_gradient(
-        self,
-        gradient: FloatArray,
-        part: _Part,
-        piece: tuple,  # type: ignore[type-arg]
-        inverse: FloatArray,
-        beta: FloatArray,
-    ) -> None:
-        inverses, weighted, _, _, _, _, data, which = piece
-        residual = data - weighted @ beta  # P d, (c, d)
-        count = len(TAU) + 2
-        for group in range(len(inverses)):
-            mine = [c for c in range(len(which)) if which[c] == group]
-            p = len(mine) * inverses[group]
-            if self.fixed:
-                tall = np.hstack([weighted[c] for c in mine])
-                turned = np.hstack([weighted[c] @ inverse for c in mine])
-                p = p - tall @ turned.T
-            vectors = residual[mine]
+        for part, times, inverse, weighted, data in solved:
+            # 1/2 (tr(P K) - d' P K P d) for every kernel K, with P d = data - weighted beta
+            tall = np.hstack([*weighted])
+            p = len(data) * inverse - tall @ np.hstack([*(weighted @ between)]).T
+            vectors = data - weighted @ beta
             p -= vectors.T @ vectors
-            trace = np.array([np.vdot(p, kernel) for kernel in part.kernels])
+            trace = part.kernels.reshape(count, -1) @ p.ravel()
             gradient[0] += 0.5 * np.trace(p)
             gradient[1 : 1 + count] += 0.5 * trace
-            if self.common and group == 0 and len(which) > 1:
-                gradient[1 + count :] += 0.5 * len(which) * trace
-
-
-def _inverse(matrix: FloatArray) -> tuple[FloatArray, float]:
-    """Inverse and logarithm of the determinant of a covariance."""
-    factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=0)
-    if failed:
-        raise np.linalg.LinAlgError("the covariance is not positive definite")
-    logdet = 2.0 * float(np.log(np.diag(factor)).sum())
-    inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
-    inverse = np.tril(inverse) + np.tril(inverse, -1).T
-    return inverse, logdet
+            if self.common and len(part.data) > 1:
+                gradient[1 + count :] += 0.5 * times * trace
+        return 0.5 * (logdet + quadratic), gradient * theta, quadratic
 
 
 def reml_problem(
@@ -249,21 +215,17 @@ def reml_problem(
     for block in layout.blocks:
         turned = rotated(block, columns)
         size = len(block.stop)
-        matrix = difference_matrix(layout, block) if repeats else _thinned(size)
+        kept = min(size, MOST_STOPS)
+        matrix = difference_matrix(layout, block)[:MOST_DIFFERENCES] if repeats else eye_array(kept, size, format="csr")
         if not matrix.shape[0]:
             continue
-        if matrix.shape[0] > MOST_DIFFERENCES:
-            matrix = matrix[:MOST_DIFFERENCES]
-        pattern = kernels(time[block.stop], spacing, layout.run[block.stop], layout.in_run[block.stop], runs=runs)
-        between = [np.ascontiguousarray((matrix @ (matrix @ kernel).T).T) for kernel in pattern]
+        taken = np.unique(matrix.indices)
+        stop, few = block.stop[taken], matrix[:, taken]
+        pattern = kernels(time[stop], spacing, layout.run[stop], layout.in_run[stop], runs=runs)
+        between = np.stack([np.ascontiguousarray(few @ (few @ kernel).T) for kernel in pattern])
         channels = np.stack([matrix @ turned[c] for c in range(block.channels)])
         parts.append(_Part(between, np.ascontiguousarray(channels[:, :, 0]), channels[:, :, 1:]))
     return _with_fixed(parts)
-
-
-def _thinned(size: int) -> csr_array:
-    keep = np.arange(min(size, MOST_STOPS))
-    return csr_array((np.ones(len(keep)), (keep, keep)), shape=(len(keep), size))
 
 
 def _with_fixed(parts: list[_Part]) -> Reml:
@@ -522,31 +484,120 @@ def _pairs(layout: MeasurementLayout, stop: IntArray) -> tuple[IntArray, IntArra
 
 
 # Whitening: columns and readings in which the noise is white with variance 1.
+#
+# The inverse Cholesky factor of a covariance is never formed. Each kernel has a state (an exponential of its time constant,
+# a level and a slope of the run), whose value at the beginning of a piece of stops is all that earlier stops say about it.
+# So a piece is whitened by its own small factor once what is known of the states is taken off: time and memory grow with the
+# number of stops, not with its square.
+
+
+#: Stops of a piece.
+PIECE = 64
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Stops first ... last - 1 that are whitened together; b stops, J states at the first of them.
+
+    Parameters
+    ----------
+    inverse : inverse Cholesky factor of their covariance given all earlier stops, (b, b).
+    known : whitened stops per unit of each state, (b, J).
+    kept, learnt : states of the next piece per unit of these states, (J,), and of these whitened stops, (J, b).
+    """
+
+    first: int
+    last: int
+    inverse: FloatArray
+    known: FloatArray
+    kept: FloatArray
+    learnt: FloatArray
+
+
+def pieces_of(
+    time: FloatArray, run: IntArray, in_run: FloatArray, white: float, variances: FloatArray
+) -> tuple[Piece, ...]:
+    """Factorise a covariance; stops (T,) in order of time, in units of their distance, ``variances`` (J,) of the kernels."""
+
+    def seen(rows: slice, at: int) -> FloatArray:
+        same = (run[rows] == run[at]).astype(np.float64)
+        slow = np.exp(-np.abs(time[rows] - time[at])[:, None] / np.array(TAU))
+        return np.column_stack([slow, same, same * in_run[rows]])
+
+    found: list[Piece] = []
+    explained = np.zeros((len(variances), len(variances)))
+    for first in range(0, len(time), PIECE):
+        rows, end = slice(first, first + PIECE), min(first + PIECE, len(time))
+        here = seen(rows, first)
+        covariance = white * np.eye(end - first) - here @ explained @ here.T
+        for variance, kernel in zip(variances, kernels(time[rows], 1.0, run[rows], in_run[rows]), strict=True):
+            if variance > 0.0:
+                covariance += variance * kernel
+        factor, failed = lapack.dpotrf(covariance, lower=1, clean=1)
+        if failed:
+            raise np.linalg.LinAlgError("the covariance of the noise is not positive definite")
+        inverse = solve_triangular(factor, np.eye(end - first), lower=True, check_finite=False)
+        after = min(end, len(time) - 1)
+        kept = np.append(np.exp(-(time[after] - time[first]) / np.array(TAU)), [float(run[after] == run[first])] * 2)
+        learnt = (variances[:, None] * seen(rows, after).T - (kept[:, None] * explained) @ here.T) @ inverse.T
+        explained = kept[:, None] * explained * kept + learnt @ learnt.T
+        found.append(Piece(first, end, inverse, inverse @ here, kept, learnt))
+    return tuple(found)
 
 
 @dataclass(frozen=True)
 class Whitener:
     """Takes columns (n, k) of all readings to (n, k) of whitened ones, block by block and channel by channel.
 
-    ``factors`` of a block: inverse-free Cholesky factors of the covariance of the mean and of the contrasts.
+    ``pieces`` of a block: those of the covariance of the mean of its channels, and of the contrasts.
     """
 
     layout: MeasurementLayout
     scale: FloatArray
-    factors: tuple[tuple[FloatArray, FloatArray], ...]
+    pieces: tuple[tuple[tuple[Piece, ...], tuple[Piece, ...]], ...]
 
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Whiten columns (n, k), or one of (n,)."""
-        wide = columns if columns.ndim == 2 else columns[:, None]
-        wide = wide / self.scale[:, None]
-        parts = []
-        for block, (mean, contrast) in zip(self.layout.blocks, self.factors, strict=True):
-            turned = rotated(block, wide)
-            for channel in range(block.channels):
-                factor = mean if channel == 0 else contrast
-                parts.append(_solved(factor, turned[channel]))
-        result = np.concatenate(parts)
-        return result if columns.ndim == 2 else result[:, 0]
+        wide = columns.reshape(len(columns), -1)
+        result, at = np.empty(wide.shape), 0
+        for block, both in zip(self.layout.blocks, self.pieces, strict=True):
+            turn = rotation(block.channels)
+            states = np.zeros((block.channels, len(both[0][0].kept), wide.shape[1]))
+            size = len(block.stop)
+            whitened = result[at : at + size * block.channels].reshape(block.channels, size, -1)
+            for mean, contrast in zip(*both, strict=True):
+                rows = block.rows[mean.first : mean.last]
+                # (c, b, k): the channels of the piece, rotated to their mean and contrasts
+                picked = wide[rows.T] / self.scale[rows.T][:, :, None]
+                turned = (turn @ picked.reshape(block.channels, -1)).reshape(picked.shape)
+                for channel in range(block.channels):
+                    piece = contrast if channel else mean
+                    white = piece.inverse @ turned[channel] - piece.known @ states[channel]
+                    states[channel] = piece.kept[:, None] * states[channel] + piece.learnt @ white
+                    whitened[channel, piece.first : piece.last] = white
+            at += size * block.channels
+        return result.reshape(columns.shape)
+
+    def transposed(self, whitened: FloatArray) -> FloatArray:
+        """The transpose of the whitening: whitened columns (n, k) to those whose products with readings are the same."""
+        result, at = np.empty(whitened.shape), 0
+        for block, both in zip(self.layout.blocks, self.pieces, strict=True):
+            turn = rotation(block.channels)
+            states = np.zeros((block.channels, len(both[0][0].kept), whitened.shape[1]))
+            size = len(block.stop)
+            parts = whitened[at : at + size * block.channels].reshape(block.channels, size, -1)
+            for mean, contrast in zip(both[0][::-1], both[1][::-1], strict=True):
+                turned = np.empty((block.channels, mean.last - mean.first, whitened.shape[1]))
+                for channel in range(block.channels):
+                    piece = contrast if channel else mean
+                    white = parts[channel, piece.first : piece.last] + piece.learnt.T @ states[channel]
+                    turned[channel] = piece.inverse.T @ white
+                    states[channel] = piece.kept[:, None] * states[channel] - piece.known.T @ white
+                rows = block.rows[mean.first : mean.last].T
+                picked = (turn.T @ turned.reshape(block.channels, -1)).reshape(turned.shape)
+                result[rows] = picked / self.scale[rows][:, :, None]
+            at += size * block.channels
+        return result
 
     def order_of(self, stop: IntArray) -> IntArray:
         """Stop of every whitened row, (n,); ``stop`` is that of every reading."""
@@ -554,38 +605,14 @@ class Whitener:
         return np.concatenate([np.tile(stop[block.rows[:, 0]], block.channels) for block in blocks])
 
 
-def _solved(factor: FloatArray, columns: FloatArray) -> FloatArray:
-    if factor.ndim == 1:
-        return np.asarray(columns / factor[:, None])
-    return np.asarray(solve_triangular(factor, columns, lower=True, check_finite=False))
-
-
 def whitener(layout: MeasurementLayout, noise: Noise) -> Whitener:
     """Return the whitening of a noise model."""
-    spacing = spacing_of(layout)
-    return Whitener(layout, noise.scale, tuple(_factors(layout, block, noise, spacing) for block in layout.blocks))
-
-
-def _factors(layout: MeasurementLayout, block: Block, noise: Noise, spacing: float) -> tuple[FloatArray, FloatArray]:
-    size = len(block.stop)
-    variances = noise.variances
-    if variances.slow <= 0.0:
-        plain = np.full(size, np.sqrt(variances.white))
-        return plain, plain
-    pattern = kernels(layout.time[block.stop], spacing, layout.run[block.stop], layout.in_run[block.stop])
-    contrast = variances.white * np.eye(size)
-    mean = np.zeros((size, size))
-    for own, common, kernel in zip(variances.own, variances.common, pattern, strict=True):
-        if own > 0:
-            contrast += own * kernel
-        if common > 0:
-            mean += (block.channels if block.channels > 1 else 1) * common * kernel
-    both = _factor(contrast)
-    return (_factor(contrast + mean) if mean.any() else both), both
-
-
-def _factor(matrix: FloatArray) -> FloatArray:
-    factor, failed = lapack.dpotrf(np.asfortranarray(matrix), lower=1, clean=1)
-    if failed:
-        raise np.linalg.LinAlgError("the covariance of the noise is not positive definite")
-    return np.asarray(factor)
+    variances, spacing = noise.variances, spacing_of(layout)
+    found = []
+    for block in layout.blocks:
+        order = (layout.time[block.stop] / spacing, layout.run[block.stop], layout.in_run[block.stop])
+        several = np.append(np.ones(len(TAU)), [float(len(np.unique(order[1])) > 1)] * 2)
+        own, common = variances.own * several, block.channels * variances.common * several
+        contrast = pieces_of(*order, variances.white, own)
+        found.append((pieces_of(*order, variances.white, own + common) if common.any() else contrast, contrast))
+    return Whitener(layout, noise.scale, tuple(found))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from compgen.data.csv_files import FloatArray
 from compgen.diagnose.base_fit import BaseFit
-from compgen.diagnose.groups import Group
+from compgen.diagnose.groups import Group, Placed, Scanned
 from compgen.diagnose.layout import IntArray
 from compgen.diagnose.noise_model import Whitener
 
@@ -23,13 +27,36 @@ from compgen.diagnose.noise_model import Whitener
 LEAST_VISIBLE = 1e-3
 #: Columns smaller than this share of the largest of their group are rounding.
 ROUNDING = 1e-9
+#: Columns of the base model up to this number pay as in the BIC; more are curves, and pay as a random effect.
+FEW = 3
 #: Columns whitened at a time.
-CHUNK = 400
+CHUNK = 128
+#: Squared share of the raw columns of a group below which products of columns are too coarse for what is left of them.
+COARSE = 1e-4
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Facts about all groups, (groups,): number of the name, tier, visible dimensions ...
+
+    ``random``: charged as a random effect, as groups without a name are, and curves of many columns.
+    """
+
+    name: IntArray
+    tier: NDArray[np.object_]
+    size: IntArray
+    scans: IntArray
+    slow: NDArray[np.bool_]
+    predicts: NDArray[np.bool_]
+    random: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Design:
     """Groups in orthonormal coordinates of what is visible of them; K coordinates in all.
+
+    The whitened columns of all groups are never kept. Products of a member with every coordinate are formed on its side:
+    its direction is taken back through the whitening once, and multiplied by the raw columns, which are short or sparse.
 
     Parameters
     ----------
@@ -40,9 +67,9 @@ class Design:
     visible : share of each group that is left without the base model (RMS over its columns), (groups,).
     residual : whitened residual without its part in the base model, (N,).
     base : orthonormal columns of the whitened base model, (N, p).
-    directions : the coordinates as whitened columns, (N, K).
     whiten : the whitening.
     fit : the base fit.
+    kept : what was computed before, by what it is: products of members, sets.
     """
 
     groups: tuple[Group, ...]
@@ -52,17 +79,59 @@ class Design:
     visible: FloatArray
     residual: FloatArray
     base: FloatArray
-    directions: FloatArray
     whiten: Whitener
     fit: BaseFit
-    _rows: dict[int, FloatArray] = field(default_factory=dict)
+    kept: dict[Any, Any] = field(default_factory=dict)
 
     def rows(self, members: Sequence[int]) -> FloatArray:
         """Products of the coordinates of ``members`` with all coordinates, (r, K), computed when first asked for."""
-        for g in members:
-            if g not in self._rows:
-                self._rows[g] = self.directions[:, self.place(g)].T @ self.directions
-        return np.vstack([self._rows[g] for g in members]) if members else np.zeros((0, len(self.score)))
+        new = [g for g in members if g not in self.kept]
+        if new:
+            vectors = self.whiten.transposed(self.directions(new))
+            summed: dict[int, FloatArray] = {}
+            raw = np.vstack([source.products(vectors, summed) for source in self._sources])
+            found = np.ascontiguousarray((self._mapping.T @ raw).T)
+            ends = np.cumsum([0, *(self.size(g) for g in new)])
+            self.kept.update({g: found[ends[k] : ends[k + 1]] for k, g in enumerate(new)})
+        return np.vstack([self.kept[g] for g in members]) if members else np.zeros((0, len(self.score)))
+
+    @cached_property
+    def _sources(self) -> list[Placed | Scanned]:
+        return list({id(group.source): group.source for group in self.groups}.values())
+
+    @cached_property
+    def _mapping(self) -> csr_array:
+        """All maps as one sparse matrix (columns of all sources, K)."""
+        first = dict(zip(map(id, self._sources), np.cumsum([0, *(s.width for s in self._sources)]), strict=False))
+        values, rows, columns = [], [], []
+        for group, mapping, at in zip(self.groups, self.maps, self.start, strict=False):
+            row = first[id(group.source)] + (group.place.start if group.place else 0)
+            values.append(mapping.ravel())
+            rows.append(np.repeat(np.arange(row, row + mapping.shape[0]), mapping.shape[1]))
+            columns.append(np.tile(np.arange(at, at + mapping.shape[1]), mapping.shape[0]))
+        shape = (sum(source.width for source in self._sources), len(self.score))
+        return csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+
+    def directions(self, members: Sequence[int]) -> FloatArray:
+        """Coordinates of some groups as whitened columns, (N, r)."""
+        if not members:
+            return np.zeros((self.count, 0))
+        left = self.projected(np.hstack([_centred(self.fit, self.groups[g].columns) for g in members]))
+        ends = np.cumsum([0, *(len(self.maps[g]) for g in members)])
+        return np.hstack([left[:, ends[k] : ends[k + 1]] @ self.maps[g] for k, g in enumerate(members)])
+
+    def first(self, count: int) -> Design:
+        """Return the design with the first groups only."""
+        size = int(self.start[count])
+        return replace(
+            self,
+            groups=self.groups[:count],
+            start=self.start[: count + 1],
+            maps=self.maps[:count],
+            score=self.score[:size],
+            visible=self.visible[:count],
+            kept={},
+        )
 
     @property
     def total(self) -> float:
@@ -78,6 +147,20 @@ class Design:
     def freedom(self) -> int:
         """Readings less unknowns of the base model."""
         return self.count - int(self.base.shape[1])
+
+    @cached_property
+    def facts(self) -> Facts:
+        """What the search asks about all groups."""
+        size, tier = np.diff(self.start), np.array([group.tier for group in self.groups], dtype=object)
+        return Facts(
+            np.unique([group.name for group in self.groups], return_inverse=True)[1],
+            tier,
+            size,
+            np.array([group.scans for group in self.groups]),
+            np.array([group.slow for group in self.groups], dtype=bool),
+            np.array([group.predicts for group in self.groups], dtype=bool),
+            (tier == "generic") | ((tier == "base") & (size > FEW)),
+        )
 
     def size(self, group: int) -> int:
         """Visible dimensions of a group."""
@@ -108,90 +191,69 @@ def orthonormal(columns: FloatArray, least: float = 1e-9) -> FloatArray:
 
 
 def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design:
-    """Whiten, project and reduce all groups."""
+    """Whiten, project and reduce all groups, a few sources of columns at a time."""
     base = orthonormal(whiten(fit.jacobian))
     white = whiten(fit.residual_mm)
     residual = white - base @ (base.T @ white)
-    directions, maps, visible = [], [], []
-    for part in _chunks(groups):
-        raw = [_centred(fit, group.columns) for group in part]
-        sizes = np.cumsum([0, *(columns.shape[1] for columns in raw)])
-        tall = whiten(np.hstack(raw))
-        left = tall - base @ (base.T @ tall)
-        for k in range(len(part)):
-            place = slice(sizes[k], sizes[k + 1])
-            basis, mapping, share = _reduced(tall[:, place], left[:, place])
-            directions.append(basis)
-            maps.append(mapping)
-            visible.append(share)
-    stacked = np.hstack(directions) if directions else np.zeros((len(residual), 0))
-    start = np.cumsum([0, *(basis.shape[1] for basis in directions)]).astype(np.int64)
-    return Design(
-        tuple(groups),
-        start,
-        tuple(maps),
-        stacked.T @ residual,
-        np.array(visible),
-        residual,
-        base,
-        stacked,
-        whiten,
-        fit,
-    )
+    owners: dict[int, list[int]] = {}
+    for g, group in enumerate(groups):
+        owners.setdefault(id(group.source), []).append(g)
+    reduced: dict[int, tuple[FloatArray, FloatArray, float]] = {}
+    chunk: list[list[int]] = []
+    for own in [*owners.values(), []]:
+        width = sum(groups[of[0]].source.width for of in (*chunk, own) if of)
+        if chunk and (not own or width > CHUNK):
+            tall = whiten(_centred(fit, np.hstack([groups[of[0]].source.columns() for of in chunk])))
+            seen, score, at = base.T @ tall, residual @ tall, 0
+            for of in chunk:
+                for g in of:
+                    where = range(at, at + groups[g].source.width)[groups[g].place or slice(None)]
+                    mine = slice(where.start, where.stop)
+                    mapping, share = _reduced(tall[:, mine], seen[:, mine], base)
+                    reduced[g] = mapping, mapping.T @ score[mine], share
+                at += groups[of[0]].source.width
+            chunk = []
+        chunk.append(own)
+    maps, scores, visible = zip(*(reduced[g] for g in range(len(groups))), strict=True) if groups else ((), (), ())
+    start = np.cumsum([0, *(mapping.shape[1] for mapping in maps)]).astype(np.int64)
+    stacked = np.concatenate(scores) if scores else np.zeros(0)
+    return Design(tuple(groups), start, tuple(maps), stacked, np.array(visible), residual, base, whiten, fit)
 
 
 def _centred(fit: BaseFit, columns: FloatArray) -> FloatArray:
     """Columns without their mean at every channel, which a dead length takes up."""
     channel = fit.observed.layout.channel
-    count = np.bincount(channel).astype(np.float64)
-    result = columns.copy()
-    for k in range(columns.shape[1]):
-        result[:, k] -= (np.bincount(channel, columns[:, k]) / count)[channel]
-    return result
+    member = csr_array((np.ones(len(channel)), (np.arange(len(channel)), channel)))
+    mean = np.asarray(member.T @ columns) / np.bincount(channel)[:, None]
+    return np.asarray(columns - mean[channel])
 
 
-def _chunks(groups: Sequence[Group]) -> list[list[Group]]:
-    parts: list[list[Group]] = []
-    width = CHUNK
-    for group in groups:
-        if width + group.columns.shape[1] > CHUNK:
-            parts.append([])
-            width = 0
-        parts[-1].append(group)
-        width += group.columns.shape[1]
-    return parts
+def _reduced(raw: FloatArray, seen: FloatArray, base: FloatArray) -> tuple[FloatArray, float]:
+    """Map (k, m) of orthonormal visible directions to the parameters, and the visible share.
 
-
-def _reduced(raw: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Orthonormal visible directions (N, m), their map to the parameters (k, m), and the visible share.
-
-    The raw columns are first made orthonormal, so that the singular values of what is left are shares.
+    ``raw`` (N, k) are whitened columns, ``seen`` (p, k) their products with the base model. The raw columns are made
+    orthonormal first, so that the eigenvalues of what is left are squared shares.
     """
-    if raw.shape[1] == 1:
-        return _single(raw, left)
-    norm = np.linalg.norm(raw, axis=0)
-    present = norm > ROUNDING * norm.max()
-    norm = np.where(present, norm, np.inf)
-    square, vectors = np.linalg.eigh((raw / norm).T @ (raw / norm))
-    kept = square > 1e-8 * max(square[-1], 1e-300)
+    whole = raw.T @ raw
+    left = whole - seen.T @ seen
+    if len(whole) == 1:
+        share = float(np.sqrt(max(left[0, 0], 0.0) / whole[0, 0])) if whole[0, 0] > 0.0 else 0.0
+        return (np.array([[1.0 / np.sqrt(left[0, 0])]]) if share > LEAST_VISIBLE else np.zeros((1, 0))), share
+    norm = np.sqrt(np.diag(whole))
+    if not norm.any():
+        return np.zeros((len(whole), 0)), 0.0
+    norm = np.where(norm > ROUNDING * norm.max(), norm, np.inf)
+    square, vectors = np.linalg.eigh(whole / np.outer(norm, norm))
+    kept = square > 1e-8 * square[-1]
     turn = vectors[:, kept] / np.sqrt(square[kept]) / norm[:, None]
-    if not kept.any() or not np.any(raw):
-        return np.zeros((len(raw), 0)), np.zeros((raw.shape[1], 0)), 0.0
-    seen = left @ turn
-    share2, axes = np.linalg.eigh(seen.T @ seen)
+    if square[kept].min() < COARSE:
+        exact = (raw - base @ seen) @ turn
+        share2, axes = np.linalg.eigh(exact.T @ exact)
+    else:
+        share2, axes = np.linalg.eigh(turn.T @ left @ turn)
     visible = share2 > LEAST_VISIBLE**2
-    mapping = turn @ (axes[:, visible] / np.sqrt(share2[visible]))
-    share = np.sum((left / norm) ** 2) / max(float(np.sum((raw / norm) ** 2)), 1e-300)
-    return left @ mapping, mapping, float(np.sqrt(share))
-
-
-def _single(raw: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """The same for one column."""
-    whole, seen = float(np.linalg.norm(raw)), float(np.linalg.norm(left))
-    share = seen / whole if whole > 0.0 else 0.0
-    if share <= LEAST_VISIBLE:
-        return np.zeros((len(raw), 0)), np.zeros((1, 0)), share
-    return left / seen, np.array([[1.0 / seen]]), share
+    share = np.sum(np.diag(left) / norm**2) / np.sum(np.diag(whole) / norm**2)
+    return turn @ (axes[:, visible] / np.sqrt(share2[visible])), float(np.sqrt(max(share, 0.0)))
 
 
 # The search for the set of groups that explains the residual best: forward beam, drops and swaps, then a prune.
@@ -203,13 +265,13 @@ def _single(raw: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray, 
 #: Handicap of a generic group, and of one that depends on time or temperature.
 HANDICAP, SLOW_HANDICAP = 21.0, 27.0
 MOST_MEMBERS = 6
-#: Columns of the base model up to this number pay as in the BIC; more are curves, and pay as a random effect.
-FEW = 3
 BEAM, ADDITIONS = 2, 3
 #: Largest p-value of a member, corrected for the number of groups and scan positions.
 LARGEST_P = 1e-3
 #: Directions of which less than this (squared) is left without the other members say nothing.
 LEAST_SQUARE = 1e-6
+#: A determinant above this has no such direction (it is at most as large as the smallest eigenvalue, which is at most 1).
+SAFE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -222,6 +284,7 @@ class Rules:
     most_named, most_members : how many named effects and groups in all may be chosen.
     predicting : whether groups that say nothing about other readings (an offset of each line) are left out.
     generic : whether groups without a name may be chosen.
+    trials : number of distinct groups that are compared.
     """
 
     named: int
@@ -229,6 +292,7 @@ class Rules:
     most_members: int = MOST_MEMBERS
     predicting: bool = False
     generic: bool = True
+    trials: int = 1
 
 
 @dataclass(frozen=True)
@@ -244,29 +308,18 @@ class Chosen:
 def rules_of(design: Design, most_named: int) -> Rules:
     """Return the rules for the groups of a design."""
     names = {group.name for group in design.groups if group.tier == "named"}
-    return Rules(max(len(names), 1), most_named)
+    return Rules(max(len(names), 1), most_named, trials=len({group.name for group in design.groups}))
 
 
-def penalty(design: Design, rules: Rules, group: int, chi2: float) -> float:
-    """Penalty of a member that gains ``chi2``."""
-    item, k = design.groups[group], design.size(group)
-    if item.tier == "base" and not _is_random(design, group):
-        return k * float(np.log(design.count))
-    if item.tier == "named":
-        return k * float(np.log(design.count)) + 2 * float(np.log(rules.named)) + 2 * float(np.log(item.scans))
-    handicap = SLOW_HANDICAP if item.slow else HANDICAP
-    return k + k * float(np.log(max(chi2 / max(k, 1), 1.0))) + handicap
-
-
-def _is_random(design: Design, group: int) -> bool:
-    """Whether a group is charged as a random effect: those without a name, and curves of many columns."""
-    tier = design.groups[group].tier
-    return tier == "generic" or (tier == "base" and design.size(group) > FEW)
-
-
-def _ordered(design: Design, members: Sequence[int]) -> list[int]:
-    rank = {"base": 0, "named": 1, "generic": 2}
-    return sorted(members, key=lambda g: (_is_random(design, g), rank[design.groups[g].tier]))
+def penalties(design: Design, rules: Rules, groups: Sequence[int], chi2: FloatArray) -> FloatArray:
+    """Penalty of each of some members that gain ``chi2``, (m,)."""
+    facts = design.facts
+    tier, k = facts.tier[groups], facts.size[groups]
+    plain = k * np.log(design.count)
+    named = plain + 2 * np.log(rules.named) + 2 * np.log(facts.scans[groups])
+    handicap = np.where(facts.slow[groups], SLOW_HANDICAP, HANDICAP)
+    random = k + k * np.log(np.maximum(chi2 / np.maximum(k, 1), 1.0)) + handicap
+    return np.where(facts.random[groups], random, np.where(tier == "named", named, plain))
 
 
 @dataclass(frozen=True)
@@ -292,80 +345,105 @@ def remainder_of(design: Design, members: Sequence[int]) -> Remainder:
     return Remainder(cross, design.score - own @ cross, float(own @ own))
 
 
+def explained(design: Design, members: Sequence[int]) -> float:
+    """chi-square of a set."""
+    key = "explained", frozenset(members)
+    if key not in design.kept:
+        index = design.coordinates(members)
+        square, vectors = np.linalg.eigh(design.rows(members)[:, index])
+        kept = square > LEAST_SQUARE
+        design.kept[key] = float(np.sum((vectors[:, kept].T @ design.score[index]) ** 2 / square[kept]))
+    return float(design.kept[key])
+
+
 def gains(design: Design, left: Remainder, wanted: Sequence[int]) -> FloatArray:
-    """chi-square that each of the groups ``wanted`` would gain in addition to the set."""
+    """chi-square that each of the groups ``wanted`` would gain in addition to the set.
+
+    s' (I - c'c)^-1 s of the products c (r, k) of a group with the set and its scores s, for all groups of one size
+    together; through (I - cc')^-1 where the set is smaller than the group.
+    """
     result = np.zeros(len(wanted))
-    sizes = np.diff(design.start)[list(wanted)]
-    single = np.flatnonzero(sizes == 1)
-    at = design.start[:-1][np.asarray(wanted, dtype=np.int64)[single]]
-    square = 1.0 - np.einsum("rk,rk->k", left.cross[:, at], left.cross[:, at])
-    result[single] = np.where(square > LEAST_SQUARE, left.score[at] ** 2 / np.maximum(square, LEAST_SQUARE), 0.0)
-    for k in np.flatnonzero(sizes > 1).tolist():
-        place = design.place(wanted[k])
-        cross = left.cross[:, place]
-        values, vectors = np.linalg.eigh(np.eye(cross.shape[1]) - cross.T @ cross)
-        kept = values > LEAST_SQUARE
-        result[k] = float(np.sum((vectors[:, kept].T @ left.score[place]) ** 2 / values[kept]))
+    sizes = design.facts.size[list(wanted)]
+    first = design.start[:-1][np.asarray(wanted, dtype=np.int64)]
+    for k in np.unique(sizes[sizes > 0]).tolist():
+        alike = np.flatnonzero(sizes == k)
+        at = first[alike][:, None] + np.arange(k)
+        score, cross = left.score[at], left.cross[:, at].transpose(1, 0, 2)
+        found = np.einsum("gk,gk->g", score, score)
+        if k == 1:
+            square = 1.0 - np.einsum("grk,grk->g", cross, cross)
+            result[alike] = np.where(square > LEAST_SQUARE, found / np.maximum(square, LEAST_SQUARE), 0.0)
+            continue
+        short = cross.shape[1] < k
+        inner = cross @ cross.transpose(0, 2, 1) if short else cross.transpose(0, 2, 1) @ cross
+        seen = np.einsum("grk,gk->gr", cross, score) if short else score
+        apart = np.eye(inner.shape[1]) - inner
+        # directions that the set holds as well say nothing: where there may be some, they are left out one by one
+        with np.errstate(all="ignore"):
+            safe = np.abs(np.linalg.det(apart)) > SAFE
+        if safe.any():
+            solved = np.linalg.solve(apart[safe], seen[safe][:, :, None])[:, :, 0]
+            further = np.einsum("gr,gr->g", seen[safe], solved)
+            result[alike[safe]] = found[safe] + further if short else further
+        for g in np.flatnonzero(~safe).tolist():
+            values, vectors = np.linalg.eigh(np.eye(k) - cross[g].T @ cross[g])
+            kept = values > LEAST_SQUARE
+            result[alike[g]] = float(np.sum((vectors[:, kept].T @ score[g]) ** 2 / values[kept]))
     return result
 
 
 def evaluate(design: Design, rules: Rules, members: Sequence[int]) -> Chosen:
     """Criterion of a set; named members enter first."""
-    order = _ordered(design, members)
-    found, total = [], 0.0
-    criterion = 0.0
-    fixed = [g for g in order if not _is_random(design, g)]
-    known = remainder_of(design, fixed).chi2
-    criterion += sum(penalty(design, rules, g, 0.0) for g in fixed) - known
-    found += [gain_of(design, [f for f in fixed if f != g], g) for g in fixed]
-    total = known
-    for k, group in enumerate(order[len(fixed) :]):
-        chi2 = remainder_of(design, order[: len(fixed) + k + 1]).chi2
-        found.append(chi2 - total)
-        criterion += penalty(design, rules, group, chi2 - total) - (chi2 - total)
-        total = chi2
-    return Chosen(tuple(order), criterion, total, tuple(found))
+    facts = design.facts
+    rank = {"base": 0, "named": 1, "generic": 2}
+    order = sorted(members, key=lambda g: (facts.random[g], rank[design.groups[g].tier]))
+    key = rules.named, tuple(order)
+    if key not in design.kept:
+        fixed = [g for g in order if not facts.random[g]]
+        totals = [explained(design, order[:k]) for k in range(len(fixed), len(order) + 1)]
+        found = [gain_of(design, [f for f in fixed if f != g], g) for g in fixed] + np.diff(totals).tolist()
+        costs = penalties(design, rules, order, np.array(found))
+        design.kept[key] = Chosen(tuple(order), float(costs.sum()) - totals[-1], totals[-1], tuple(found))
+    chosen: Chosen = design.kept[key]
+    return chosen
 
 
 def gain_of(design: Design, others: Sequence[int], group: int) -> float:
     """chi-square that a group gains in addition to others."""
-    return float(gains(design, remainder_of(design, others), [group])[0])
+    return explained(design, [*others, group]) - explained(design, others)
 
 
 def allowed_with(design: Design, rules: Rules, members: Sequence[int]) -> list[int]:
     """Groups that may be added: of another name, visible, allowed by the rules, and within the numbers allowed."""
-    names = {design.groups[g].name for g in members}
-    reported = [g for g in members if design.groups[g].tier != "base"]
-    named = sum(design.groups[g].tier == "named" for g in members)
-    found = []
-    for g, group in enumerate(design.groups):
-        if group.name in names or not design.size(g) or (rules.predicting and not group.predicts):
-            continue
-        if group.tier == "named" and named >= rules.most_named:
-            continue
-        if group.tier == "generic" and not rules.generic:
-            continue
-        if group.tier != "base" and len(reported) >= rules.most_members:
-            continue
-        found.append(g)
-    return found
+    facts = design.facts
+    allowed = (facts.size > 0) & ~np.isin(facts.name, facts.name[list(members)])
+    if rules.predicting:
+        allowed &= facts.predicts
+    if np.sum(facts.tier[list(members)] == "named") >= rules.most_named:
+        allowed &= facts.tier != "named"
+    if not rules.generic:
+        allowed &= facts.tier != "generic"
+    if np.sum(facts.tier[list(members)] != "base") >= rules.most_members:
+        allowed &= facts.tier == "base"
+    return np.flatnonzero(allowed).tolist()
 
 
 def _best_additions(design: Design, rules: Rules, members: Sequence[int], most: int) -> list[Chosen]:
     """The sets with one more group that lower the criterion most."""
-    allowed = allowed_with(design, rules, members)
-    if not allowed:
-        return []
-    gained = gains(design, remainder_of(design, members), allowed)
-    merit = np.array([g - penalty(design, rules, a, g) for g, a in zip(gained, allowed, strict=True)])
-    best: dict[str, Chosen] = {}
-    for k in np.argsort(-merit)[: 4 * most]:
-        name = design.groups[allowed[k]].name
-        if merit[k] <= -10.0 or len(best) >= most:
+    key = "additions", rules, frozenset(members)
+    if key not in design.kept:
+        allowed = allowed_with(design, rules, members)
+        gained = gains(design, remainder_of(design, members), allowed)
+        merit = gained - penalties(design, rules, allowed, gained)
+        first = np.argsort(-merit)[: 4 * max(ADDITIONS, most)]
+        design.kept[key] = [(allowed[k], float(merit[k])) for k in first]
+    best: dict[str, int] = {}
+    for g, merit in design.kept[key][: 4 * most]:
+        if merit <= -10.0 or len(best) >= most:
             break
-        if name not in best:
-            best[name] = evaluate(design, rules, [*members, allowed[k]])
-    return list(best.values())
+        best.setdefault(design.groups[g].name, g)
+    design.rows(list(best.values()))
+    return [evaluate(design, rules, [*members, g]) for g in best.values()]
 
 
 def search(design: Design, rules: Rules, start: Sequence[int] = ()) -> Chosen:
@@ -459,10 +537,9 @@ def prune(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
     """Drop the least significant member as long as its corrected p-value is too large."""
     from scipy.stats import f as f_distribution  # imported here: slow to load
 
-    trials = len({group.name for group in design.groups})
     members = list(chosen.members)
     while members:
-        left = design.total - remainder_of(design, members).chi2
+        left = design.total - explained(design, members)
         freedom = design.freedom - len(design.coordinates(members))
         worst, largest = -1, 0.0
         for member in members:
@@ -471,7 +548,7 @@ def prune(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
             k = max(design.size(member), 1)
             gain = gain_of(design, [g for g in members if g != member], member)
             ratio = gain / k / max(left / max(freedom, 1), 1e-300)
-            p = float(f_distribution.sf(ratio, k, design.count / 2)) * trials * design.groups[member].scans
+            p = float(f_distribution.sf(ratio, k, design.count / 2)) * rules.trials * design.groups[member].scans
             if p > largest:
                 worst, largest = member, p
         if largest <= LARGEST_P:
@@ -507,8 +584,9 @@ def alternatives(design: Design, rules: Rules, chosen: Chosen, member: int) -> l
     rough: dict[int, tuple[float, list[int]]] = {}
     for base in ([], *bases):
         known = evaluate(design, rules, [*rest, *base]).criterion
-        for g, gain in zip(allowed, gains(design, remainder_of(design, [*rest, *base]), allowed), strict=True):
-            value = known + penalty(design, rules, g, 0.0) - float(gain)
+        gained = gains(design, remainder_of(design, [*rest, *base]), allowed)
+        values = known + penalties(design, rules, allowed, np.zeros(len(allowed))) - gained
+        for g, value in zip(allowed, values.tolist(), strict=True):
             if g not in rough or value < rough[g][0]:
                 rough[g] = value, [*rest, *base]
     reference = rough[member][0] if member in rough else 0.0
@@ -517,9 +595,9 @@ def alternatives(design: Design, rules: Rules, chosen: Chosen, member: int) -> l
         if design.groups[g].name not in best and rough[g][0] - reference < 3 * WITHIN:
             best[design.groups[g].name] = g
     best[design.groups[member].name] = member
-    values = {name: evaluate(design, rules, [*rough.get(g, (0.0, rest))[1], g]).criterion for name, g in best.items()}
-    least = min(values.values())
-    kept = {name: value for name, value in values.items() if value - least <= WITHIN}
+    criteria = {name: evaluate(design, rules, [*rough.get(g, (0.0, rest))[1], g]).criterion for name, g in best.items()}
+    least = min(criteria.values())
+    kept = {name: value for name, value in criteria.items() if value - least <= WITHIN}
     weights = {name: float(np.exp(-0.5 * (value - least))) for name, value in kept.items()}
     total = sum(weights.values())
     found = [Alternative(name, weight / total, best[name]) for name, weight in weights.items()]
