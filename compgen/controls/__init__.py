@@ -92,21 +92,18 @@ def controller_named(name: str) -> type[AnyController]:
     if name not in CONTROLLERS:
         from compgen.data.registry import why_missing
 
-        raise InputError(f"no controller is named {name!r}; {_hint(name)}{why_missing(CONTROLLERS.broken, name)}")
+        # what was probably meant: the controls with it in their name, in the title of their card, anywhere in the card
+        folders = {known: control.templates or data_folder("templates") for known, control in CONTROLLERS.items()}
+        cards = {known: folder / known / "format.toml" for known, folder in folders.items()}
+        texts = {known: read_text(path) for known, path in cards.items() if path.is_file()}
+        titles = {
+            known: next((line for line in text.splitlines() if line.startswith("title")), "")
+            for known, text in texts.items()
+        }
+        hint = nearest(name, CONTROLLERS, titles, alike=0.7)
+        hint = hint if "did you mean" in hint else nearest(name, CONTROLLERS, texts)
+        raise InputError(f"no controller is named {name!r}; {hint}{why_missing(CONTROLLERS.broken, name)}")
     return CONTROLLERS[name]
-
-
-def _hint(name: str) -> str:
-    """What was probably meant: the controls with it in their name, in the title of their card, anywhere in the card."""
-    shipped = data_folder("templates")
-    cards = {known: (CONTROLLERS.templates(known) or shipped) / known / "format.toml" for known in CONTROLLERS}
-    texts = {known: read_text(path) for known, path in cards.items() if path.is_file()}
-    titles = {
-        known: next((line for line in text.splitlines() if line.startswith("title")), "")
-        for known, text in texts.items()
-    }
-    hint = nearest(name, CONTROLLERS, titles, alike=0.7)
-    return hint if "did you mean" in hint else nearest(name, CONTROLLERS, texts)
 
 
 __all__ = ["CONTROLLERS", "AnyController", "Controller", "Monomial", "SourceFile", "Term", "controller_named"]

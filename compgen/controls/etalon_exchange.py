@@ -62,9 +62,22 @@ def parse_etalon(source: SourceFile) -> ParameterFile:
     if sections and sections[-1].open:
         raise source.fail(f"[{sections[-1].name}] has no closing brace: the file was cut", sections[-1].line)
     records = sum(len(section.rows) if section.grid else 1 for section in sections)
-    parameters = tuple(_parameter(source, section) for section in sections)
+    parameters = []
+    for section in sections:
+        name, line = section.name, section.line
+        if section.value is not None:
+            parameters.append(ErrorParameter(name, ParameterGrid((), (), np.array(section.value)), source, line))
+            continue
+        if not section.rows:
+            raise source.fail(f"[{name}] has no values; was the file cut?", line)
+        if name in ISO_NAMES and ISO_NAMES[name] in SQUARENESS_NAMES:
+            raise source.fail(f"[{name}] is a constant; expected 'VALUE = number'", line)
+        pairs = np.array([[floating(source, at, word, name) for word in words] for at, words in section.rows])
+        nodes, order = grid_order(source, [at for at, _ in section.rows], [pairs[:, 0]])
+        axis = 0 if is_rotary(name) else ARGUMENTS.index(name[-1])
+        parameters.append(ErrorParameter(name, ParameterGrid((axis,), nodes, pairs[order, 1]), source, line))
     check_complete(source, records)
-    return ParameterFile(parameters, records, exponent)
+    return ParameterFile(tuple(parameters), records, exponent)
 
 
 def _take_line(source: SourceFile, sections: list[_Section], line: int, text: str) -> None:
@@ -81,19 +94,16 @@ def _take_line(source: SourceFile, sections: list[_Section], line: int, text: st
     elif current is None:
         raise source.fail(f"expected a parameter name in brackets such as [EXX], found {text[:40]!r}", line)
     elif current.open:
-        _take_row(source, current, line, text)
+        row, brace, rest = text.partition("}")
+        words = row.split()
+        if rest or len(words) not in ((0, 2) if brace else (2,)):
+            message = f"expected two numbers 'argument value' or '}}' in [{current.name}], got {text[:40]!r}"
+            raise source.fail(message, line)
+        if words:
+            current.rows.append((line, words))
+        current.open = not brace
     else:
         _take_entry(source, current, line, text)
-
-
-def _take_row(source: SourceFile, section: _Section, line: int, text: str) -> None:
-    row, brace, rest = text.partition("}")
-    words = row.split()
-    if rest or len(words) not in ((0, 2) if brace else (2,)):
-        raise source.fail(f"expected two numbers 'argument value' or '}}' in [{section.name}], got {text[:40]!r}", line)
-    if words:
-        section.rows.append((line, words))
-    section.open = not brace
 
 
 def _take_entry(source: SourceFile, section: _Section, line: int, text: str) -> None:
@@ -107,20 +117,6 @@ def _take_entry(source: SourceFile, section: _Section, line: int, text: str) -> 
     else:
         message = f"expected 'VALUE = number' or 'Gridpoints = {{' in [{section.name}], got {text[:40]!r}"
         raise source.fail(message, line)
-
-
-def _parameter(source: SourceFile, section: _Section) -> ErrorParameter:
-    name, line = section.name, section.line
-    if section.value is not None:
-        return ErrorParameter(name, ParameterGrid((), (), np.array(section.value)), source, line)
-    if not section.rows:
-        raise source.fail(f"[{name}] has no values; was the file cut?", line)
-    if name in ISO_NAMES and ISO_NAMES[name] in SQUARENESS_NAMES:
-        raise source.fail(f"[{name}] is a constant; expected 'VALUE = number'", line)
-    pairs = np.array([[floating(source, at, word, name) for word in words] for at, words in section.rows])
-    nodes, order = grid_order(source, [at for at, _ in section.rows], [pairs[:, 0]])
-    axis = 0 if is_rotary(name) else ARGUMENTS.index(name[-1])
-    return ErrorParameter(name, ParameterGrid((axis,), nodes, pairs[order, 1]), source, line)
 
 
 def is_exchange_text(text: str) -> bool:

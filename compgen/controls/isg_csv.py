@@ -82,7 +82,12 @@ def _block(source: SourceFile, block: list[_Row]) -> list[ErrorParameter]:
     )
     columns = {name: matrix[:, k] for k, name in enumerate(names)}
     if any(name in "ABC" for name in names):
-        return _rotary_block(source, header_line, names)
+        mixed = [name for name in names if len(name) > 1 and not is_rotary(name)]
+        if mixed:
+            raise source.fail(f"{mixed[0]} depends on a rotary axis; the model has three linear axes", header_line)
+        where = f"{source.path}:{header_line}"
+        warnings.warn(f"{where}: the block belongs to a rotary axis and is left out", CompgenWarning, stacklevel=2)
+        return []
     arguments = [name for name in names if name in ARGUMENTS]
     nodes, order = grid_order(source, [line for line, _ in rows], [columns[name] for name in arguments])
     axes = tuple(ARGUMENTS.index(name) for name in arguments)
@@ -104,16 +109,6 @@ def _check_header(source: SourceFile, line: int, names: list[str]) -> None:
         raise source.fail(f"the header names {twice} twice (the control's error 70469)", line)
     if all(len(name) == 1 for name in names):
         raise source.fail("the header has arguments only; expected at least one error parameter", line)
-
-
-def _rotary_block(source: SourceFile, line: int, names: list[str]) -> list[ErrorParameter]:
-    mixed = [name for name in names if len(name) > 1 and not is_rotary(name)]
-    if mixed:
-        raise source.fail(f"{mixed[0]} depends on a rotary axis; the model has three linear axes", line)
-    warnings.warn(
-        f"{source.path}:{line}: the block belongs to a rotary axis and is left out", CompgenWarning, stacklevel=2
-    )
-    return []
 
 
 class IsgCsv(VolumetricController):

@@ -102,21 +102,6 @@ class IsgTables:
     remarks: tuple[str, ...] = ()
 
 
-def disagreements(listing: ListFile, wanted: ListFile) -> list[str]:
-    """Return where a list file differs from the one that the machine file asks for, in words."""
-    pairs: list[tuple[str, object, object]] = [
-        ("chain", listing.chain, wanted.chain),
-        ("workpiece_axes", listing.workpiece_axes, wanted.workpiece_axes),
-        ("negate", listing.negate or "nothing", wanted.negate or "nothing"),
-        *zip(AXES, listing.logical_axes, wanted.logical_axes, strict=True),
-    ]
-    return [
-        f"list file: {key} is {given if given is not None else 'missing'}, the machine file makes it {due}"
-        for key, given, due in pairs
-        if given != due
-    ]
-
-
 # Words for the people at the machine: what the exported files of the ISG kernel say, and what must be set and checked.
 
 
@@ -244,13 +229,19 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
     def emulate(self, tables: IsgTables, points: Points) -> FloatArray:
         """Return minus E = C P of the parsed numbers with the chain of the list file (of the machine without one).
 
-        The tool offset is the points', else P0X, P0Y, P0Z of the file, else the machine's. Sign: ``result_signs``.
+        The tool offset is the points', else P0X, P0Y, P0Z of the file, else the machine's.
         """
         listing = tables.listing
         chain = self.machine.chain if listing is None else chain_of(listing, self.settings.chain_direction)
         position = np.asarray(points.position_mm, dtype=np.float64)
         tool = points.tool_mm if points.tool_mm is not None else self.tool_of(tables)
-        return error_of(chain, tables.fields, position, np.asarray(tool)) * self._result_signs(listing) + 0.0
+        # the error of each axis enters the command with -1, or +1, or 0 (set_to_zero)
+        negate = self.settings.negate if listing is None else listing.negate
+        blank = "" if listing is None else listing.set_to_zero
+        signs = np.array([1.0 if letter in self.settings.reversed_axes else -1.0 for letter in AXES])
+        signs[[letter in negate for letter in AXES]] *= -1.0
+        signs[[letter in blank for letter in AXES]] = 0.0
+        return np.asarray(error_of(chain, tables.fields, position, np.asarray(tool)) * signs + 0.0)
 
     def tool_of(self, tables: IsgTables) -> FloatArray:
         """Tool offset that the control uses without a tool of its own, shape (3,), mm."""
@@ -267,19 +258,35 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
                 f"{tables.records} records, max_records is {settings.max_records}: the control refuses the file; raise "
                 f"vol_comp[0].max_records in the start-up list and max_records in the machine file"
             )
-        found += self._coverage(tables.fields)
+        uncovered: dict[str, list[str]] = {}  # one message per axis and range, naming the errors that it holds for
+        for name, item in tables.fields.items():
+            for axis, nodes in zip(item.axes, item.nodes_mm, strict=True):
+                for message in coverage_violations(self.machine, axis, float(nodes[0]), float(nodes[-1]), ""):
+                    uncovered.setdefault(message, []).append(name)
+        found += [f"{', '.join(listed)}:{message}" for message, listed in uncovered.items()]
         for k, name in enumerate(LOGICAL_NAMES):
             if name in tables.constants and tables.constants[name] != settings.logical_axes[k]:
                 found.append(f"{name} = {tables.constants[name]:g}, the machine file says {settings.logical_axes[k]}")
         return found + self._list_violations(tables)
 
     def _list_violations(self, tables: IsgTables) -> list[str]:
+        """Return where the list file differs from the one that the machine file asks for, or from the files given."""
         if tables.listing is None:
             return [f"{len(tables.files)} parameter files, the control takes {MOST_FILES}"] * (
                 len(tables.files) > MOST_FILES
             )
         listing, wanted = tables.listing, self._list_of(self.parameter_file, self.file_format)
-        found = disagreements(listing, wanted)
+        pairs: list[tuple[str, object, object]] = [
+            ("chain", listing.chain, wanted.chain),
+            ("workpiece_axes", listing.workpiece_axes, wanted.workpiece_axes),
+            ("negate", listing.negate or "nothing", wanted.negate or "nothing"),
+            *zip(AXES, listing.logical_axes, wanted.logical_axes, strict=True),
+        ]
+        found = [
+            f"list file: {key} is {given if given is not None else 'missing'}, the machine file makes it {due}"
+            for key, given, due in pairs
+            if given != due
+        ]
         if len(listing.files) > MOST_FILES or max(listing.files) >= MOST_FILES:
             found.append(f"list file: {len(listing.files)} files; the control takes {MOST_FILES}, file[0] ... file[9]")
         if listing.use_axis_offsets:
@@ -313,8 +320,20 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
     def context(self, tables: IsgTables) -> dict[str, Any]:
         """Return what the templates need: numbers, list entries, the sign in words, parameters and checks."""
         listing = tables.listing or self._list_of(self.parameter_file, self.file_format)
+        # the grid point of 3 x 3 x 3 with the largest correction of each axis
+        lines = [(axis.range_mm[0], 0.5 * sum(axis.range_mm), axis.range_mm[1]) for axis in self.machine.axes]
+        position = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+        added = self.emulate(tables, Points(position))
+        worst = np.argmax(np.abs(added), axis=0)
+        reference = "the reference direction is X, as in the machine file"
+        if self.machine.squareness_reference == "Y":
+            reference = "the machine file takes Y as the reference: its squareness of X and Y is a slope in EYX here, C0Y is zero"
         return {
-            **self._notes(tables, listing),
+            "sign_statement": self._sign_statement(listing),
+            "chain_statement": self._chain_statement(listing),
+            "reference_statement": reference,
+            "parameters": self._parameters(tables, listing),
+            "warnings": self._warnings(listing),
             **self.body(tables),
             "tables": tables,
             "records": tables.records,
@@ -324,19 +343,11 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
                 {"letter": letter, "number": number} for letter, number in zip(AXES, listing.logical_axes, strict=True)
             ],
             "absent": [CONTROL_NAMES[name] for name in ERROR_NAMES if name not in tables.fields],
-            "check": self._check_points(tables),
+            "check": [
+                {"axis": letter, "position": position[worst[k]].tolist(), "correction": float(added[worst[k], k])}
+                for k, letter in enumerate(AXES)
+            ],
         }
-
-    def _check_points(self, tables: IsgTables) -> list[dict[str, Any]]:
-        """For each axis the grid point of 3 x 3 x 3 with its largest correction."""
-        lines = [(axis.range_mm[0], 0.5 * sum(axis.range_mm), axis.range_mm[1]) for axis in self.machine.axes]
-        position = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        added = self.emulate(tables, Points(position))
-        worst = np.argmax(np.abs(added), axis=0)
-        return [
-            {"axis": letter, "position": position[worst[k]].tolist(), "correction": float(added[worst[k], k])}
-            for k, letter in enumerate(AXES)
-        ]
 
     def _list_of(self, parameter_file: str, file_format: str) -> ListFile:
         """Return the list file that the export writes."""
@@ -350,16 +361,6 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
             files={0: settings.path + parameter_file},
             formats={0: file_format},
         )
-
-    def _notes(self, tables: IsgTables, listing: ListFile) -> dict[str, Any]:
-        """Return the texts of the context: sign_statement, chain_statement, parameters, warnings."""
-        return {
-            "sign_statement": self._sign_statement(listing),
-            "chain_statement": self._chain_statement(listing),
-            "reference_statement": self._reference_statement(),
-            "parameters": self._parameters(tables, listing),
-            "warnings": self._warnings(listing),
-        }
 
     def _sign_statement(self, listing: ListFile) -> str:
         settings = self.settings
@@ -378,11 +379,6 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
             f"chain {listing.chain} is meant {_DIRECTIONS[settings.chain_direction]}, {listing.workpiece_axes} of these axes "
             f"carry the workpiece"
         )
-
-    def _reference_statement(self) -> str:
-        if self.machine.squareness_reference == "Y":
-            return "the machine file takes Y as the reference: its squareness of X and Y is a slope in EYX here, C0Y is zero"
-        return "the reference direction is X, as in the machine file"
 
     def _parameters(self, tables: IsgTables, listing: ListFile) -> list[dict[str, object]]:
         settings = self.settings
@@ -429,21 +425,3 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
                 "use_axis_offsets 1: what the control then shifts is not documented in public and not emulated."
             )
         return found
-
-    def _result_signs(self, listing: ListFile | None) -> FloatArray:
-        """Sign, shape (3,), with which the error of each axis enters the command: -1, or +1, or 0 (set_to_zero)."""
-        negate = self.settings.negate if listing is None else listing.negate
-        blank = "" if listing is None else listing.set_to_zero
-        signs = np.array([1.0 if letter in self.settings.reversed_axes else -1.0 for letter in AXES])
-        signs[[letter in negate for letter in AXES]] *= -1.0
-        signs[[letter in blank for letter in AXES]] = 0.0
-        return signs
-
-    def _coverage(self, fields: Mapping[str, ParameterGrid]) -> list[str]:
-        """One message per axis and range, naming the errors that it holds for."""
-        names: dict[str, list[str]] = {}
-        for name, item in fields.items():
-            for axis, nodes in zip(item.axes, item.nodes_mm, strict=True):
-                for message in coverage_violations(self.machine, axis, float(nodes[0]), float(nodes[-1]), ""):
-                    names.setdefault(message, []).append(name)
-        return [f"{', '.join(listed)}:{message}" for message, listed in names.items()]

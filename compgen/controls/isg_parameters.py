@@ -17,6 +17,7 @@ from compgen.controls.shared.scanner import check_complete, content_lines
 from compgen.data.machine import Chain
 from compgen.data.messages import nearest
 from compgen.data.names import ERROR_NAMES, SQUARENESS_NAMES
+from compgen.data.toml_files import choice
 from compgen.errors import CompgenWarning
 
 # Error parameters of the ISG kernel's volumetric compensation: names, grids and strict numbers of both file formats.
@@ -99,7 +100,15 @@ def collect(parameters: Sequence[ErrorParameter]) -> tuple[dict[str, ParameterGr
         seen[item.name] = item
     fields = {ISO_NAMES[name]: item.field for name, item in seen.items() if name in ISO_NAMES}
     constants = {name: _constant(item) for name, item in seen.items() if name in (*TOOL_NAMES, *LOGICAL_NAMES)}
-    _check_rest({name: item for name, item in seen.items() if name not in ISO_NAMES and name not in constants})
+    rest = {name: item for name, item in seen.items() if name not in ISO_NAMES and name not in constants}
+    if rotary := [name for name in rest if is_rotary(name)]:
+        source, listed = rest[rotary[0]].source.path, ", ".join(rotary)
+        message = f"{source}: {listed} belong to rotary axes and are left out; the model has three linear axes"
+        warnings.warn(message, CompgenWarning, stacklevel=2)
+    for name, item in rest.items():
+        if name not in rotary and name not in _ORIENTATION_NAMES and np.any(item.field.values != 0.0):
+            message = f"{item.name} is not zero, but the model has only {', '.join(ISO_NAMES)}; express it by these"
+            raise item.source.fail(message, item.line)
     if not fields:
         raise parameters[0].source.fail("holds none of the 21 errors of three linear axes", parameters[0].line)
     return {name: fields[name] for name in ERROR_NAMES if name in fields}, constants
@@ -109,22 +118,6 @@ def _constant(item: ErrorParameter) -> float:
     if item.field.axes:
         raise item.source.fail(f"{item.name} is a constant; it takes no argument", item.line)
     return float(item.field.values)
-
-
-def _check_rest(rest: Mapping[str, ErrorParameter]) -> None:
-    rotary = [name for name in rest if is_rotary(name)]
-    if rotary:
-        source = rest[rotary[0]].source.path
-        listed = ", ".join(rotary)
-        warnings.warn(
-            f"{source}: {listed} belong to rotary axes and are left out; the model has three linear axes",
-            CompgenWarning,
-            stacklevel=2,
-        )
-    for name, item in rest.items():
-        if name not in rotary and name not in _ORIENTATION_NAMES and np.any(item.field.values != 0.0):
-            message = f"{item.name} is not zero, but the model has only {', '.join(ISO_NAMES)}; express it by these"
-            raise item.source.fail(message, item.line)
 
 
 # The list file (``volcomp0.lis``) that configures one volumetric compensation of the ISG kernel.
@@ -203,14 +196,15 @@ def parse_list(source: SourceFile) -> ListFile:
     formats = {int(key[12:-1]): value.upper() for key, (value, _) in entries.items() if key.startswith("file_format[")}
     if not files:
         raise source.fail("names no parameter file: file[0] is missing; was the list cut?")
+    known = choice("GRID", "AUTO")  # other modes interpolate in a way that is not documented in public
     axes = tuple(_take(source, entries, letter, _whole(1, 65535), None) for letter in "xyz")
     return ListFile(
         logical_axes=(axes[0], axes[1], axes[2]),
-        chain=_take(source, entries, "chain", _order, "XYZ"),
+        chain=_take(source, entries, "chain", choice(*map("".join, itertools.permutations("XYZ"))), "XYZ"),
         workpiece_axes=_take(source, entries, "workpiece_axes", _whole(0, 3), 0),
         negate=_take(source, entries, "negate", axis_letters, ""),
         set_to_zero=_take(source, entries, "set_to_zero", axis_letters, ""),
-        interpolation=_take(source, entries, "interpolation", _interpolation, "GRID"),
+        interpolation=_take(source, entries, "interpolation", lambda word: known(word.upper()), "GRID"),
         use_axis_offsets=_take(source, entries, "use_axis_offsets", _whole(0, 1), 0),
         files=files,
         formats=formats,
@@ -260,15 +254,3 @@ def axis_letters(value: object) -> str:
     if not isinstance(value, str) or len(set(value)) != len(value) or not set(value) <= set("XYZ"):
         raise ValueError("some of the letters X, Y, Z, each once, are expected")
     return "".join(sorted(value))
-
-
-def _order(value: str) -> str:
-    if sorted(value) != ["X", "Y", "Z"]:
-        raise ValueError("X, Y and Z, each once, are expected (rotary axes are not modelled)")
-    return value
-
-
-def _interpolation(value: str) -> str:
-    if value.upper() not in ("GRID", "AUTO"):
-        raise ValueError("GRID or AUTO is expected; other modes interpolate in a way that is not documented in public")
-    return value.upper()

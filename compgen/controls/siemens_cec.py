@@ -57,6 +57,7 @@ from compgen.controls.siemens_text import (
     ArchiveAssignments,
     ArchiveFindings,
     Assignment,
+    LinearTable,
     TableParts,
     axis_of,
     foreign_assignments,
@@ -217,25 +218,21 @@ class SiemensCec(Controller[CecSettings, CecTables]):
                 index for index in range(len(settings.kept_tables) + 2) if index not in settings.kept_tables
             ],
             "overwrites": cec_overwrites(tables.tables, settings.kept_tables),
-            "tables": [self._table_context(index, entry) for index, entry in sorted(tables.tables.items())],
-        }
-
-    def _table_context(self, index: int, entry: CecTable) -> dict[str, Any]:
-        return {
-            "index": index,
-            "label": entry.label,
-            "input": self._styled(entry.input_axis),
-            "output": self._styled(entry.output_axis),
-            "step_mm": float(entry.table.step_mm),
-            "minimum_mm": float(entry.table.start_mm),
-            "maximum_mm": float(entry.table.last_mm),
-            "direction": entry.direction,
-            "multiplier": entry.multiplier,
-            "modulo": int(entry.table.modulo),
-            "enabled": int(entry.enabled),
-            "weight": float(entry.weight),
-            "decimals": entry.decimals,
-            "values_mm": [float(value) for value in entry.table.values],
+            "tables": [
+                {
+                    **entry.table.context(),
+                    "index": index,
+                    "label": entry.label,
+                    "input": self._styled(entry.input_axis),
+                    "output": self._styled(entry.output_axis),
+                    "direction": entry.direction,
+                    "multiplier": entry.multiplier,
+                    "enabled": int(entry.enabled),
+                    "weight": float(entry.weight),
+                    "decimals": entry.decimals,
+                }
+                for index, entry in sorted(tables.tables.items())
+            ],
         }
 
     def parse(self, files: Sequence[SourceFile]) -> CecTables:
@@ -256,7 +253,20 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         control does before the first motion is not documented.
         """
         settings = self.settings
-        outputs = {index: _output(entry, points) for index, entry in tables.tables.items()}
+        outputs = {}
+        for index, entry in tables.tables.items():
+            outputs[index] = entry.at(points.position_mm[:, entry.input_axis])
+            if entry.direction:
+                unknown = np.zeros(len(points))
+                travel = unknown if points.approach is None else np.sign(points.approach[:, entry.input_axis])
+                if np.any(travel == 0):
+                    message = (
+                        f"a table acts in one direction of {AXES[entry.input_axis]} only, and some points do not say from "
+                        "where they were approached: there it is taken as not acting; give approach_x, approach_y, "
+                        "approach_z"
+                    )
+                    warnings.warn(message, CompgenWarning, stacklevel=2)
+                outputs[index] = np.where(travel == entry.direction, outputs[index], 0.0)
         totals = sum_into_axes(tables.tables, settings.mult_mode, outputs)
         total = np.column_stack([np.broadcast_to(part, (len(points),)) for part in totals])
         if settings.max_sum_mm is not None:
@@ -319,13 +329,13 @@ def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], se
         index = item.index_number(0, 999)
         if item.variable in SWITCHES:
             switches[item.variable, index] = item
-            continue
-        part = parts.setdefault(index, TableParts(f"table {index}", item.source))
-        part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
-    labels = labels_in(files)
-    found = {
-        index: _read_table(part, settings.axis_names, labels.get(index, "")) for index, part in sorted(parts.items())
-    }
+        else:
+            parts.setdefault(index, TableParts(f"table {index}", item.source)).add(item)
+    labels, found = labels_in(files), {}
+    for index, part in sorted(parts.items()):
+        part.scalar("$AN_CEC_MULT_BY_TABLE")
+        table = part.table("$AN_CEC")
+        found[index] = _cec_table(part, table, settings.axis_names, 1_000_000, labels.get(index, ""))
     if not settings.mode_stated:
         for index in (index for index, entry in found.items() if entry.multiplier):
             raise (parts[index].scalar("$AN_CEC_MULT_BY_TABLE").fail(MODE_OF_A_FILE))
@@ -352,8 +362,7 @@ def foreign_cec_tables(
         if item.variable in SWITCHES:
             continue
         index = item.index_number(0, 999)
-        part = parts.setdefault(index, TableParts(f"table {index}", item.source))
-        part.add(item, item.index_number(1, 999_999) if item.variable == "AN_CEC" else None)
+        parts.setdefault(index, TableParts(f"table {index}", item.source)).add(item)
     found, apart = {}, set()
     for index, part in sorted(parts.items()):
         if part.is_zero and part.scalar("$AN_CEC_STEP").number() == 0:
@@ -361,7 +370,11 @@ def foreign_cec_tables(
             continue
         axes = [_axis_name_of(part.scalar(f"$AN_CEC_{side}_AXIS")) for side in ("INPUT", "OUTPUT")]
         if set(axes) <= set(settings.axis_names):
-            found[index] = _foreign_table(part, machine, settings, axes, findings)
+            travel_mm = machine.axes[settings.axis_names.index(axes[0])].range_mm
+            table = findings.table(part, "$AN_CEC", travel_mm)
+            if "$AN_CEC_MULT_BY_TABLE" not in part.scalars:
+                findings.count("tables without MULT_BY_TABLE (0 taken)")
+            found[index] = _cec_table(part, table, settings.axis_names, 1)
         else:
             apart.add(index)
             findings.apart.append(f"table {index} ({axes[0]} into {axes[1]}, up to {part.largest})")
@@ -370,47 +383,25 @@ def foreign_cec_tables(
             "new tables may not take their places: an export with --active keeps them, or one with kept_tables = "
             f"{missing} in the machine file"
         )
-    _check_products(parts, set(found), apart, settings)
-    if not found:
-        listed = f"; of other axes: {'; '.join(findings.apart)}" if apart else ""
-        raise next(iter(parts.values())).source.fail(
-            f"holds no table over and into the axes {', '.join(settings.axis_names)} of the machine file{listed}"
-        )
-    return CecTables(_switched(found, given, settings, findings), tuple(sorted(apart)))
-
-
-def _foreign_table(
-    part: TableParts, machine: Machine, settings: CecSettings, axes: Sequence[str], findings: ArchiveFindings
-) -> CecTable:
-    base, output = (settings.axis_names.index(name) for name in axes)
-    table = findings.table(part, "$AN_CEC", machine.axes[base].range_mm)
-    factor = part.scalars.get("$AN_CEC_MULT_BY_TABLE")
-    if factor is None:
-        findings.count("tables without MULT_BY_TABLE (0 taken)")
-    return CecTable(
-        base,
-        output,
-        table,
-        part.scalar("$AN_CEC_DIRECTION").whole(-1, 1),
-        0 if factor is None else factor.whole(0, 1_000_000),
-        decimals=written_decimals(table),
-    )
-
-
-def _check_products(parts: Mapping[int, TableParts], found: set[int], apart: set[int], settings: CecSettings) -> None:
-    """Refuse products that cannot be worked out: with an axis that is not there, or without a stated mode."""
+    # products that cannot be worked out: with an axis that is not there, or without a stated mode
     for index, part in parts.items():
         factor = part.scalars.get("$AN_CEC_MULT_BY_TABLE")
         number = 0 if factor is None else factor.whole(0, 1_000_000)
         if not number or factor is None:
             continue
-        if {index, number - 1} & found and {index, number - 1} & apart:
+        if {index, number - 1} & set(found) and {index, number - 1} & apart:
             raise factor.fail(
                 f"table {index} is multiplied by table {number - 1}, and one of the two belongs to an axis that the "
                 "machine file does not have"
             )
         if index in found and not settings.mode_stated:
             raise factor.fail(MODE_OF_A_FILE)
+    if not found:
+        listed = f"; of other axes: {'; '.join(findings.apart)}" if apart else ""
+        raise next(iter(parts.values())).source.fail(
+            f"holds no table over and into the axes {', '.join(settings.axis_names)} of the machine file{listed}"
+        )
+    return CecTables(_switched(found, given, settings, findings), tuple(sorted(apart)))
 
 
 def _switched(
@@ -438,24 +429,22 @@ def _switched(
     return result
 
 
-def _read_table(part: TableParts, axis_names: Sequence[str], label: str) -> CecTable:
-    input_item, output_item = part.scalar("$AN_CEC_INPUT_AXIS"), part.scalar("$AN_CEC_OUTPUT_AXIS")
-    direction = part.scalar("$AN_CEC_DIRECTION").whole(-1_000_000, 1_000_000)
-    multiplier = part.scalar("$AN_CEC_MULT_BY_TABLE").whole(0, 1_000_000)
-    table = part.table("$AN_CEC")
+def _cec_table(
+    part: TableParts, table: LinearTable, axis_names: Sequence[str], farthest: int, label: str = ""
+) -> CecTable:
+    """Return a table with its axes, its direction (up to ``farthest`` in size) and its multiplier (0 if not given)."""
+    sides = (part.scalar(f"$AN_CEC_{side}_AXIS") for side in ("INPUT", "OUTPUT"))
+    base, output = (axis_of(item, _axis_name_of(item), axis_names) for item in sides)
+    factor = part.scalars.get("$AN_CEC_MULT_BY_TABLE")
     return CecTable(
-        _axis_value(input_item, axis_names),
-        _axis_value(output_item, axis_names),
+        base,
+        output,
         table,
-        direction,
-        multiplier,
+        part.scalar("$AN_CEC_DIRECTION").whole(-farthest, farthest),
+        0 if factor is None else factor.whole(0, 1_000_000),
         decimals=written_decimals(table),
         label=label,
     )
-
-
-def _axis_value(item: Assignment, axis_names: Sequence[str]) -> int:
-    return axis_of(item, _axis_name_of(item), axis_names)
 
 
 def _axis_name_of(item: Assignment) -> str:
@@ -463,18 +452,3 @@ def _axis_name_of(item: Assignment) -> str:
     if match is None:
         raise item.fail(f'{item.value[:40]!r} is not an axis; write (AX1) or "AX1"')
     return match.group(1) or match.group(2)
-
-
-def _output(entry: CecTable, points: Points) -> FloatArray:
-    """Interpolated value of one table at the points, zero where its direction of travel is not the last one."""
-    value = entry.at(points.position_mm[:, entry.input_axis])
-    if entry.direction == 0:
-        return value
-    travel = np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, entry.input_axis])
-    if np.any(travel == 0):
-        message = (
-            f"a table acts in one direction of {AXES[entry.input_axis]} only, and some points do not say from where "
-            "they were approached: there it is taken as not acting; give approach_x, approach_y, approach_z"
-        )
-        warnings.warn(message, CompgenWarning, stacklevel=3)
-    return np.where(travel == entry.direction, value, 0.0)

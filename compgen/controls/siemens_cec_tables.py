@@ -16,7 +16,7 @@ from scipy.linalg import lstsq
 from compgen.controls.shared.base import SourceFile, Term
 from compgen.controls.shared.grids import equidistant_grid
 from compgen.controls.shared.terms import one_dimensional_name, product_name
-from compgen.controls.siemens_text import LinearTable, exact_grid
+from compgen.controls.siemens_text import LinearTable, exact_grid, exact_values
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, reversal_name
 from compgen.data.machine import Machine
@@ -196,16 +196,14 @@ def folded_tables(
         if part.lever is None:
             counts = np.rint(sign * part.sign * np.asarray(values[term.name]) * 10**MM_DECIMALS).astype(np.int64)
             work.ordinary[part.output, term.axis] = counts * _UNITS_PER_MM_QUANTUM
-        elif _matters(values[term.name], nodes[part.lever] - part.origin_mm):
-            products.setdefault((part.output, part.lever), []).append(term)
+        else:
+            largest_rad = float(np.max(np.abs(values[term.name])))
+            largest_lever_mm = float(np.max(np.abs(nodes[part.lever] - part.origin_mm)))
+            if largest_rad >= NEGLIGIBLE_RAD and largest_rad * largest_lever_mm >= NEGLIGIBLE_PRODUCT_MM:
+                products.setdefault((part.output, part.lever), []).append(term)
     for (output, lever), group in sorted(products.items()):
         _add_products(work, nodes[lever], output, lever, [(term, sign * values[term.name]) for term in group], mode)
     return _numbered(work, nodes)
-
-
-def _matters(angle_rad: FloatArray, lever_mm: FloatArray) -> bool:
-    largest = float(np.max(np.abs(angle_rad)))
-    return largest >= NEGLIGIBLE_RAD and largest * float(np.max(np.abs(lever_mm))) >= NEGLIGIBLE_PRODUCT_MM
 
 
 def _add_products(
@@ -247,35 +245,28 @@ def _numbered(work: _Set, nodes: Mapping[int, FloatArray]) -> dict[int, CecTable
     ordinary = {key: units for key, units in sorted(work.ordinary.items()) if np.any(units)}
     if not ordinary and not work.angles:
         ordinary = dict(sorted(work.ordinary.items())[:1])
-    tables = [_ordinary_table(work, key, units, nodes[key[1]]) for key, units in ordinary.items()]
+    tables = []
+    for (output, axis), units in ordinary.items():
+        folds = work.folds.get((output, axis), [])
+        decimals = FACTOR_DECIMALS if folds else MM_DECIMALS
+        label = one_dimensional_name(output, axis) + (f", less {' and '.join(folds)}" if folds else "")
+        numbers = exact_values(units // 10 ** (FACTOR_DECIMALS - decimals), decimals)
+        table = LinearTable(*exact_grid(nodes[axis]), values=numbers)
+        tables.append(CecTable(axis, output, table, decimals=decimals, label=label))
     first_lever = len(tables) + len(work.angles)
     number_of = {key: first_lever + n + 1 for n, key in enumerate(sorted(work.levers))}
     for (output, axis, lever), units in sorted(work.angles.items()):
         grid = exact_grid(nodes[axis])
         label = f"{product_name(output, axis, lever)}: scaled angle over {AXES[axis]}"
-        table = LinearTable(*grid, values=_scaled_decimals(units, FACTOR_DECIMALS))
+        table = LinearTable(*grid, values=exact_values(units, FACTOR_DECIMALS))
         number = number_of[output, lever]
         tables.append(CecTable(axis, output, table, 0, number, decimals=FACTOR_DECIMALS, label=label))
     for (output, lever), ends in sorted(work.levers.items()):
         start, _, last = exact_grid(nodes[lever])
         label = f"scaled lever {AXES[lever].lower()} of {AXES[output]}"
-        table = LinearTable(start, last - start, last, _scaled_decimals(ends, FACTOR_DECIMALS))
+        table = LinearTable(start, last - start, last, exact_values(ends, FACTOR_DECIMALS))
         tables.append(CecTable(lever, output, table, decimals=FACTOR_DECIMALS, label=label))
     return dict(enumerate(tables))
-
-
-def _ordinary_table(work: _Set, key: tuple[int, int], units: IntArray, nodes_mm: FloatArray) -> CecTable:
-    output, axis = key
-    folds = work.folds.get(key, [])
-    decimals = FACTOR_DECIMALS if folds else MM_DECIMALS
-    label = one_dimensional_name(output, axis) + (f", less {' and '.join(folds)}" if folds else "")
-    values = _scaled_decimals(units // 10 ** (FACTOR_DECIMALS - decimals), decimals)
-    table = LinearTable(*exact_grid(nodes_mm), values=values)
-    return CecTable(axis, output, table, decimals=decimals, label=label)
-
-
-def _scaled_decimals(units: IntArray, decimals: int) -> tuple[Decimal, ...]:
-    return tuple(Decimal(int(count)).scaleb(-decimals) for count in units)
 
 
 def written_decimals(table: LinearTable) -> int:
@@ -330,7 +321,8 @@ def with_reversal_tables(
         for direction in (1, -1):
             words = "positive" if direction > 0 else "negative"
             label = f"{reversal_name(axis, component)}, after {words} travel of {AXES[axis]}"
-            table = LinearTable(*exact_grid(nodes_mm), values=_rounded_decimals(direction * half))
+            units = np.rint(direction * half * 10**MM_DECIMALS).astype(np.int64)
+            table = LinearTable(*exact_grid(nodes_mm), values=exact_values(units, MM_DECIMALS))
             found[max(found, default=-1) + 1] = CecTable(axis, component, table, direction, label=label)
     return found
 
@@ -341,10 +333,6 @@ def _nodes_mm(machine: Machine, axis: int, curve: Curve, max_points: int, step_m
     inside = replace(curve, u=np.full(len(curve.value), np.nan))
     as_errors = ErrorTable({f"E{AXES[axis]}{AXES[axis]}": inside})
     return equidistant_grid(machine, as_errors, axis, most=max_points, step_mm=step_mm).nodes_mm
-
-
-def _rounded_decimals(values_mm: FloatArray) -> tuple[Decimal, ...]:
-    return tuple(Decimal(int(count)).scaleb(-MM_DECIMALS) for count in np.rint(values_mm * 10**MM_DECIMALS))
 
 
 def reversal_statement(tables: CecMap, names: tuple[str, ...]) -> str:
@@ -484,7 +472,18 @@ def chosen_terms(
     if allowed is None or wanted <= allowed:
         return Choice(list(terms), (), wanted, allowed, wanted, 0.0)
     gains = [_Gains.of(machine, errors, terms, beside, output) for output in range(3)]
-    picked = _best_sets(gains, mode, allowed)
+    # the best set of each axis such that all together take no more tables than there are, by dynamic programming
+    best: dict[int, tuple[float, list[tuple[Term, ...]]]] = {0: (0.0, [])}
+    for gain in gains:
+        options = gain.by_count(mode, allowed)
+        joined: dict[int, tuple[float, list[tuple[Term, ...]]]] = {}
+        for used, (so_far, parts) in best.items():
+            for number, (value, part) in options.items():
+                total = used + number
+                if total <= allowed and (total not in joined or so_far + value > joined[total][0]):
+                    joined[total] = so_far + value, [*parts, part]
+        best = joined
+    picked = max(best.values(), key=lambda item: item[0])[1]
     names = {term.name for part in picked for term in part} or {terms[0].name}
     kept = [term for term in terms if term.name in names]
     left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, picked, strict=True))
@@ -575,7 +574,10 @@ class _Gains:
         tool_mm, weight = tool_of(machine, None), sample.weight / np.sum(sample.weight)
         wanted = -volumetric_error(machine, errors, sample.position_mm)[:, output]
         own = [term for term in terms if term.carrier[0].output == output]
-        own = [term for term in own if _moves(machine, term)]
+        # natural values of no more than the last decimal are no table
+        reach = [1.0 if (lever := t.carrier[0].lever) is None else machine.axes[lever].length_mm for t in own]
+        largest = [float(np.max(np.abs(term.start), initial=0.0)) for term in own]
+        own = [term for term, size, span in zip(own, largest, reach, strict=True) if size * span > _NOTHING_MM]
         given = [term for term in beside if term.carrier[0].output == output]
         parts: list[FloatArray] = []
         columns: dict[str, IntArray] = {}
@@ -626,25 +628,3 @@ class _Gains:
                 if count not in best or gain > best[count][0]:
                     best[count] = gain, part
         return best
-
-
-def _moves(machine: Machine, term: Term) -> bool:
-    """Whether the natural values of a term are more than the last decimal."""
-    lever = term.carrier[0].lever
-    span = 1.0 if lever is None else machine.axes[lever].length_mm
-    return float(np.max(np.abs(term.start), initial=0.0)) * span > _NOTHING_MM
-
-
-def _best_sets(gains: Sequence[_Gains], mode: str, allowed: int) -> list[tuple[Term, ...]]:
-    """Return the best set of each axis such that all together take no more than ``allowed`` tables; one at least."""
-    best: dict[int, tuple[float, list[tuple[Term, ...]]]] = {0: (0.0, [])}
-    for gain in gains:
-        options = gain.by_count(mode, allowed)
-        joined: dict[int, tuple[float, list[tuple[Term, ...]]]] = {}
-        for used, (so_far, parts) in best.items():
-            for number, (value, part) in options.items():
-                total = used + number
-                if total <= allowed and (total not in joined or so_far + value > joined[total][0]):
-                    joined[total] = so_far + value, [*parts, part]
-        best = joined
-    return max(best.values(), key=lambda item: item[0])[1]

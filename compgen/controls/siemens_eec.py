@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from compgen.controls.siemens_text import (
     TableParts,
     axis_of,
     exact_grid,
+    exact_values,
     foreign_assignments,
     read_assignments,
     table_violations,
@@ -81,7 +81,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
             start, step, last = exact_grid(term.nodes_mm)
             quantum = 10**self.settings.decimals
             counts = np.rint(-np.asarray(values[term.name]) * quantum).astype(np.int64)
-            numbers = tuple(Decimal(int(count)).scaleb(-self.settings.decimals) for count in counts)
+            numbers = exact_values(counts, self.settings.decimals)
             axis = term.carrier[0].output
             for encoder in self.settings.encoders[axis]:
                 tables[axis, encoder] = LinearTable(start, step, last, numbers)
@@ -112,11 +112,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
                     "letter": AXES[axis],
                     "axis": settings.axis_names[axis],
                     "encoder": encoder,
-                    "minimum_mm": float(table.start_mm),
-                    "maximum_mm": float(table.last_mm),
-                    "step_mm": float(table.step_mm),
-                    "modulo": int(table.modulo),
-                    "values_mm": [float(value) for value in table.values],
+                    **table.context(),
                 }
                 for (axis, encoder), table in sorted(tables.tables.items())
             ],
@@ -273,8 +269,7 @@ def foreign_eec_tables(
         if item.variable in SWITCHES:
             continue
         encoder, name = item.index_number(0, 1), item.index[-1]
-        part = parts.setdefault((name, encoder), TableParts(f"table of {name}, encoder {encoder}", item.source))
-        part.add(item, item.index_number(1, 999_999) if item.variable == "AA_ENC_COMP" else None)
+        parts.setdefault((name, encoder), TableParts(f"table of {name}, encoder {encoder}", item.source)).add(item)
     tables = {}
     for (name, encoder), part in sorted(parts.items()):
         axis = settings.axis_names.index(name) if name in settings.axis_names else None
@@ -315,6 +310,5 @@ def eec_tables_from(items: Sequence[Assignment], settings: EecSettings) -> EecTa
         if item.variable in SWITCHES:
             continue
         what = f"table of {settings.axis_names[axis]}" + (f", encoder {encoder}" if len(own) > 1 else "")
-        part = parts.setdefault((axis, encoder), TableParts(what, item.source))
-        part.add(item, item.index_number(1, 999_999) if item.variable == "AA_ENC_COMP" else None)
+        parts.setdefault((axis, encoder), TableParts(what, item.source)).add(item)
     return EecTables({key: part.table("$AA_ENC_COMP") for key, part in sorted(parts.items())})

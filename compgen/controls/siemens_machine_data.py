@@ -12,7 +12,7 @@ import numpy as np
 
 from compgen.controls.shared.base import Usage
 from compgen.controls.shared.grids import loss_setting
-from compgen.controls.siemens_cec_tables import MULT_MODES, CecMap, CecTable, sum_into_axes
+from compgen.controls.siemens_cec_tables import MULT_MODES, CecMap, sum_into_axes
 from compgen.controls.siemens_text import POSITION_QUANTUM_MM, table_violations
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
@@ -405,32 +405,25 @@ def largest_slopes(machine: Machine, tables: CecMap, mode: str) -> FloatArray:
 def set_violations(machine: Machine, tables: CecMap, max_points: int, tables_available: int | None) -> list[str]:
     """Return broken rules of single tables and of the set: grid, travel, numbers of tables and nodes, references."""
     found: list[str] = []
+    factors = {entry.multiplier - 1 for entry in tables.values() if entry.multiplier}
     for index, entry in sorted(tables.items()):
         what = f"table {index} ({AXES[entry.output_axis]} over {AXES[entry.input_axis]})"
         found += table_violations(machine, entry.input_axis, entry.table, max_points, what)
-        found += _reference_violations(tables, index, entry, what)
+        if entry.direction not in (-1, 0, 1):
+            found.append(f"{what}: DIRECTION is {entry.direction}; 0, 1 and -1 are allowed")
+        other = tables.get(entry.multiplier - 1)
+        if entry.multiplier and other is None:
+            found.append(f"{what}: MULT_BY_TABLE names table number {entry.multiplier}, which does not exist")
+        elif other is not None and other.table.modulo != entry.table.modulo:
+            found.append(f"{what}: it and its multiplier {entry.multiplier - 1} are not both cyclic or both not")
+        if (entry.multiplier or index in factors) and (entry.weight != 1 or not entry.enabled):
+            found.append(
+                f"{what} is a factor of a product, with SD41300 = {int(entry.enabled)} and SD41310 = {entry.weight}; what "
+                "the product is then is not documented: both must be 1"
+            )
     needed = max(tables) + 1
     if tables_available is not None and needed > tables_available:
         found.append(f"{needed} tables are needed, the control has {tables_available}")
-    return found
-
-
-def _reference_violations(tables: CecMap, index: int, entry: CecTable, what: str) -> list[str]:
-    found = []
-    if entry.direction not in (-1, 0, 1):
-        found.append(f"{what}: DIRECTION is {entry.direction}; 0, 1 and -1 are allowed")
-    if entry.multiplier:
-        other = tables.get(entry.multiplier - 1)
-        if other is None:
-            found.append(f"{what}: MULT_BY_TABLE names table number {entry.multiplier}, which does not exist")
-        elif other.table.modulo != entry.table.modulo:
-            found.append(f"{what}: it and its multiplier {entry.multiplier - 1} are not both cyclic or both not")
-    factors = {other.multiplier - 1 for other in tables.values() if other.multiplier}
-    if (entry.multiplier or index in factors) and (entry.weight != 1 or not entry.enabled):
-        found.append(
-            f"{what} is a factor of a product, with SD41300 = {int(entry.enabled)} and SD41310 = {entry.weight}; what "
-            "the product is then is not documented: both must be 1"
-        )
     return found
 
 
@@ -528,7 +521,22 @@ def cec_parameters(
     ]
     slopes = largest_slopes(machine, tables, mode)
     for output in sorted({entry.output_axis for entry in tables.values()}):
-        rows += _axis_rows(names, output, abs(sums[output][0]), slopes[output].tolist())
+        name, needed_mm = names[output], abs(sums[output][0])
+        by_base = ", ".join(f"{names[base]} {slope:.3g}" for base, slope in enumerate(slopes[output].tolist()))
+        rows += [
+            _row(f"MD32710 $MA_CEC_ENABLE[{name}]", "0, then 1", "0 while the file is loaded; 1 enables the sum"),
+            _row(
+                f"MD32720 $MA_CEC_MAX_SUM[{name}]",
+                f">= {np.ceil(needed_mm * 1e4) / 1e4:.4f} mm",
+                f"the sum reaches {needed_mm:.6f} mm; what is above this limit is cut off (alarm 20124)",
+            ),
+            _row(
+                f"MD32730 $MA_CEC_MAX_VELO[{name}]",
+                f">= {100.0 * sum(slopes[output].tolist()):.4f} %",
+                f"largest change of the sum, mm per mm of travel of the base axes: {by_base}; the percentage holds if all "
+                "bases run as fast as this axis' own maximum MD32000, else scale it by v_base / MD32000",
+            ),
+        ]
     return rows
 
 
@@ -558,25 +566,6 @@ def cec_overwrites(tables: CecMap, kept: Sequence[int]) -> list[str]:
     return [first, f"Tables {_indices_in_words(tables)}, whatever they hold now."]
 
 
-def _axis_rows(names: Sequence[str], output: int, needed_mm: float, slopes: Sequence[float]) -> list[dict[str, str]]:
-    name = names[output]
-    by_base = ", ".join(f"{names[base]} {slope:.3g}" for base, slope in enumerate(slopes))
-    return [
-        _row(f"MD32710 $MA_CEC_ENABLE[{name}]", "0, then 1", "0 while the file is loaded; 1 enables the sum"),
-        _row(
-            f"MD32720 $MA_CEC_MAX_SUM[{name}]",
-            f">= {np.ceil(needed_mm * 1e4) / 1e4:.4f} mm",
-            f"the sum reaches {needed_mm:.6f} mm; what is above this limit is cut off (alarm 20124)",
-        ),
-        _row(
-            f"MD32730 $MA_CEC_MAX_VELO[{name}]",
-            f">= {100.0 * sum(slopes):.4f} %",
-            f"largest change of the sum, mm per mm of travel of the base axes: {by_base}; the percentage holds if all "
-            "bases run as fast as this axis' own maximum MD32000, else scale it by v_base / MD32000",
-        ),
-    ]
-
-
 def _row(name: str, value: str, meaning: str) -> dict[str, str]:
     return {"name": name, "value": value, "meaning": meaning}
 
@@ -600,7 +589,16 @@ def cec_warnings(
                 f"{names[axis]}: the sum changes by up to {percent / 100.0:.3g} mm per mm of travel; the usual "
                 f"MD32730 is {DEFAULT_MAX_VELO_PERCENT:g} % and would make it lag behind"
             )
-    return found + _jumps(machine, names, tables, settings.mult_mode)
+    at_reference = {
+        index: entry.at(np.array(machine.reference_point_mm[entry.input_axis])) for index, entry in tables.items()
+    }
+    for axis, total in enumerate(map(float, sum_into_axes(tables, settings.mult_mode, at_reference))):
+        if abs(total) > NOTICEABLE_JUMP_MM:
+            found.append(
+                f"{names[axis]}: the sum at the reference point is {total:+.6f} mm ({AXES[axis]}); the axis jumps by it "
+                "when the compensation is enabled"
+            )
+    return found
 
 
 def cec_reservations(tables: CecMap, settings: CecSettings) -> list[str]:
@@ -626,16 +624,3 @@ def cec_reservations(tables: CecMap, settings: CecSettings) -> list[str]:
             "nodes; what has no room does not act. State nc_axes or tables_available"
         )
     return found
-
-
-def _jumps(machine: Machine, names: Sequence[str], tables: CecMap, mode: str) -> list[str]:
-    at_reference = {
-        index: entry.at(np.array(machine.reference_point_mm[entry.input_axis])) for index, entry in tables.items()
-    }
-    totals = [float(total) for total in sum_into_axes(tables, mode, at_reference)]
-    return [
-        f"{names[axis]}: the sum at the reference point is {total:+.6f} mm ({AXES[axis]}); the axis jumps by it when "
-        "the compensation is enabled"
-        for axis, total in enumerate(totals)
-        if abs(total) > NOTICEABLE_JUMP_MM
-    ]

@@ -10,6 +10,7 @@ from decimal import Decimal
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.controls.shared.base import SourceFile, coverage_violations
 from compgen.controls.shared.scanner import fixed_point, number_pattern, plain_lines
@@ -111,76 +112,67 @@ def read_assignments(files: Sequence[SourceFile], index_counts: Mapping[str, int
     """
     seen: dict[tuple[str, tuple[str, ...]], Assignment] = {}
     for source in files:
-        for item in _unprotected(_assignments(source, index_counts)):
+        on: dict[tuple[str, ...], Assignment] = {}
+        for item in _assignments(source, index_counts):
+            if item.variable in PROTECTING:
+                on.pop((item.variable, *item.index), None)
+                if item.whole(0, 1):
+                    on[item.variable, *item.index] = item
+            elif item.variable not in SWITCHES and on:
+                switch = next(iter(on.values()))
+                raise item.fail(
+                    f"is written while {switch.label} is 1 (line {switch.line}): the control write-protects its tables then"
+                )
             if item.variable in SWITCHES:
                 seen[item.variable, item.index] = item
                 continue
             first = seen.setdefault((item.variable, item.index), item)
             if first is not item:
-                where = (
-                    f"{first.source.path}, line {first.line}" if first.source is not source else f"line {first.line}"
-                )
-                raise item.fail(f"is assigned a second time; the first is in {where}")
+                path = f"{first.source.path}, " if first.source is not source else ""
+                raise item.fail(f"is assigned a second time; the first is in {path}line {first.line}")
     if not any(item.variable not in SWITCHES for item in seen.values()):
         raise files[0].fail("holds no table") if files else InputError("no file was given")
     return list(seen.values())
 
 
-def _unprotected(items: Iterator[Assignment]) -> Iterator[Assignment]:
-    """Pass the assignments on; a table that is written while the file itself has switched its function on is an error."""
-    on: dict[tuple[str, tuple[str, ...]], Assignment] = {}
-    for item in items:
-        if item.variable in PROTECTING:
-            on.pop((item.variable, item.index), None)
-            if item.whole(0, 1):
-                on[item.variable, item.index] = item
-        elif item.variable not in SWITCHES and on:
-            switch = next(iter(on.values()))
-            raise item.fail(
-                f"is written while {switch.label} is 1 (line {switch.line}): the control write-protects its tables then"
-            )
-        yield item
-
-
 def _assignments(source: SourceFile, index_counts: Mapping[str, int]) -> Iterator[Assignment]:
+    """Yield the assignments of one file in their order; a file that is cut or has anything else is an error."""
     ended, started, number, dotted = False, False, 1, False
     codes = (line.partition(";")[0].strip().upper() for line in plain_lines(source, _MOST_CHARACTERS, _LONGEST_LINE))
     for number, code in ((number, code) for number, code in enumerate(codes, start=1) if code):
         if ended:
-            raise source.fail(f"{code[:40]!r} stands after the end mark M17", number)
+            raise source.fail(f"{code[:40]!r} follows the end mark M17", number)
         if code == "M17":
             ended = True
-        elif code == MAKE_EFFECTIVE or not started and (_HEADER.fullmatch(code) or _CHANNEL.fullmatch(code)):
             continue
-        else:
-            started = True
-            item = _assignment(source, number, code, index_counts)
-            dotted = dotted or "." in code.partition("]")[0]
-            yield item
+        if code == MAKE_EFFECTIVE or not started and (_HEADER.fullmatch(code) or _CHANNEL.fullmatch(code)):
+            continue
+        started = True
+        match = _ASSIGNMENT.fullmatch(code)
+        if match is None:
+            raise source.fail(f"{code[:60]!r} is not an assignment; expected e.g. $AN_CEC[0,1]=0.005000", number)
+        variable, index_text, value = match.groups()
+        if variable not in index_counts:
+            known = [f"${name}" for name in index_counts]
+            raise source.fail(
+                f"${variable} is not a variable of these tables; {nearest('$' + variable, known)}", number
+            )
+        index = _plain_indices(index_text)
+        if len(index) != index_counts[variable] or not all(index):
+            raise source.fail(f"${variable} has {index_counts[variable]} indices; got [{index_text}]", number)
+        dotted = dotted or "." in index_text
+        yield Assignment(variable, index, value.strip(), source, number)
     if not ended:
         raise source.fail("the end mark M17 is missing: the file is truncated", number)
     if dotted:
         message = f"{source.path}: indices are separated by '.'; read as ',' (write a comma: the control needs it)"
-        warnings.warn(message, CompgenWarning, stacklevel=4)
+        warnings.warn(message, CompgenWarning, stacklevel=3)
 
 
-def _assignment(source: SourceFile, number: int, code: str, index_counts: Mapping[str, int]) -> Assignment:
-    match = _ASSIGNMENT.fullmatch(code)
-    if match is None:
-        raise source.fail(f"{code[:60]!r} is not an assignment; expected e.g. $AN_CEC[0,1]=0.005000", number)
-    variable, index_text, value = match.groups()
-    if variable not in index_counts:
-        known = [f"${name}" for name in index_counts]
-        raise source.fail(f"${variable} is not a variable of these tables; {nearest('$' + variable, known)}", number)
-    index = tuple(_plain_index(part.strip()) for part in re.split(r"[,.]", index_text))
-    if len(index) != index_counts[variable] or not all(index):
-        raise source.fail(f"${variable} has {index_counts[variable]} indices; got [{index_text}]", number)
-    return Assignment(variable, index, value.strip(), source, number)
-
-
-def _plain_index(text: str) -> str:
-    """An index without leading zeros, so that [0,01] and [0,1] are one."""
-    return str(int(text)) if text.isdigit() and len(text) < 10 else text
+def _plain_indices(text: str) -> tuple[str, ...]:
+    """The indices of a variable without blanks and leading zeros, so that [0,01] and [0,1] are one."""
+    words = [word.strip() for word in re.split(r"[,.]", text)]
+    return tuple(str(int(word)) if word.isdigit() and len(word) < 10 else word for word in words)
 
 
 @dataclass(frozen=True)
@@ -221,6 +213,16 @@ class LinearTable:
         position = start + np.mod(position_mm - start, last - start) if self.modulo else np.minimum(position_mm, last)
         return np.interp(position, self.nodes_mm, self.numbers)
 
+    def context(self) -> dict[str, object]:
+        """Return what the templates need of a table."""
+        return {
+            "step_mm": float(self.step_mm),
+            "minimum_mm": float(self.start_mm),
+            "maximum_mm": float(self.last_mm),
+            "modulo": int(self.modulo),
+            "values_mm": [float(value) for value in self.values],
+        }
+
 
 def exact_grid(nodes_mm: FloatArray) -> tuple[Decimal, Decimal, Decimal]:
     """Return start, step and last node of equidistant positions as exact decimal numbers; start + k step is last."""
@@ -232,6 +234,11 @@ def exact_grid(nodes_mm: FloatArray) -> tuple[Decimal, Decimal, Decimal]:
     return start, step, last
 
 
+def exact_values(units: NDArray[np.int64], decimals: int) -> tuple[Decimal, ...]:
+    """Return whole units of the last decimal (n,) as exact decimal numbers."""
+    return tuple(Decimal(int(count)).scaleb(-decimals) for count in units)
+
+
 @dataclass
 class TableParts:
     """The assignments that make one table, collected in any order; ``what`` names the table in messages."""
@@ -241,12 +248,12 @@ class TableParts:
     scalars: dict[str, Assignment] = field(default_factory=dict)
     nodes: dict[int, Assignment] = field(default_factory=dict)
 
-    def add(self, item: Assignment, node: int | None) -> None:
-        """Take one assignment: the value of a node, or (None) a scalar variable of the table."""
-        if node is None:
-            self.scalars[f"${item.variable}"] = item
+    def add(self, item: Assignment) -> None:
+        """Take one assignment: the value of a node, or a scalar variable of the table."""
+        if item.variable in ("AN_CEC", "AA_ENC_COMP"):
+            self.nodes[item.index_number(1, 999_999)] = item
         else:
-            self.nodes[node] = item
+            self.scalars[f"${item.variable}"] = item
 
     def scalar(self, name: str) -> Assignment:
         """Return the assignment of one scalar variable; InputError if the files do not have it."""
@@ -272,12 +279,7 @@ class TableParts:
         Where MAX is no whole number of steps from MIN, the node behind it ends the last, shorter interval; whether the
         control interpolates to it or holds the node before is not documented, and the doubt is what that can matter.
         """
-        first, last, step = (self.scalar(f"{prefix}_{key}") for key in ("MIN", "MAX", "STEP"))
-        start_mm, last_mm, step_mm = first.number(), last.number(), step.number()
-        if step_mm <= 0:
-            raise step.fail(f"{step.value} is not above zero, and the table holds values")
-        if last_mm <= start_mm:
-            raise last.fail(f"{last.value} is not above the position {first.value} of the first node")
+        start_mm, last_mm, step_mm = self._grid(prefix)
         whole, part = divmod(last_mm - start_mm, step_mm)
         count = int(whole) + (2 if part else 1)
         if part and int(whole) + 1 not in self.nodes:
@@ -285,7 +287,8 @@ class TableParts:
         missing = next((n for n in range(count) if n not in self.nodes), None)
         if missing is not None:
             raise self.source.fail(
-                f"{self.what}: node {missing} of 0 ... {count - 1} is missing: is the file truncated?", first.line
+                f"{self.what}: node {missing} of 0 ... {count - 1} is missing: is the file truncated?",
+                self.scalar(f"{prefix}_MIN").line,
             )
         values = tuple(self.nodes[n].number() for n in range(count))
         modulo = f"{prefix}_IS_MODULO" in self.scalars and self.scalars[f"{prefix}_IS_MODULO"].whole(-1, 1) == 1
@@ -296,19 +299,9 @@ class TableParts:
 
     def table(self, prefix: str) -> LinearTable:
         """Return the complete table; ``prefix`` is ``$AN_CEC`` or ``$AA_ENC_COMP``."""
-        first, last, step = (self.scalar(f"{prefix}_{key}") for key in ("MIN", "MAX", "STEP"))
-        start_mm, last_mm, step_mm = first.number(), last.number(), step.number()
-        if step_mm <= 0:
-            raise step.fail(f"{step.value} is not above zero")
-        if last_mm <= start_mm:
-            raise last.fail(f"{last.value} is not above the position {first.value} of the first node")
+        start_mm, last_mm, step_mm = self._grid(prefix)
         modulo = self.scalar(f"{prefix}_IS_MODULO").whole(0, 1) == 1
-        count = self._count(round((Fraction(last_mm) - Fraction(start_mm)) / Fraction(step_mm)))
-        values = tuple(self.nodes[n].number() for n in range(count))
-        return LinearTable(start_mm, step_mm, last_mm, values, modulo)
-
-    def _count(self, intervals: int) -> int:
-        count = max(intervals, 1) + 1
+        count = max(round((Fraction(last_mm) - Fraction(start_mm)) / Fraction(step_mm)), 1) + 1
         surplus = next((node for n, node in self.nodes.items() if n >= count), None)
         if surplus is not None:
             raise surplus.fail(
@@ -320,7 +313,17 @@ class TableParts:
                 f"{self.what}: node {missing} of 0 ... {count - 1} is missing (the control would keep an older value): "
                 f"is the file truncated?"
             )
-        return count
+        values = tuple(self.nodes[n].number() for n in range(count))
+        return LinearTable(start_mm, step_mm, last_mm, values, modulo)
+
+    def _grid(self, prefix: str) -> tuple[Decimal, Decimal, Decimal]:
+        """Return MIN, MAX and STEP, checked."""
+        first, last, step = (self.scalar(f"{prefix}_{key}") for key in ("MIN", "MAX", "STEP"))
+        if step.number() <= 0:
+            raise step.fail(f"{step.value} is not above zero")
+        if last.number() <= first.number():
+            raise last.fail(f"{last.value} is not above the position {first.value} of the first node")
+        return first.number(), last.number(), step.number()
 
 
 def table_violations(machine: Machine, axis: int, table: LinearTable, most: int, what: str) -> list[str]:
@@ -396,6 +399,8 @@ _LONGEST_EXPONENT = 12
 _MENTIONS_TABLE = re.compile(r"A[NA]_(?:CEC|ENC_COMP)")
 _WRITES_TABLE = re.compile(r"\s*(?:N\d{1,8}\s+)?\$(?:AN_CEC|AA_ENC_COMP)\s*\[")
 _TRUTH = {"TRUE": "1", "FALSE": "0"}
+_KEYS = ("", "_STEP", "_MIN", "_MAX", "_IS_MODULO", "_INPUT_AXIS", "_OUTPUT_AXIS", "_DIRECTION", "_MULT_BY_TABLE")
+_TABLE_VARIABLES = {head + key for head in ("AN_CEC", "AA_ENC_COMP") for key in _KEYS}
 
 
 @dataclass
@@ -458,11 +463,6 @@ class _ArchivePart:
     lines: tuple[tuple[int, str], ...]
 
     @property
-    def has_end(self) -> bool:
-        """Whether some line is an end mark."""
-        return any(_END_WORD.fullmatch(line.partition(";")[0].strip().upper()) for _, line in self.lines)
-
-    @property
     def writes_tables(self) -> bool:
         """Whether some line, comments aside, gives a table a value."""
         return any(_WRITES_TABLE.match(line.upper()) for _, line in self.lines)
@@ -495,15 +495,9 @@ def foreign_assignments(
     items: dict[tuple[str, tuple[str, ...]], Assignment] = {}
     machine_data: dict[tuple[str, tuple[str, ...]], Assignment] = {}
     for source in files:
-        parts = _parts(source)
-        archive = len(parts) > 1
-        for part in _with_data(source, parts, findings):
+        parts, archive = _parts(source, findings)
+        for part in parts:
             beside = archive and not part.writes_tables
-            if archive and part is parts[-1] and part.kind == "INI" and not part.has_end:
-                message = (
-                    f"the archive ends within {part.name}.{part.kind}: it was cut, and its switches are not all there"
-                )
-                raise source.fail(message, part.lines[-1][0])
             for item in _assignments_of_part(source, part, tables, findings, archive=archive):
                 key = item.variable, item.index
                 if item.variable in SWITCHES:
@@ -520,27 +514,11 @@ def foreign_assignments(
     return ArchiveAssignments(list(items.values()), machine_data)
 
 
-def _with_data(source: SourceFile, parts: list[_ArchivePart], findings: ArchiveFindings) -> list[_ArchivePart]:
-    """The parts to be read: the only one, or the initialisation files of an archive; the others are counted."""
-    if len(parts) == 1:
-        return parts
-    chosen = [part for part in parts if part.kind in DATA_KINDS]
-    others = [part for part in parts if part.kind not in DATA_KINDS]
-    writing = [f"{part.name}.{part.kind}" for part in others if part.writes_tables]
-    if writing and not any(part.writes_tables for part in chosen):
-        raise source.fail(f"tables stand in programs only ({_few(writing)}): give such a program as a file of its own")
-    if others := [part for part in others if part.name]:
-        named = f" (programs that write tables, not run here: {_few(writing)})" if writing else ""
-        findings.count(f"other files of the archive{named}", len(others))
-    return chosen
+def _parts(source: SourceFile, findings: ArchiveFindings) -> tuple[list[_ArchivePart], bool]:
+    """Return the parts of a text that are to be read, and whether it is an archive of several files.
 
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-
-
-def _parts(source: SourceFile) -> list[_ArchivePart]:
-    """The files that a text holds, split where NUL bytes or ``%_N_..`` lines name the next one."""
+    They are the only part, or the initialisation files of an archive; the others are counted.
+    """
     found: list[_ArchivePart] = []
     name, kind = "", ""
     lines: list[tuple[int, str]] = []
@@ -548,7 +526,7 @@ def _parts(source: SourceFile) -> list[_ArchivePart]:
     for number, line in enumerate(text.split("\n"), start=1):
         head, nul, rest = line.rpartition("\0")
         names = _NAME.findall(head) if nul else _TEXT_HEADER.findall(line.upper()[:120])
-        if names or nul:  # NUL bytes without a name stand before what is no file of the control's memory (drives)
+        if names or nul:  # NUL bytes without a name come before what is no file of the control's memory (drives)
             found.append(_ArchivePart(name, kind, tuple(lines)))
             (name, kind), lines = names[-1] if names else ("", ""), []
         if nul or not names:
@@ -556,7 +534,24 @@ def _parts(source: SourceFile) -> list[_ArchivePart]:
             if code.strip():
                 lines.append((number, code))
     found.append(_ArchivePart(name, kind, tuple(lines)))
-    return [part for part in found if any(not code.lstrip().startswith(";") for _, code in part.lines)]
+    found = [part for part in found if any(not code.lstrip().startswith(";") for _, code in part.lines)]
+    if len(found) <= 1:
+        return found, False
+    chosen = [part for part in found if part.kind in DATA_KINDS]
+    others = [part for part in found if part.kind not in DATA_KINDS]
+    writing = [f"{part.name}.{part.kind}" for part in others if part.writes_tables]
+    few = ", ".join(writing[:3]) + (f" and {len(writing) - 3} more" if len(writing) > 3 else "")
+    if writing and not any(part.writes_tables for part in chosen):
+        raise source.fail(f"only programs hold tables ({few}): give such a program as a file of its own")
+    if others := [part for part in others if part.name]:
+        named = f" (programs that write tables, not run here: {few})" if writing else ""
+        findings.count(f"other files of the archive{named}", len(others))
+    last = found[-1]
+    ends = (_END_WORD.fullmatch(line.partition(";")[0].strip().upper()) for _, line in last.lines)
+    if last.kind == "INI" and not any(ends):
+        message = f"the archive ends within {last.name}.INI: it was cut, and its switches are not all there"
+        raise source.fail(message, last.lines[-1][0])
+    return chosen, True
 
 
 def _assignments_of_part(
@@ -573,7 +568,15 @@ def _assignments_of_part(
             continue
         match = _ARCHIVE_ASSIGNMENT.fullmatch(" ".join(code.split())) if code.startswith("$") else None
         if match is None:
-            _check_word(source, number, code, archive=archive)
+            # what is no assignment must not change a table: inch, jumps, calculations, anything with a table in it
+            if _INCH_WORD.fullmatch(code):
+                raise source.fail(f"{code!r}: the file is in inch; tables are read in mm only", number)
+            if not _IDLE_WORD.fullmatch(code) and (not archive or _MENTIONS_TABLE.search(code)):
+                raise source.fail(
+                    f"{one_line(code)[:60]!r} is not understood, and it could change a table; give the archive of the "
+                    "control, or its NC_CEC.INI or AX_EEC.INI, or take the line out if it has no bearing on the tables",
+                    number,
+                )
             if archive:
                 findings.count("other lines")
             continue
@@ -586,34 +589,21 @@ def _assignments_of_part(
         raise source.fail("the end mark (M17, M30) behind the tables is missing: the file is truncated", number)
 
 
-def _check_word(source: SourceFile, number: int, code: str, *, archive: bool) -> None:
-    """Refuse what is no assignment and could change a table: inch, jumps, calculations, anything with a table in it."""
-    if _INCH_WORD.fullmatch(code):
-        raise source.fail(f"{code!r}: the file is in inch; tables are read in mm only", number)
-    if _IDLE_WORD.fullmatch(code):
-        return
-    if not archive or _MENTIONS_TABLE.search(code):
-        raise source.fail(
-            f"{one_line(code)[:60]!r} is not understood, and it could change a table; give the archive of the control, or "
-            "its NC_CEC.INI or AX_EEC.INI, or take the line out if it has no bearing on the tables",
-            number,
-        )
-
-
 def _item(
     source: SourceFile, number: int, match: re.Match[str], tables: Mapping[str, int], findings: ArchiveFindings
 ) -> Assignment | None:
     """One assignment if it is of the wanted tables; None for what is passed over."""
     variable, index_text, value = match.group(1), match.group(2) or "", match.group(3).strip()
-    index = tuple(_plain(word) for word in re.split(r"[,.]", index_text)) if index_text.strip() else ()
-    item = Assignment(variable, index, _plain_value(value)[0], source, number)
+    index = _plain_indices(index_text) if index_text.strip() else ()
+    plain, unusual = _plain_value(value)
+    item = Assignment(variable, index, plain, source, number)
     if variable in tables or variable in SWITCHES:
         count = tables.get(variable) or SWITCHES[variable]
         if len(index) != count or not all(index):
             raise source.fail(f"${variable} has {count} indices; got [{one_line(index_text)[:40]}]", number)
         if variable in tables:
-            if what := _plain_value(value)[1]:
-                findings.count(what)
+            if unusual:
+                findings.count(unusual)
             return item
         findings.count("switches of other tables")
         return None
@@ -626,8 +616,7 @@ def _item(
     if _OTHER_CEC.fullmatch(variable) and item.value in ("0", "0.0", "FALSE"):
         findings.count("machine data beside the tables")
         return None
-    other_table = variable.startswith(("AN_CEC", "AA_ENC_COMP"))
-    if other_table and _is_table(variable):
+    if variable in _TABLE_VARIABLES:
         findings.count("values of tables of the other kind (CEC, EEC)")
         return None
     if "CEC" in variable or "ENC_COMP" in variable:
@@ -637,30 +626,6 @@ def _item(
         return None
     findings.count("other machine data")
     return None
-
-
-_TABLE_VARIABLES = (
-    "",
-    "_STEP",
-    "_MIN",
-    "_MAX",
-    "_IS_MODULO",
-    "_INPUT_AXIS",
-    "_OUTPUT_AXIS",
-    "_DIRECTION",
-    "_MULT_BY_TABLE",
-)
-
-
-def _is_table(variable: str) -> bool:
-    """Whether a variable is one of the tables of either kind."""
-    return any(variable == head + tail for head in ("AN_CEC", "AA_ENC_COMP") for tail in _TABLE_VARIABLES)
-
-
-def _plain(word: str) -> str:
-    """An index without blanks and leading zeros."""
-    text = word.strip()
-    return str(int(text)) if text.isdigit() and len(text) < 10 else text
 
 
 def _plain_value(value: str) -> tuple[str, str]:

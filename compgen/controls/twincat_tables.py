@@ -326,8 +326,12 @@ def parse_axis_list(
     body = _Body(source, axis_names, logical_axes, increment_mm, foreign)
     count = 0
     for line, text in content_lines(source, "#"):
-        if code := _without_comment(source, line, text):
-            _take(body, line, code)
+        code, start, rest = text.partition("/*")
+        _, end, behind = rest.partition("*/")
+        if start and (not end or behind.strip()):
+            raise source.fail("a comment /* ... */ ends on its line, with nothing after it", line)
+        if code.strip():
+            _take(body, line, code.strip())
             count += 1
     if not count:
         raise source.fail("holds no entry; is it the right file?")
@@ -340,7 +344,12 @@ def parse_axis_list(
     axis = body.axis("kopf", key)
     present = {structure for structure, _ in (*body.scalars, *body.tables)}
     if foreign is not None:
-        present -= {name for name in present if _kept_apart(body, name)}
+        for structure in sorted(present & set(_MASTERS)):
+            missing = [name for name in _MASTERS[structure] if _is_apart(body, structure, name)]
+            if missing:
+                number = body.whole(structure, missing[0], 0, 65535)
+                foreign.apart.append(f"{structure} of {source.path.name} (master {number})")
+                present.remove(structure)
     return axis, AxisList(
         _screw(body, axis) if "kw.ssfk" in present else None,
         _cross(body, axis) if "kw.crosscomp" in present else None,
@@ -354,24 +363,6 @@ _MASTERS = {"kw.crosscomp": ("master_ax_nr",), "kw.crosscomp2": ("master1_ax_nr"
 def _is_apart(body: _Body, structure: str, name: str) -> bool:
     """Whether a logical axis number is none of the machine file's."""
     return body.whole(structure, name, 0, 65535) not in body.logical_axes
-
-
-def _kept_apart(body: _Body, structure: str) -> bool:
-    """Name a table whose master the machine file does not have, and say so."""
-    missing = [name for name in _MASTERS.get(structure, ()) if _is_apart(body, structure, name)]
-    if missing and body.foreign is not None:
-        number = body.whole(structure, missing[0], 0, 65535)
-        body.foreign.apart.append(f"{structure} of {body.source.path.name} (master {number})")
-    return bool(missing)
-
-
-def _without_comment(source: SourceFile, line: int, text: str) -> str:
-    code, start, rest = text.partition("/*")
-    if start:
-        _, end, behind = rest.partition("*/")
-        if not end or behind.strip():
-            raise source.fail("a comment /* ... */ ends on its line, and nothing stands behind it", line)
-    return code.strip()
 
 
 def _take(body: _Body, line: int, code: str) -> None:

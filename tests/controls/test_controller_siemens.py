@@ -701,7 +701,7 @@ GOOD = "%_N_NC_CEC_INI\nCHANDATA(1)\n" + constant(0, "0.1") + "M17\n"
     ("old", "new", "message", "line"),
     [
         ("M17\n", "", "the end mark M17 is missing: the file is truncated", 12),
-        ("M17\n", "M17\n$AN_CEC[0,2]=0.0\n", "stands after the end mark M17", 14),
+        ("M17\n", "M17\n$AN_CEC[0,2]=0.0\n", "follows the end mark M17", 14),
         ("$AN_CEC[0,1]=0.1\n", "", "node 1 of 0 ... 1 is missing", None),
         ("$AN_CEC[0,1]=0.1\n", "$AN_CEC[0,0]=0.1\n", "is assigned a second time; the first is in line 3", 4),
         ("$AN_CEC[0,1]=0.1\n", "$AN_CEC[0,00]=0.1\n", "is assigned a second time", 4),
