@@ -118,7 +118,7 @@ def accuracy_of_diagonals(
         ways, last = run.statistics.directions, len(run.statistics.position_mm) - 1
         ends = [(sign / len(ways), way, at) for way in ways for sign, at in ((1.0, last), (-1.0, 0))]
         said = "mean of both directions" if len(ways) == 2 else "of the measured direction"
-        text = f"diagonal {name}: deviation of its length from end to end, {said}; own figure"
+        text = f"diagonal {name}: deviation of its length from end to end, {said}; not a standard figure"
         groups[name]["D"] = figure(run.statistics, combine(run.statistics, ends), text, budget)
     statements = [f"ISO 230-6, each diagonal as ISO 230-2:{edition}", *(_described(run) for run in runs.values())]
     missing = [name for name in BODY_DIAGONALS if name not in runs]
@@ -191,7 +191,7 @@ def _squareness(
     ends = [groups[name]["D"] for name in BODY_DIAGONALS]
     found = {}
     for name, row in zip(SQUARENESS_NAMES, weights * MM_PER_UM / RAD_PER_URAD, strict=True):
-        meaning = f"indication of squareness {name} from differences of the body diagonals; own figure"
+        meaning = f"indication of squareness {name} from differences of the body diagonals; not a standard figure"
         value = float(sum(w * item.value for w, item in zip(row, ends, strict=True)))
         u = math.sqrt(sum((w * item.u) ** 2 for w, item in zip(row, ends, strict=True)))  # independent of each other
         parts = {

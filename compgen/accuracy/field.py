@@ -183,13 +183,15 @@ def volume_figures(field: ErrorField, pairs: ErrorField | None = None) -> dict[s
     rms = float(np.sqrt(np.mean(size**2)))
     worst = int(np.argmax(size))
     found["max"] = _figure(
-        field, size[worst], _at(field, worst), f"largest length of the error vector {where}; own figure"
+        field, size[worst], _at(field, worst), f"largest length of the error vector {where}; not a standard figure"
     )
     weight = field.error_mm / (len(field) * rms) if rms else np.zeros_like(field.error_mm)
-    found["rms"] = _figure(field, rms, weight, f"root mean square of the error vector {where}; own figure")
+    found["rms"] = _figure(field, rms, weight, f"root mean square of the error vector {where}; not a standard figure")
     p95 = float(np.percentile(size, 95))
     near = int(np.argmin(np.abs(size - p95)))
-    found["p95"] = _figure(field, p95, _at(field, near), f"95th percentile of its length {where}; own figure")
+    found["p95"] = _figure(
+        field, p95, _at(field, near), f"95th percentile of its length {where}; not a standard figure"
+    )
     return found | _between(pairs or field)
 
 
@@ -226,7 +228,7 @@ def _between(field: ErrorField) -> dict[str, Figure]:
             field,
             float(np.linalg.norm(apart)),
             weight,
-            f"largest difference of the error vectors of {where}; own figure",
+            f"largest difference of the error vectors of {where}; not a standard figure",
         )
     }
     i, j = length
@@ -235,7 +237,7 @@ def _between(field: ErrorField) -> dict[str, Figure]:
     weight = (_at(field, i, line) - _at(field, j, line)) * (1.0 if value >= 0 else -1.0)
     ends = f"({_place(field, i)}) and ({_place(field, j)}) mm"
     found["length"] = _figure(
-        field, abs(value), weight, f"largest error of the distance between {where}, here {ends}; own figure"
+        field, abs(value), weight, f"largest error of the distance between {where}, here {ends}; not a standard figure"
     )
     return found
 

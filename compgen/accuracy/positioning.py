@@ -218,7 +218,7 @@ def figure(statistics: RunStatistics, item: Combination, meaning: str, budget: S
     """Return a combination in um with its standard uncertainty.
 
     The scatter gives s^2 / n for a mean and s^2 (1 - c4^2) for an estimator s (normal readings); the rest is the
-    budget's. A single reading has no scatter of its own: u is nan then.
+    budget's. A single reading has no scatter: u is nan then.
     """
     counts, scatter = statistics.count, statistics.values[2:]
     # variance of s over sigma^2 for n normal readings: 1 - c4(n)^2, c4^2 = 2 / (n - 1) (G(n/2) / G((n-1)/2))^2

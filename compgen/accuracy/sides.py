@@ -64,7 +64,7 @@ NOT_KNOWN = KnownReversal(None, "reversal: not known: errors are means of both d
 class Side:
     """One side as it was read: ``kind`` in words, and of the rest what that kind has.
 
-    ``deviations`` and ``lengths`` are identified when errors are asked for (:meth:`errors`); ``predicted`` is a field at
+    ``deviations`` and ``lengths`` are identified when errors are requested (:meth:`errors`); ``predicted`` is a field at
     points.
     """
 
@@ -163,7 +163,7 @@ def _source_of(machine: Machine, found: Identification) -> ErrorSource:
 
 
 def _read_predicted(machine: Machine, path: Path) -> ErrorField:
-    """Predicted errors at points as a field without uncertainty of its own."""
+    """Predicted errors at points as a field without uncertainty."""
     table = read_csv(path, (*POSITION_COLUMNS, *PREDICTED_COLUMNS), ("tool_x_mm", "tool_y_mm", "tool_z_mm"))
     position = np.column_stack([table.numbers(name) for name in POSITION_COLUMNS])
     error = np.column_stack([table.numbers(name) for name in PREDICTED_COLUMNS]) * MM_PER_UM
@@ -200,18 +200,8 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
             raise InputError(
                 f"BEFORE contains {before.kind}, AFTER {after.kind}; {name} can be compared with {name} only"
             )
-    if options.align != "model":
-        if before.deviations is not None and after.deviations is not None:
-            return _positions(before, after, options)
-        if before.deviations is not None or after.deviations is not None:
-            # errors on one side, taken at the positions that were measured on the other
-            measured = _own_tool(after if before.deviations is None else before)
-            other = before if before.deviations is None else after
-            taken = replace(measured, field=_predicted_at(other, measured.field))
-            sides = (taken, measured) if other is before else (measured, taken)
-            found = compare_fields(before.machine, *sides, options)
-            text = f"{other.path.name}: errors, the exact model moved with them to the measured positions"
-            return replace(found, statements=(text, *found.statements))
+    if options.align != "model" and (before.deviations is not None or after.deviations is not None):
+        return _at_positions(before, after, options)
     said = []
     if before.lengths is not None and after.lengths is not None:
         said.append(check_same_positions(before.lengths, after.lengths, options.align))
@@ -235,8 +225,17 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
     return replace(found, groups=groups, statements=(*said, *found.statements))
 
 
-def _positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
-    """Points against points; and the errors identified from each side, where they follow from the points."""
+def _at_positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
+    """Points against points, or against errors; and the errors identified from each side, where they follow from the points."""
+    if before.deviations is None or after.deviations is None:
+        # errors on one side, taken at the positions that were measured on the other
+        measured = _own_tool(after if before.deviations is None else before)
+        other = before if before.deviations is None else after
+        taken = replace(measured, field=_predicted_at(other, measured.field))
+        sides = (taken, measured) if other is before else (measured, taken)
+        found = compare_fields(before.machine, *sides, options)
+        text = f"{other.path.name}: errors, the exact model moved with them to the measured positions"
+        return replace(found, statements=(text, *found.statements))
     found = compare_fields(before.machine, before.measured(), after.measured(), options)
     try:
         first, second = before.errors().source, after.errors().source

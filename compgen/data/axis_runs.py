@@ -110,7 +110,7 @@ def format_axis_runs(runs: AxisRuns) -> str:
 # Measured diagonals of the working volume (ISO 230-6): ``*.diagonals.csv``.
 
 
-#: Face diagonals, with 0 for the axis that stands.
+#: Face diagonals, with 0 for the axis that does not move.
 FACE_DIAGONALS = {
     "PP0": (1, 1, 0),
     "NP0": (-1, 1, 0),

@@ -189,9 +189,9 @@ _PARTS = Schema(
 
 
 def read_parts(files: str | Path | Sequence[str | Path]) -> Deviations:
-    """Read one or more ``*.part.csv`` files: measured minus nominal coordinates, each set-up in a frame of its own.
+    """Read one or more ``*.part.csv`` files: measured minus nominal coordinates, each set-up in its own frame.
 
-    A feature lies where the tool stood when it was made, so that its deviation is the error of the machine at the
+    A feature lies where the tool was when it was made, so that its deviation is the error of the machine at the
     nominal position, seen from the unknown pose of the part. The nominal coordinates are those of the machine; a comment
     ``# origin_mm = X, Y, Z`` says where the part's origin was in them. Without ``z_mm`` all features lie at one height:
     that of the origin.
@@ -256,7 +256,7 @@ def aligned(deviations: Deviations) -> Deviations:
     Raises
     ------
     InputError
-        where what is left is no error of a machine (axes exchanged or mirrored, features in another order).
+        where what is left cannot be an error of a machine (axes exchanged or mirrored, features in another order).
     """
     setups, turned = setups_of(deviations), deviations.deviation_mm.copy()
     poses = {}

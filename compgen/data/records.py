@@ -53,7 +53,7 @@ class Field:
         file has none of them; ``complete``: all or none, alike in all files; ``each``: a dict of the columns that
         are there; ``covariates``: as that, in the order of the file and with its temperatures.
     fill : value of a column that a file lacks.
-    encode : turns the values into cells of text, as for the letters of axes; None: numbers, or text as it is.
+    encode : turns the values into cells of text, as for the letters of axes; None: numbers, or text unchanged.
     """
 
     name: str
@@ -280,7 +280,7 @@ def fail_at(origin: Sequence[tuple[str, int]], row: int, message: str, field: st
 
 @dataclass(frozen=True)
 class _Signature:
-    """Columns of a native format: any of ``marks`` tells it, ``needed`` are what a file in the format has beside them."""
+    """Columns of a native format: any of ``marks`` tells it, ``needed`` are what a file in the format has besides them."""
 
     kind: str
     marks: tuple[frozenset[str], ...]

@@ -174,7 +174,7 @@ ADVICE = {
     "thermal_scale": "the scale of the axis grows with its temperature: set the control's temperature compensation of "
     "this axis to this coefficient, fixed point and reference temperature; the tables do not follow the temperature",
     "periodic": "the error repeats with the pitch: use the control's periodic (encoder, torque-ripple) compensation, or "
-    "table positions at a fraction of the pitch; tables with wide positions leave it as it is",
+    "table positions at a fraction of the pitch; tables with wide positions do not change it",
     "spindle_growth": "the tool grows with the temperature of the spindle: warm the spindle up, or use the control's "
     "spindle growth compensation",
     "servo_lag": "the axis lags by a time: adapt loop gain or feed-forward; tables cannot hold it",

@@ -1,6 +1,6 @@
 """Effects of single axes: thermal scale, spindle growth, backlash, lost motion, periodic error, lag, cosine error.
 
-The card of a class is a template: ``{A}`` and ``{a}`` stand for the letter of the axis.
+The card of a class is a template: ``{A}`` and ``{a}`` are replaced by the letter of the axis.
 """
 
 from __future__ import annotations

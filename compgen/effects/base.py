@@ -19,7 +19,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.effects.readings import Readings
 
-#: What stands for the name of a station where the catalogue is listed without a measurement.
+#: Placeholder for the name of a station where the catalogue is listed without a measurement.
 ANY_STATION = "<station>"
 
 

@@ -1,7 +1,7 @@
 """The catalogue of effects: every family, advice, and which effects readings can tell apart.
 
 :func:`catalogue` lists the effects, :func:`what_to_do` says what helps against each, and :func:`visible_parts` what a set of
-readings shows of each effect beside the geometric errors.
+readings shows of each effect besides the geometric errors.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def check_family(name: str, thing: Any) -> tuple[Any, list[str]]:
     return family, problems
 
 
-# What to do about each effect of the catalogue, a sentence for the one who stands at the machine.
+# What to do about each effect of the catalogue, a sentence for the person at the machine.
 
 
 #: By family: the name of the effect without the axis, station or error at its end.
@@ -155,7 +155,7 @@ WHAT_TO_DO = {
     "beam_sag": "measure more sections along the beam, and let the tables follow two axes; check the balance of the carriage",
     "ram_droop": "export tables over both axes, and measure with the heaviest tool; check the counterbalance",
     "load_deflection": "measure with the load of the workpieces, and keep one set of tables for each class of load",
-    "refractive_index": "log air temperature, pressure and humidity beside the beam and switch the wavelength compensation on",
+    "refractive_index": "log air temperature, pressure and humidity next to the beam and switch the wavelength compensation on",
     "dead_path": "zero the interferometer close to the reflector's nearest point, or enter the dead path into its software",
     "laser_scale": "check wavelength and material compensation of the interferometer against a calibrated length",
     "station_drift": "let the tracer warm up, clamp it on the table and not on a tripod, and return to one reference point "

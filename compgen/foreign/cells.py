@@ -42,7 +42,7 @@ from compgen.foreign.source import LARGEST, MEGABYTE, Text, check_size, parse_nu
 
 _THOUSANDS_COMMA = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d+")
 _THOUSANDS_POINT = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
-#: Thousands parted by a blank or an apostrophe can be read in one way only.
+#: Thousands separated by a blank or an apostrophe can be read in one way only.
 _THOUSANDS_BLANK = re.compile(r"[+-]?\d{1,3}([ \u00a0\u202f'\u2019]\d{3})+([.,]\d+)?")
 _BLANKS = re.compile(r"[ \u00a0\u202f'\u2019]")
 #: A number that may have a decimal comma or thousands.
@@ -68,7 +68,7 @@ def plain_decimals(rows: list[list[str]], lines: Sequence[int], decimal: str | N
             numbers = [meant.fullmatch(cell) is not None for cell in row]
             for cell, good in zip(row, numbers, strict=True):
                 if not good and (_COMMA.fullmatch(cell) or _POINT.fullmatch(cell)):
-                    message = f"{shown(cell)} has no decimal {decimal}, and parts no thousands"
+                    message = f"{shown(cell)} has no decimal {decimal}, and does not separate thousands"
                     raise InputError(message, line=line, field="--decimal")
             read.append(
                 [c.replace(other, "").replace(mark, ".") if n else c for c, n in zip(row, numbers, strict=True)]
@@ -92,7 +92,7 @@ def plain_decimals(rows: list[list[str]], lines: Sequence[int], decimal: str | N
         message = (
             f"a decimal comma here, a decimal point in line {point}; write all numbers in one way, or say --decimal"
         )
-        raise InputError(f"{message} comma or point (the other parts thousands)", line=comma)
+        raise InputError(f"{message} comma or point (the other separates thousands)", line=comma)
     if either and not comma:
         raise InputError(
             "numbers such as 1,000 may be 1000 or 1.000; say --decimal point (1000) or comma (1.000)", line=either
@@ -109,7 +109,7 @@ def _plain(cell: str) -> str:
     return cell.replace(",", "") if _THOUSANDS_COMMA.fullmatch(cell) else cell
 
 
-# Cells of a table as text or a sheet gives them, and where in them header and rows stand.
+# Cells of a table as text or a sheet gives them, and where among them header and rows are.
 
 
 #: The rows of the largest sheet there is.
@@ -124,9 +124,9 @@ _MEASURED_ROWS = 5_000
 _NUMERAL = re.compile(r"[+\-\u2212]?(\d[\d.,' \u00a0\u202f]*)?[.,]?\d(e[+\-]?\d+)?", re.IGNORECASE)
 _SQUARENESS = re.compile(r"(?i)rechtwinkl|square|perpendic|equerr|ortogonal|\u5782\u76f4|E[ABC]0[YZ]")
 _ALL_WORDS = frozenset(word for words in FIELDS.values() for word in words)
-#: What stands in a row of units where there is none.
+#: Cells in a row of units that mean: no unit.
 _NO_UNIT = ("", "-", "\u2013", "--", "/", "1")
-#: A key and at most so many cells of its value stand in one row above a table.
+#: A row above a table may contain a key and at most this many cells, the key included.
 _MOST_PAIR = 6
 #: Letters of words that Python takes for numbers (inf, nan), and a comma: a column without them is converted at once.
 _NOT_PLAIN = frozenset("infa,")
@@ -134,7 +134,7 @@ _NOT_PLAIN = frozenset("infa,")
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Rows of cells with their line numbers; how they were read stands in ``notes``, why cells may be empty in ``empty``."""
+    """Rows of cells with their line numbers; ``notes`` says how they were read, ``empty`` why cells may be empty."""
 
     path: Path
     rows: Sequence[Sequence[str]]
@@ -151,7 +151,7 @@ class CellGrid:
 class Table:
     """A header and its rows, all of one width.
 
-    ``metadata`` holds what stands above as ``key: value``, keys in lower case; ``comments`` the ``# key = value`` as they are.
+    ``metadata`` contains the lines above as ``key: value``, keys in lower case; ``comments`` the ``# key = value`` as they are.
     """
 
     grid: CellGrid
@@ -242,7 +242,7 @@ def _separator(lines: Sequence[str]) -> str | None:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where a table stands in a grid: its rows of names from ``top`` on, rows of numbers from ``first`` to before ``end``.
+    """Where a table is in a grid: its rows of names from ``top`` on, rows of numbers from ``first`` to before ``end``.
 
     ``numbers`` counts its cells with numbers. ``labels`` > 0: each row is a run, and so many cells of it name it; then
     ``names`` are those of the rows.
@@ -257,7 +257,7 @@ class _Layout:
 
 
 def find_table(grid: CellGrid, decimal: str | None = None) -> Table:
-    """Find header and rows: the longest block of numbers below a row of names; what stands above is metadata.
+    """Find header and rows: the longest block of numbers below a row of names; the lines above are metadata.
 
     The targets may go down (a row each) or across (a column each); the table that is returned has a row for each.
     ``decimal`` is the decimal mark, "comma" or "point", if the user says it.
@@ -368,7 +368,7 @@ def _numbers_runs(row: Sequence[str], below: Sequence[str]) -> bool:
 
 
 def _joined_names(grid: CellGrid, k: int) -> tuple[int, list[str]]:
-    """Return the first row of names above row k, and the names: what stands over several columns belongs to each of them."""
+    """Return the first row of names above row k, and the names: a name above several columns belongs to each of them."""
     names = [name.lstrip("#% ") if n == 0 else name for n, name in enumerate(grid.rows[k])]
     below = grid.rows[k + 1 : k + 3]
     while names and not names[-1] and all(row[len(names) - 1 : len(names)] == [""] for row in below):
@@ -454,7 +454,7 @@ def _turned(
 
 
 def _check_beside(grid: CellGrid, start: int, end: int, least: int = 1) -> None:
-    """Refuse ``least`` adjacent rows of readings that do not belong to the table; statistics over the runs may stand there."""
+    """Refuse ``least`` adjacent rows of readings that do not belong to the table; statistics over the runs are allowed."""
     last, count = 0, 0
     for k in range(start, end):
         row = grid.rows[k]
@@ -464,7 +464,7 @@ def _check_beside(grid: CellGrid, start: int, end: int, least: int = 1) -> None:
         count = count + 1 if readings and (not count or k == last + 1) else int(readings)
         last = k
         if count >= least and not _is_summary(grid, k + 1 - count):
-            message = "these rows of numbers do not belong to the table: put each table into a file or sheet of its own"
+            message = "these rows of numbers do not belong to the table: put each table into a separate file or sheet"
             raise grid.fail(message, grid.lines[k + 1 - count])
 
 
@@ -487,7 +487,7 @@ def _is_summary(grid: CellGrid, first: int) -> bool:
 
 
 def _note(row: Sequence[str], metadata: dict[str, str], comments: dict[str, str]) -> None:
-    """Take what stands above a table: ``key = value``, ``key: value``, or a key and its value in the next cells."""
+    """Take a line above a table: ``key = value``, ``key: value``, or a key and its value in the next cells."""
     cells = _filled(row)
     text = cells[0].lstrip("#% ") if cells else ""
     if cells and _is_comment([*cells]) and text.partition("=")[0].strip():
@@ -523,7 +523,7 @@ def _single_names(grid: CellGrid, header: Sequence[str], line: int) -> tuple[str
             names[n] = f"{name} {seen[name]}"
     doubled = next((name for name, times in Counter(names).items() if times > 1), None)
     if doubled:
-        raise grid.fail(f"the header names {shown(doubled)} twice; give each column a name of its own", line)
+        raise grid.fail(f"the header names {shown(doubled)} twice; give each column a different name", line)
     return tuple(names)
 
 
@@ -546,7 +546,7 @@ def _table(
                     again = any(other) and not other[0].startswith("#") and _as(rows[0], other)
                     if again and len(_filled(other)) >= len(names):
                         message = f"rows of numbers follow again, below line {at} where the table ended: put each table into a"
-                        raise grid.fail(f"{message} file or sheet of its own", below)
+                        raise grid.fail(f"{message} separate file or sheet", below)
                 _check_beside(grid, k, len(grid.rows))
                 notes.append(f"line {at} and everything below is not part of the table and was left out")
                 break
@@ -579,7 +579,7 @@ def _finished(
 
 
 def _as(first: Sequence[str], row: Sequence[str]) -> bool:
-    """Whether a row has numbers where the first row has them; an empty cell or the error of a spreadsheet may stand there."""
+    """Whether a row has numbers where the first row has them; an empty cell or a spreadsheet error is allowed."""
     numeric = [k for k, cell in enumerate(first) if parse_number(cell) is not None]
     cells = [row[k] if k < len(row) else "" for k in numeric]
     known = [parse_number(cell) is not None for cell in cells]
@@ -615,7 +615,7 @@ _EMPTY = " (of merged cells only the first is filled; a formula that was never c
 def read_sheets(path: Path, name: str | None = None) -> tuple[list[tuple[str, CellGrid]], list[str]]:
     """Return name and cells of every sheet that holds any, and the names of hidden ones, which are left out.
 
-    ``name`` is a sheet that is wanted though it be hidden. InputError for what is no workbook, or unsafe.
+    ``name`` is a sheet to read even if it is hidden. InputError for a file that is not a workbook, or unsafe.
 
     Cells hold text; numbers have all their digits, whatever the format of the cell shows; formulas count with the value
     that was stored with them.

@@ -65,7 +65,7 @@ _FILLERS = _DEVIATIONS | _words(
     direction dir richtung sens direzione direccion in im de du di en der den the of and st nd rd th er eme way
     \u5b9e\u6d4b \u503c \u65b9\u5411"""
 )
-#: Statistics that laboratories print beside the runs; only those of kind mean and scatter are compared with them.
+#: Statistics that laboratories print next to the runs; only those of kind mean and scatter are compared with them.
 _STATISTICS = {
     "mean": """mean means average avg mittel mittelwert mittelwerte mittlere mittlerer durchschnitt moyenne moyen media medio
     promedio x\u0304 \u00d8 \u00f8 \u5e73\u5747 \u5e73\u5747\u503c \u5747\u503c""",
@@ -152,7 +152,7 @@ def _read(text: str, letters: str = "") -> _Words:
         following = tokens[k + 1] if k + 1 < len(tokens) else ""
         if token[0].isdigit():
             if following in ("s", "sigma", "\u03c3"):
-                continue  # 2 s is no second run
+                continue  # 2 s is not a second run
             whole = token.isdigit() and len(token) <= 3
             numbers += [int(token)] if whole else []
             unknown += [] if whole else [token]
@@ -243,7 +243,7 @@ def statistic_in(text: str) -> tuple[str, int] | None:
 
 
 def run_columns(header: Sequence[str], taken: Sequence[str]) -> list[RunColumn]:
-    """Return the columns that hold one run each, such as ``Run 1 +``, ``fwd2``, ``r3``, ``V1`` beside ``R1``.
+    """Return the columns that hold one run each, such as ``Run 1 +``, ``fwd2``, ``r3``, ``V1`` next to ``R1``.
 
     Names without a number are counted for each direction as they come.
 
@@ -251,7 +251,7 @@ def run_columns(header: Sequence[str], taken: Sequence[str]) -> list[RunColumn]:
     [RunColumn(name='Run 1-', number=1, direction=-1), RunColumn(name='bwd 2', number=2, direction=-1)]
     """
     names = [name for name in header if name not in taken]
-    # the two letters of names such as V1, R1, V2, R2, positive first; empty where they are no pair of ways
+    # the two letters of names such as V1, R1, V2, R2, positive first; empty where they are not such a pair
     first = [
         tokens[0] for name in names if len(tokens := _tokens(name)) >= 2 and len(tokens[0]) == 1 and tokens[1].isdigit()
     ]
@@ -267,7 +267,7 @@ def run_columns(header: Sequence[str], taken: Sequence[str]) -> list[RunColumn]:
     return numbered
 
 
-# Units of what stands beside the readings: temperatures, times, feeds, masses.
+# Units of columns other than the readings: temperatures, times, feeds, masses.
 
 
 Quantity = Literal["temperature", "time", "feed", "load"]
@@ -322,7 +322,7 @@ def units_of(quantity: Quantity) -> tuple[str, ...]:
     return _BY_QUANTITY[quantity]
 
 
-# What the columns of a foreign table are: fields by the words of their names, units by what stands in brackets.
+# What the columns of a foreign table are: fields by the words of their names, units by what is in brackets.
 
 
 MM_PER_LENGTH = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "m": 1e3, "cm": 10.0, "in": 25.4, "mil": 0.0254, "0.1um": 1e-4}
@@ -477,7 +477,7 @@ def split_name(name: str) -> NamedColumn:
 
 
 def quantity_of(word: str) -> Quantity | None:
-    """Return what a column beside the readings holds, by the word of its name; None if the word does not say it.
+    """Return what a column other than the readings contains, by the word of its name; None if the word does not say it.
 
     >>> quantity_of("airtemp"), quantity_of("vorschub"), quantity_of("timestamp"), quantity_of("position")
     ('temperature', 'feed', 'time', None)
@@ -490,7 +490,7 @@ def quantity_of(word: str) -> Quantity | None:
 
 
 def _word(text: str) -> str:
-    flat = unicodedata.normalize("NFKD", text).lower().replace("x\u0304", "mean")  # x with a bar is no coordinate
+    flat = unicodedata.normalize("NFKD", text).lower().replace("x\u0304", "mean")  # x with a bar is not a coordinate
     return re.sub(r"[^a-z0-9\u4e00-\u9fff]", "", flat)
 
 
@@ -525,7 +525,7 @@ def is_index(name: str) -> bool:
 
 
 def check_field(key: str, option: str) -> None:
-    """Raise InputError for a name that is no field of a table."""
+    """Raise InputError for a name that is not a field of a table."""
     if key not in FIELDS and key != "temperature" and not CHANNEL.fullmatch(key) and not RUN_FIELD.fullmatch(key):
         known = [*FIELDS, "temperature", "temp_NAME", "run1+", "run1-"]
         raise InputError(f"{key!r} is not a field; {nearest(key, known)}", field=option)

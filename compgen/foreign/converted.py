@@ -137,14 +137,14 @@ def _joined(parts: Sequence[Plain]) -> Plain:
     return join_deviations([part for part in parts if isinstance(part, Deviations)])
 
 
-# Errors that another program identified, in place of an identification of our own.
+# Errors that another program identified, in place of an identification here.
 
 
 def given_errors(machine: Machine, table: ErrorTable) -> Identification:
     """Return errors of a foreign file as what an identification hands on.
 
     They are brought to the zeros that every identification has (positioning and angles at the reference point, straightness
-    at both ends; squareness takes up the lines), without smoothing; what that moved stands in ``details``.
+    at both ends; squareness takes up the lines), without smoothing; ``details`` says what that moved.
 
     Raises
     ------

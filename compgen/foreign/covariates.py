@@ -47,7 +47,7 @@ from compgen.foreign.source import (
     shown,
 )
 
-# Columns beside the readings of a foreign table as numbers in the units of the contract.
+# Columns other than the readings of a foreign table, as numbers in the units of the contract.
 
 
 #: Temperatures of a workshop and its machines, degC; a column without a unit is taken in the one that puts it here.
@@ -134,7 +134,7 @@ def celsius_of(findings: TableFindings, key: str, channel: str, column: NamedCol
 
 
 def amount_of(findings: TableFindings, key: str, quantity: Quantity, scales: Mapping[str, float]) -> FloatArray:
-    """Feed or load in the unit of the contract; the unit must stand in the file or be given."""
+    """Feed or load in the unit of the contract; the unit must be in the file or be given."""
     column = findings.fields[key]
     unit = _given_unit(findings, key, quantity) or (column.unit if column.unit in scales else None)
     if unit is None:
@@ -165,7 +165,7 @@ def labels_of(findings: TableFindings, column: NamedColumn) -> NDArray[np.int64]
 
 
 def tool_of(findings: TableFindings, key: str) -> FloatArray:
-    """One component of the tool offset, mm; without a unit of its own in that of the positions."""
+    """One component of the tool offset, mm; in its own unit, else in that of the positions."""
     column = findings.fields[key]
     unit = findings.given_unit(key) or column.unit or str(findings.understood.get("position_unit", "mm"))
     if unit not in MM_PER_LENGTH:
@@ -188,7 +188,7 @@ def directions_of(findings: TableFindings, column: NamedColumn) -> FloatArray:
 
 
 _DAY_S = 86400.0
-#: Keys of a header under which the day of the measurement stands, the clock, and both.
+#: Keys of a header that give the day of the measurement, the time of day, or both.
 _DATE_KEYS = (
     "measured_at", "measured at", "measurement date", "messdatum", "date/time", "date time", "datum/zeit",
     "datum/uhrzeit", "date", "datum", "test date", "date of measurement", "start time", "created",
@@ -204,7 +204,7 @@ def times_of(
     Raises
     ------
     InputError
-        for numbers without a unit, text that is no date, times of the day that cross midnight without a date.
+        for numbers without a unit, text that is not a date, times of day that cross midnight without a date.
     """
     column = time or date
     if column is None:
@@ -284,7 +284,7 @@ def _seconds(date: Written, order: Order) -> float:
 
 
 def date_in_header(findings: TableFindings) -> str | None:
-    """Return the date of the measurement in ISO form by what stands above the table, None if it is not clear."""
+    """Return the date of the measurement in ISO form from the lines above the table, None if it is not clear."""
     metadata = findings.table.metadata
     text = next((metadata[key] for key in _DATE_KEYS if metadata.get(key)), "")
     clock = next((metadata[key] for key in _CLOCK_KEYS if metadata.get(key)), "")
@@ -310,7 +310,7 @@ _HEADER_CHANNELS = {
     "mat temp 2": "temp_material_2_c",
     "mat temp 3": "temp_material_3_c",
 }
-#: Beginning and end may differ so much that their mean still stands for the whole test, K.
+#: Beginning and end may differ by this much for their mean to represent the whole test, K.
 STEADY_K = 1.0
 _QUOTED = re.compile(r"\"([^\"]{4,60})\"")
 
@@ -348,7 +348,7 @@ def surroundings_of(
     if environment.get("exp coeff"):
         notes.append(
             f"its software has the expansion coefficient {shown(environment['exp coeff'])}: if it compensated the material, "
-            "the readings hold at 20 degC already; nothing is corrected here"
+            "the readings refer to 20 degC already; nothing is corrected here"
         )
     return temperatures, at, notes
 
@@ -366,14 +366,14 @@ def _date(stamps: str, user_date: str, chosen: Order | None) -> tuple[str | None
     return at, against
 
 
-# What stands in a foreign table beside positions and readings: temperatures, times, tool, feed, load, labels.
+# What a foreign table contains besides positions and readings: temperatures, times, tool, feed, load, labels.
 #
 # A column that has a place in the contract file is taken along; every other one is named as not used, with the reason.
 
 
 #: Why a column is not used that the user left out.
 LEFT_OUT = "left out by --ignore"
-#: Parts of names of columns that hold no reading, in the languages of FIELDS; such columns may be left out.
+#: Parts of names of columns that contain no readings, in the languages of FIELDS; such columns may be left out.
 _HARMLESS = (
     "deadpath", "totstrecke", "totweg", "pressure", "druck", "pression", "presion", "humid", "feuchte", "umidita", "humedad",
     "wavelength", "wellenlange", "refractive", "brechung", "intensity", "intensitat", "signal", "quality", "strength", "beam",
@@ -386,7 +386,7 @@ _READINGS = ("actual", "deviation", "correction", "value", "length", "x", "y", "
 #: Units in brackets that are neither a length nor an angle.
 _OTHER_UNIT = re.compile(r"(?i)[\[(]\s*(%|%\s?rh|rh|[hkm]?pa|m?bar|mmhg|ppm|m?v|m?a|k?w|k?n|hz|rpm|1/min|db)\s*[\])]")
 
-#: What stands above a table and is kept, by the words of its key.
+#: What is kept of the lines above a table, by the words of the key.
 _FACTS = {
     "operator": ("operator", "bediener", "prufer", "pruefer", "messtechniker", "gemessenvon", "measuredby", "inspector",
                  "technician", "operateur", "operatore", "operador", "bearbeiter", "\u64cd\u4f5c\u5458", "\u6d4b\u91cf\u5458",
@@ -442,7 +442,7 @@ class RowData:
 
 
 def row_data_of(findings: TableFindings, kind: Kind, *, once: bool = True) -> RowData:
-    """Return what a table holds beside its readings, and say in ``findings`` what was taken and what was not.
+    """Return what a table contains besides its readings, and say in ``findings`` what was taken and what was not.
 
     Parameters
     ----------
@@ -621,7 +621,7 @@ class _Reader:
 
 
 def metadata_of(findings: TableFindings, row_data: RowData) -> dict[str, str]:
-    """Return the comments of the contract file: those of the file itself, what stands above its table, source and date.
+    """Return the comments of the contract file: those of the file itself, the lines above its table, source and date.
 
     Comments ``# key = value`` count for other commands (``u_length_um``, ``reference_point_mm``) and are kept as they are.
     Temperatures, operator, instrument, its serial number and the expansion coefficient are kept where they are clear; a

@@ -137,7 +137,7 @@ def _axis_of_name(path: Path, notes: list[str]) -> str | None:
 
 
 def _error_named(path: Path, axis: str | None, options: ImportOptions, doubts: list[str], *, angular: bool) -> str:
-    """Return the error that the user named; without one a stand-in, with the doubt that keeps it from being used."""
+    """Return the error that the user named; without one a placeholder, with the doubt that keeps it from being used."""
     if options.error is None:
         about = "EA?, EB? or EC? with the axis in place of ?" if angular else "the straightness error, for example EYX"
         doubts.append(f"the file does not say which error it is; give --error ({about})")
@@ -229,7 +229,7 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
 
 
 def import_exchange(path: Path, options: ImportOptions) -> Imported:
-    """Import an Etalon exchange file, variant Vendor: errors in mm and rad, as they stand."""
+    """Import an Etalon exchange file, variant Vendor: errors in mm and rad, unchanged."""
     source = read_source(path, most=MOST_EXCHANGE_BYTES)
     table, units, scales = errors_from_etalon(source.text, path), {"linear": "mm", "angle": "rad"}, {}
     for kind, known in (("linear", MM_PER_LENGTH), ("angle", RAD_PER_ANGLE)):

@@ -94,7 +94,7 @@ class ImportOptions:
     sheet: str | None = option(None, "Sheet of a workbook.", metavar="NAME")
     dates: Order | None = option(None, "Order of dates such as 03/04/2025 (never guessed): day, month, year.")
     decimal: Literal["comma", "point"] | None = option(
-        None, "Decimal mark of a table; the other one parts thousands (asked for where 1,000 may be either)."
+        None, "Decimal mark of a table; the other one separates thousands (needed where 1,000 may be either)."
     )
     zero_runs: Literal["drop", "keep"] | None = option(
         None, "Laser runs that are zero at every target: not made (drop) or measured (keep)."

@@ -35,7 +35,7 @@ from compgen.foreign.source import (
 # spacing and in sections that it does not know, and strict in numbers: every run must hold every target.
 
 
-#: What the deviations are by the letter of the file type; the unit does not stand in the file.
+#: What the deviations are by the letter of the file type; the file does not state the unit.
 UNITS = {"l": "um", "a": "mrad", "s": "um"}
 SUFFIXES = {".rtl": "l", ".rta": "a", ".rts": "s"}
 REFUSED = {".rtf": "flatness", ".rtp": "squareness", ".rtr": "a rotary axis"}
@@ -451,7 +451,9 @@ def read_capture(path: Path) -> Capture:
     with path.open("rb") as stream:
         stream.seek(start + _SAMPLE_BYTES * count)
         trailer = stream.read(_TRAILER_BYTES)
-    if not 0 <= trailer.find(b"EOF") < _SAMPLE_BYTES:  # further off, a sample that is not counted would stand before it
+    if (
+        not 0 <= trailer.find(b"EOF") < _SAMPLE_BYTES
+    ):  # further off, there would be a sample before it that is not counted
         raise InputError("has no end mark EOF:: behind its samples: it was cut, or Sample no is wrong", file=path)
     value = np.memmap(path, dtype="<f8", mode="r", offset=start, shape=(count,))
     for first in range(0, count, 1_000_000):
@@ -469,7 +471,7 @@ def _whole(path: Path, keys: Mapping[str, str], key: str) -> int:
 
 
 def _step(path: Path, keys: Mapping[str, str]) -> float:
-    """Seconds between samples: by the actual rate, the interval, or the rate, whichever stands there."""
+    """Seconds between samples: by the actual rate, the interval, or the rate, whichever is given."""
     for key, is_rate in (("actual sample rate", True), ("trigger interval", False), ("sample rate", True)):
         value = parse_number(keys.get(key, ""))
         if value is not None and value > 0:

@@ -18,7 +18,7 @@ from compgen.errors import InputError
 
 
 MEGABYTE = 1_000_000
-#: Larger files are no measurement in text form: a million tracer lengths have 80 MB.
+#: Larger files are not a measurement in text form: a million tracer lengths have 80 MB.
 MOST_BYTES = 128 * MEGABYTE
 #: The project's own files are read faster, but they too fit into the memory of a workstation.
 MOST_OWN_BYTES = 256 * MEGABYTE
@@ -91,7 +91,7 @@ def check_size(path: Path, most: int = MOST_BYTES) -> int:
 
 
 def read_head(path: Path) -> bytes:
-    """Return the first bytes of a file; InputError for kinds of file that hold no readable numbers."""
+    """Return the first bytes of a file; InputError for kinds of file that contain no readable numbers."""
     head = read_bytes(path, HEAD_BYTES)
     for mark, what in _BINARY:
         if head.startswith(mark):
@@ -118,7 +118,7 @@ def read_source(path: Path, encodings: Sequence[str] = ENCODINGS, most: int = MO
         raise InputError("is XML or HTML; export the numbers as text (CSV) or .xlsx", file=path)
     if "\0" in text:
         line = text[: text.index("\0")].count("\n") + 1
-        raise InputError("holds NUL bytes: it is not text, or was not written to its end", file=path, line=line)
+        raise InputError("contains NUL bytes: it is not text, or was not written completely", file=path, line=line)
     return Text(path, text, encoding)
 
 
@@ -213,7 +213,7 @@ _MONTH_NAMES = frozenset([
 
 @dataclass(frozen=True)
 class Written:
-    """One date as it stands: what each possible order makes of it (at midnight), seconds of the day, and the zone.
+    """One date as written: what each possible order makes of it (at midnight), seconds of the day, and the zone.
 
     ``day_text`` is what is left of the text without the time of the day.
     """
@@ -357,7 +357,7 @@ def iso(date: Written, order: Order) -> str:
 
 
 def header_date(text: str, chosen: Order | None = None) -> tuple[str | None, str | None]:
-    """Return the ISO form of a date in a header, and what stands against it: (iso, None), (None, why) or (None, None).
+    """Return the ISO form of a date in a header, and what is wrong with it: (iso, None), (None, why) or (None, None).
 
     >>> header_date("10/02/2025 12:58:22")[0], header_date("10/02/2025 12:58:22", "dmy")[0]
     (None, '2025-02-10T12:58:22')

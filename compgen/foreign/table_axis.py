@@ -1,7 +1,7 @@
 """Tables of readings along axes: a row for each reading, or a row for each target and a column for each run.
 
-:func:`axis_readings` finds runs, deviations, axes and directions. Columns that say the same thing twice (deviations beside
-readings, means beside runs) are compared, and the user is asked where they disagree.
+:func:`axis_readings` finds runs, deviations, axes and directions. Columns that say the same thing twice (deviations next to
+readings, means next to runs) are compared, and the user is asked where they disagree.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class _Rows:
 
 
 def axis_readings(findings: TableFindings, *, angular: bool = False) -> tuple[dict[str, OneAxis], RowData]:
-    """Return the readings of each axis, "" where nothing says which it is, and what stands beside the rows."""
+    """Return the readings of each axis, "" where nothing says which it is, and the other columns."""
     rows = _rows(findings)
     target = findings.positions_mm("position", findings.numbers("position"))[rows.row]
     value = _deviations(findings, rows, target, angular=angular)
@@ -160,7 +160,7 @@ def _runs_in_cells(findings: TableFindings) -> tuple[IntArray, IntArray | None]:
 
 
 def _compared(findings: TableFindings, key: str) -> str:
-    """Hold deviations or corrections that are printed beside the readings against them; return the field that counts.
+    """Compare deviations or corrections that are printed next to the readings with them; return the field that counts.
 
     The finer one counts where both agree; where they do not, or differ in sign, the user is asked.
     """
@@ -200,7 +200,7 @@ def _compared(findings: TableFindings, key: str) -> str:
 def _reference(findings: TableFindings, key: str) -> tuple[FloatArray | None, float, float]:
     """Return the deviations by which others are judged, mm per unit of them, and the value of their last digit.
 
-    None where readings do not follow the targets in a known unit; that is asked for elsewhere.
+    None where readings do not follow the targets in a known unit; the user is asked elsewhere.
     """
     values, digit = findings.numbers(key), _last_digit(findings, findings.fields[key].name)
     unit = findings.given_unit(key, value=key == "deviation") or findings.fields[key].unit
@@ -257,7 +257,7 @@ def _wide(findings: TableFindings, columns: Sequence[RunColumn]) -> _Rows:
 
 
 def _statistics(findings: TableFindings, columns: Sequence[RunColumn]) -> None:
-    """Keep means and other statistics beside the runs out of the runs; a mean must be that of the runs."""
+    """Tell means and other statistics from the runs; a mean must be that of the runs."""
     mm = MM_PER_LENGTH.get(split_name(columns[0].name).unit or "")
     taken = {*findings.used, *(column.name for column in findings.fields.values()), *findings.options.ignore}
     for name in findings.table.header:
@@ -339,7 +339,7 @@ def _from_readings(findings: TableFindings, rows: _Rows, target: FloatArray) -> 
     sign = -1.0 if slope.sign < 0 and findings.options.sign == "correction" else 1.0
     offset = slope.offset * scale
     if abs(offset) > 1.0:
-        findings.notes.append(f"readings are {offset:.6g} mm beside the targets at zero; nothing was taken off")
+        findings.notes.append(f"readings are {offset:.6g} mm off the targets at zero; nothing was taken off")
     findings.understood["slope_of_readings"] = slope.slope
     findings.understood["sign"] = "measured minus target"
     findings.understood["unit"] = next((u for u, mm in MM_PER_LENGTH.items() if abs(mm / scale - 1) < 1e-9), "mm")

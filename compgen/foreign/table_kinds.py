@@ -167,7 +167,7 @@ _ISO = re.compile(r"(?<![A-Z0-9])E_?([CBA])_?[0O]_?([YZ])(?![A-Z0-9])")
 def squareness_in(grid: CellGrid) -> tuple[ErrorTable, list[str]] | None:
     """Return the squareness errors of a sheet that holds nothing else, rad, and what it leaves open; None for another sheet.
 
-    Each row has a name (EC0Y, or a pair of axes), a number and a unit, which may stand above. The sign of a bare pair is
+    Each row has a name (EC0Y, or a pair of axes), a number and a unit, which may be above. The sign of a bare pair is
     never guessed; an angle in degrees near 90 shows it.
     """
     found: dict[str, tuple[float, float]] = {}
@@ -193,7 +193,7 @@ def squareness_in(grid: CellGrid) -> tuple[ErrorTable, list[str]] | None:
         unit = next((name for name in own if name in RAD_PER_ANGLE), above.get(numbers[0], ""))
         if unit not in RAD_PER_ANGLE:
             doubts.append(
-                f"line {line}: the file gives no unit of {shown(called)}; write urad, arcsec, um/m or deg beside it"
+                f"line {line}: the file gives no unit of {shown(called)}; write urad, arcsec, um/m or deg next to it"
             )
             continue
         if iso:
@@ -581,7 +581,7 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
     beside = None
     if kinds == {"axis"} or kinds == {"axis", "errors"}:
         read = [item.data for _, item in parts if isinstance(item.data, AxisRuns)]
-        # with the numbers beside the readings that all sheets have
+        # with the covariates that all sheets have
         common = set.intersection(*(set(part.covariates) for part in read))
         kept = [replace(r, covariates={k: v for k, v in r.covariates.items() if k in common}) for r in read]
         runs = replace(join_axis_runs(kept), metadata=read[0].metadata)
@@ -607,7 +607,7 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
 
 
 def _together(parts: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
-    """Return the numbers beside the readings that every part has, one after the other."""
+    """Return the covariates that every part has, one after the other."""
     common = [name for name in parts[0] if all(name in part for part in parts)]
     return {name: np.concatenate([part[name] for part in parts]) for name in common}
 

@@ -49,7 +49,7 @@ class AxisErrors:
         repeatability); nan where there is one run only.
     reversal : mean of the runs in positive direction less those in negative direction, (n, 6), or None.
     count : runs at each position, (n,).
-    turned_by : how often the rotation of each other axis, where it stood, is still in the translations.
+    turned_by : how often the rotation of each other axis, where it was, is still in the translations.
     """
 
     axis: int
@@ -128,7 +128,7 @@ def evaluate_axes(machine: Machine, instrument: SixDofInstrument, axes: Mapping[
     curves: dict[str, Curve] = {}
     slopes: dict[str, float] = {}
     for axis, entry in axes.items():
-        # without what the rotation of the other axes, where they stood, adds to the measured translations
+        # without what the rotation of the other axes, where they were, adds to the measured translations
         stood, turn = instrument.axes[axis].position_mm or (0.0, 0.0, 0.0), np.zeros(3)
         for other, times in entry.turned_by.items():
             if other in axes:

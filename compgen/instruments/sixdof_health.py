@@ -147,7 +147,7 @@ def _contradiction(machine: Machine, instrument: SixDofInstrument, runs: Sequenc
 
 
 def _swapped(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
-    """Angles and drift monitor are small; the spots of a long run are not: channels that stand in each other's place."""
+    """Angles and drift monitor are small; the spots of a long run are not: two channels that were exchanged."""
     spots = readings.signals_mm
 
     def size(first: str, second: str | None = None) -> float:

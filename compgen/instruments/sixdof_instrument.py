@@ -121,7 +121,7 @@ class SetUp:
     Parameters
     ----------
     axis : 0, 1, 2 for X, Y, Z.
-    mode : 1: the target moves; 2: the unit and its prism move, the target stands.
+    mode : 1: the target moves; 2: the unit and its prism move, the target is at rest.
     beam_direction : +1 or -1, the sense along the axis in which the beam meets the target.
     """
 
@@ -352,7 +352,7 @@ class AxisSetUp:
     ----------
     set_up : axis, mode and beam direction.
     distance_first_mm : L at the first target position of a run; None if the readings hold the distance.
-    position_mm : where the other axes stood (its own component does not count); None: machine zero.
+    position_mm : where the other axes were (its own component does not count); None: machine zero.
     target_offset_mm : from the reference point of the tool (spindle nose) to the front centre of the first cube corner.
     systematics : calibrated parameters of this axis, mm and rad.
     """

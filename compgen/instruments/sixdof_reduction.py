@@ -207,7 +207,7 @@ def _distance(
 #
 #     delta_i(q) = E(q) - eps_i(q) x lever_i(q) - (sum of eps of the carriers of i) x q e_i
 #
-# with all eps zero at the machine's reference point. In B the unit, and with it the measured directions, stands turned by
+# with all eps zero at the machine's reference point. In B the unit, and with it the measured directions, is turned by
 # the eps of all axes at the first position of the run; that turn is put back.
 #
 # Which of the two it is follows from chain and mode: A if the moving body is the target on a tool-side axis, or the unit on
@@ -302,7 +302,7 @@ def lever_arm(machine: Machine, axis: int, position_mm: FloatArray, tool_mm: Flo
 
 
 def turned_by(machine: Machine, axis: int, *, unit_at_tool: bool) -> dict[int, int]:
-    """By other axis: how often its rotation, where it stood, turns the measured travel of ``axis``.
+    """By other axis: how often its rotation, where it was, turns the measured travel of ``axis``.
 
     The carriers turn the travel as the workpiece sees it (+1); a unit on the tool's side is itself turned by all axes
     (-1).
@@ -320,7 +320,7 @@ def turned_by(machine: Machine, axis: int, *, unit_at_tool: bool) -> dict[int, i
 #
 # Exact ray tracing refutes them in several places (``docs/sixdof.md``, "What the print has otherwise"): the cross-talk of
 # the angles in mode 1, the drift in yaw and pitch, the roll of Y and Z. Nothing else of the program uses this module. Where
-# the print cannot be read (pitch of Y, the sign of the drift) the traced form stands.
+# the print cannot be read (pitch of Y, the sign of the drift) the traced form is used.
 
 
 WARNING = (

@@ -119,7 +119,7 @@ def scatter_of(
 ) -> Scatter:
     """Scatter of the readings of one axis, whose runs are ``runs``.
 
-    The stated noise counts as it is. What repeated runs scatter beyond it (each run freed of an offset and a line, which
+    The stated noise counts unchanged. What repeated runs scatter beyond it (each run freed of an offset and a line, which
     its first row makes) is the source ``repeatability``. Without repeats and without stated noise the differences of
     neighbouring positions take its place.
     """

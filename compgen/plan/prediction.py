@@ -465,7 +465,7 @@ def plan_visibility(found: Planned, points: Points) -> PlanVisibility:
     """Project every effect of the catalogue off what errors, stations and dead lengths can do in this plan.
 
     The order of the points is that in which they are visited. What the points do not say is assumed: one feed, equal
-    times, temperatures that rise together; it stands in the result.
+    times, temperatures that rise together; the result says so.
     """
     readings, assumed = _readings(found, points)
     modelled = modelled_errors(found.machine)

@@ -1,4 +1,4 @@
-"""Planned stations, and the regions in which they may stand."""
+"""Planned stations, and the regions in which they may be placed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OF_IDENTIFY = (
 )
 _BOX_COLUMNS = tuple(f"{axis}_{end}_mm" for axis in "xyz" for end in ("min", "max"))
 
-#: The shell in which stations may stand where no box is given: this far from the footprint of the working volume, and
+#: The shell in which stations may be placed where no box is given: this far from the footprint of the working volume, and
 #: this high above its lowest tool tip, the level of the table.
 SHELL_NEAR_MM, SHELL_FAR_MM, SHELL_HEIGHT_MM = 100.0, 600.0, 300.0
 
@@ -41,7 +41,7 @@ class PlannedStations:
     names : one for each station, S of them.
     position_mm : in the workpiece frame, shape (S, 3).
     passes : station index and set-up of each pass, shape (p, 2); in a pass a station reads every point once, and each
-        pass has an unknown constant of its own.
+        pass has its own unknown constant.
     """
 
     names: tuple[str, ...]
@@ -85,7 +85,7 @@ def read_stations(path: str | Path) -> PlannedStations:
     position_mm = np.zeros((len(known), 3))
     first: dict[tuple[str, int | None], int] = {}
     main = table.labels("segment") == 0 if "segment" in table.columns else np.ones(len(table), dtype=bool)
-    kept = np.flatnonzero(main).tolist()  # dead lengths that a beam break added are no set-ups to plan
+    kept = np.flatnonzero(main).tolist()  # dead lengths that a beam break added are not set-ups to plan
     for row in kept:
         name = names[row]
         earlier = first.setdefault((name, None), row)
@@ -116,7 +116,7 @@ def format_stations(stations: PlannedStations, machine: Machine) -> str:
     return format_csv(columns, {"machine": machine.name, "source": "compgen plan"}, dict.fromkeys(POSITION_COLUMNS, 3))
 
 
-# --- where stations may stand --------------------------------------------------------------------------------------
+# --- where stations may be placed ----------------------------------------------------------------------------------
 
 
 class Region(Protocol):

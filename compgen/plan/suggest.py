@@ -124,8 +124,8 @@ def suggest(
 
     Parameters
     ----------
-    start : the measurement with the stations as they are; they count as one candidate wherever they stand.
-    regions : where each station may stand.
+    start : the measurement with the stations as they are; they count as one candidate wherever they are.
+    regions : where each station may be placed.
     criterion : ``"worst"`` or ``"rms"`` of the standard uncertainty of E over the volume.
     evaluations : how many arrangements are looked at.
     seed : of the spread places; the same seed gives the same result.

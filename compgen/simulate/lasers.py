@@ -119,7 +119,7 @@ def read_laser_tracer(section: toml_files.Section) -> LaserTracer:
 # A simulated laser along single axes: bidirectional runs as ISO 230-2 has them, ``*.axis.csv``.
 
 
-#: Targets stand this share of the travel inside its ends, so that both directions can approach them.
+#: Targets lie this share of the travel inside its ends, so that both directions can approach them.
 OVERRUN = 0.02
 
 
@@ -145,7 +145,7 @@ class AxisLaser:
     noise_um : standard deviation of a reading.
     feed_mm_min, dwell_s : speed between targets and time at each; several dwells are those of the runs in turn, and are
         logged.
-    at_mm : where the other axes stand; None: the machine's reference point.
+    at_mm : where the other axes are; None: the machine's reference point.
     """
 
     axes: tuple[int, ...] = setting(_axes, (0, 1, 2))
@@ -197,8 +197,7 @@ class AxisLaser:
         """Return the readings; ``tips`` tells where the tip really is at stops, ``effects`` act on readings alone."""
         stops, mark = self.stops(machine)
         stops, axis = with_temperatures(stops, temperatures), mark[:, 0]
-        moved_mm = tips(stops) - stops.position_mm - np.array(machine.tool_offset_mm)
-        deviation = along_beam(moved_mm, np.eye(3)[axis], stops, effects, "axis runs")
+        deviation = along_beam(machine, tips, np.eye(3)[axis], stops, effects, "axis runs")
         return AxisRuns(
             axis=axis,
             position_mm=np.round(stops.position_mm[np.arange(len(axis)), axis], 6),
@@ -217,9 +216,15 @@ def stop_times_s(position_mm: FloatArray, feed_mm_min: float, dwell_s: float | F
 
 
 def along_beam(
-    moved_mm: FloatArray, unit: FloatArray, stops: Stops, effects: Sequence[SimulatedEffect], what: str
+    machine: Machine,
+    tips: Callable[[Stops], FloatArray],
+    unit: FloatArray,
+    stops: Stops,
+    effects: Sequence[SimulatedEffect],
+    what: str,
 ) -> FloatArray:
-    """Return displacements (n, 3) along beams (n, 3) with the effects that act on the readings alone, (n,), mm."""
+    """Return how far the tip is along beams (n, 3) from where it was sent, with effects on the readings alone, (n,), mm."""
+    moved_mm = tips(stops) - stops.position_mm - np.array(machine.tool_offset_mm)
     deviation = np.einsum("ij,ij->i", moved_mm, unit)
     for effect in effects:
         if isinstance(effect, LengthEffect):
@@ -230,7 +235,7 @@ def along_beam(
 
 
 def logged_beside(stops: Stops) -> dict[str, FloatArray]:
-    """Return the columns that are written beside the readings: the time, the temperatures, and dwells that differ."""
+    """Return the columns that are written next to the readings: the time, the temperatures, and dwells that differ."""
     logged = {
         name: values for name, values in stops.covariates.items() if name.startswith("temp_") or name == "dwell_s"
     }
@@ -263,12 +268,12 @@ class DiagonalLaser:
 
     Parameters
     ----------
-    diagonals : names of those that are measured; axes that stand do so at the machine's reference point.
+    diagonals : names of those that are measured; axes that do not move are at the machine's reference point.
     targets : targets of each diagonal, equally spaced.
     cycles : runs there and back of each diagonal.
     noise_um : standard deviation of a reading.
     feed_mm_min, dwell_s : speed between targets and time at each.
-    inside : how far the first and last target stand inside the travel of each axis, as a share of it, so that both
+    inside : how far the first and last target lie inside the travel of each axis, as a share of it, so that both
         directions can approach them.
     """
 
@@ -332,9 +337,9 @@ class DiagonalLaser:
         """Return the readings; ``tips`` tells where the tip really is at stops, ``effects`` act on readings alone."""
         stops, names, mark = self.stops(machine)
         stops = with_temperatures(stops, temperatures)
-        moved_mm = tips(stops) - stops.position_mm - np.array(machine.tool_offset_mm)
         units = {name: self.unit(machine, name) for name in self.diagonals}
-        deviation = along_beam(moved_mm, np.array([units[name] for name in names]), stops, effects, "diagonals")
+        unit = np.array([units[name] for name in names])
+        deviation = along_beam(machine, tips, unit, stops, effects, "diagonals")
         return Diagonals(
             name=names,
             position_mm=stops.position_mm,

@@ -266,7 +266,7 @@ def simulate(
     ----------
     machine : chain, travel, nodes and modelled errors count.
     scenario : true errors, instrument and trajectory.
-    seed : takes the place of the scenario's. Errors and noise have random streams of their own, so that changing
+    seed : takes the place of the scenario's. Errors and noise have separate random streams, so that changing
         the one leaves the other.
     effects : what acts besides the geometric errors and the effects of the scenario.
 

@@ -33,10 +33,10 @@ from compgen.kinematics.exact_chain import tip_position
 
 # Exact vector ray tracer of the six-DOF instrument: refraction and reflection at planes, cube corner, prism, plate.
 #
-# Written from the geometry alone, not from the linear model; it stands where Jia et al. 2022 used a ray tracing program.
+# Written from the geometry alone, not from the linear model; it takes the place of the ray tracing program of Jia et al. 2022.
 #
 # Frame of the unit: beam 1 leaves along +x on y = z = 0, beam 2 at y = -h; the detectors lie in the exit plane.
-# X: the beam goes straight on, the front face of the target stands at x = L. Y: prism 1 with entrance face x = -b/2,
+# X: the beam goes straight on, the front face of the target is at x = L. Y: prism 1 with entrance face x = -b/2,
 # reflector y = x, exit face y = b/2. Z: prism 2 reflects on its outside at z = x. Front faces at b/2 + L behind a prism.
 # A beam along the negative axis is the same picture after half a turn about the vertical direction.
 
@@ -128,7 +128,7 @@ def refract(ray: Ray, plane: OpticalPlane, before: float, after: float) -> Ray:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where things stand for one axis, before any error.
+    """Where things are for one axis, before any error.
 
     Parameters
     ----------
@@ -322,7 +322,7 @@ def run_signals(
 ) -> FloatArray:
     """Signals (n, 7) of one run, in mm and in the order of SIGNALS; the interferometer's with its travel.
 
-    Chain and mode say where unit and target are. The one on the workpiece stands still in the workpiece frame; the one
+    Chain and mode say where unit and target are. The one on the workpiece does not move in the workpiece frame; the one
     at the tool has the offset ``target_offset_mm`` (the target's front centre, or the unit's reference point).
 
     Parameters
@@ -383,7 +383,7 @@ class SimulatedSixDof:
     Parameters
     ----------
     instrument : constants, set-up and calibrated parameters, as the instrument file has them.
-    uncalibrated : parameters that are there as well, but do not stand in the instrument file, mm and rad.
+    uncalibrated : parameters that the instrument has as well, but the instrument file does not contain, mm and rad.
     runs, there_and_back : how often each axis is run, and whether each run comes back.
     positions_mm : target positions by axis; None takes the machine's nodes.
     scatter : standard deviation of each reading by axis in the order of ROLES, (3, 6), mm and rad: the machine does not

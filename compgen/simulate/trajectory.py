@@ -1,7 +1,7 @@
 """Which points the machine visits, in which order and when: passes over a grid, or sessions of many runs.
 
 A :class:`Trajectory` gives the points, a :class:`Session` repeats its lines under several loads and feeds; both end as
-:class:`Stops` in order of time, with temperatures beside them.
+:class:`Stops` in order of time, with the temperatures there.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Trajectory:
     levels_mm : explicit levels of X, Y, Z in mm; None for an axis takes ``counts``, else the machine's nodes.
     lines : the lines of kind ``lines``.
     there_and_back : whether each pass is repeated in reverse order.
-    tools_mm : tool offsets, each of which makes a pass of its own; empty: the machine's own tool.
+    tools_mm : tool offsets, each of which makes a separate pass; empty: the machine's own tool.
     feed_mm_min, dwell_s : path speed between points and time of standing at each.
     start_mm : where the machine comes from; default the machine's reference point.
     """
@@ -198,7 +198,7 @@ def trajectory_points(trajectory: Trajectory, machine: Machine) -> FloatArray:
 
 
 def plan_stops(trajectory: Trajectory, machine: Machine, repeats: int = 1) -> Stops:
-    """Return all stops in order of time: for each repeat, each tool, the points there and, if asked for, back.
+    """Return all stops in order of time: for each repeat, each tool, the points there and, if requested, back.
 
     Raises
     ------
@@ -225,7 +225,7 @@ def plan_stops(trajectory: Trajectory, machine: Machine, repeats: int = 1) -> St
 
 
 def passes_of(trajectory: Trajectory, machine: Machine) -> list[FloatArray]:
-    """Points of one pass there and, if asked for, back, each (n, 3), mm."""
+    """Points of one pass there and, if requested, back, each (n, 3), mm."""
     there = trajectory_points(trajectory, machine)
     return [there, there[::-1]] if trajectory.there_and_back else [there]
 

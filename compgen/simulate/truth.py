@@ -65,7 +65,7 @@ class RandomErrors:
 
 @dataclass(frozen=True)
 class TruthPlan:
-    """Where the true errors come from; what is ``given`` wins over what is drawn or stands in the file.
+    """Where the true errors come from; what is ``given`` wins over what is drawn or in the file.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def read_truth_plan(section: toml_files.Section, folder: Path) -> TruthPlan:
     Raises
     ------
     InputError
-        for unknown keys or errors, a unit that does not fit the error, a file beside random errors.
+        for unknown keys or errors, a unit that does not fit the error, a file together with random errors.
     """
     file = section.take("file", toml_files.text, None)
     drawn = section.take("random", toml_files.flag, file is None)
@@ -140,7 +140,7 @@ def draw_truth(
 ) -> ErrorTable:
     """Return the true errors of ``machine`` in mm and rad.
 
-    Every error has a random stream of its own, so giving one of them leaves the others as they were.
+    Every error has its own random stream, so giving one of them leaves the others as they were.
 
     Parameters
     ----------

@@ -170,7 +170,7 @@ def spindle_growth(axis: int, p: Values, settings: Values) -> Displacement:
 
 
 def cosine_error(axis: int, p: Values, settings: Values) -> Displacement:
-    """A scale that leans by theta: it stands at p cos(theta) where p was told."""
+    """A scale that leans by theta: it is at p cos(theta) when sent to p."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         theta = math.sqrt(max(2.0 * p["c_ppm"], 0.0))
@@ -535,9 +535,7 @@ def _built_in(name: str, p: Mapping[str, float], settings: Mapping[str, float]) 
 def _of_columns(effect: Effect, values: FloatArray) -> Displacement:
     """Simulate an effect of a plug-in's family by its own columns."""
     if not isinstance(effect, DisplacementEffect):
-        raise InputError(
-            f"{effect.card.name} does not move the tip, so a plug-in has to give a reader of its own for it"
-        )
+        raise InputError(f"{effect.card.name} does not move the tip, so a plug-in has to bring a reader for it")
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         covariates = {"time_s": stops.time_s, **stops.covariates}
