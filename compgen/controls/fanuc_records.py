@@ -640,7 +640,17 @@ def style_of(file: SourceFile) -> tuple[FanucStyle, tuple[str, ...]]:
     style = frame_of(file, records, points)
     style = spacing_of(style, records)
     style = _parameter_style(style, [record for record in others if _is_pitch_parameter(record)])
-    style = _point_style(style, points)
+    texts = []
+    for record in points:
+        words = type_word(record, record.words())[1]
+        if len(words) != 1 or words[0][0] != "P":
+            raise record.fail("expected a single value word P for a compensation point, e.g. P-2")
+        record.whole(words[0][1], -MOST_VALUE, MOST_VALUE)
+        texts.append(words[0][1])
+    if points:
+        base = min(record.number for record in points) // 10000 * 10000
+        style = whole_numbers_of(style, texts)
+        style = replace(style, point_digits=width_of(points, style.point_digits), number_base=base)
     return style, _notes(style, points, others)
 
 
@@ -746,20 +756,6 @@ def _parameter_style(style: FanucStyle, records: Sequence[Record]) -> FanucStyle
     letter = next(letter for letter, _ in lengths[0][0].words() if letter in "PM")
     fixed = decimals.pop() if len(decimals) == 1 else None
     return replace(style, real_point=real[0], decimals=fixed if real[0] and fixed != 1 else None, real_letter=letter)
-
-
-def _point_style(style: FanucStyle, points: Sequence[Record]) -> FanucStyle:
-    """Record numbers and whole numbers, from the compensation points."""
-    if not points:
-        return style
-    texts = [type_word(record, record.words())[1] for record in points]
-    for record, words in zip(points, texts, strict=True):
-        if len(words) != 1 or words[0][0] != "P":
-            raise record.fail("expected a single value word P for a compensation point, e.g. P-2")
-        record.whole(words[0][1], -10_000_000, 10_000_000)
-    style = whole_numbers_of(style, [words[0][1] for words in texts])
-    base = min(record.number for record in points) // 10000 * 10000
-    return replace(style, point_digits=width_of(points, style.point_digits), number_base=base)
 
 
 def _notes(style: FanucStyle, points: Sequence[Record], others: Sequence[Record]) -> tuple[str, ...]:

@@ -196,24 +196,19 @@ def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> 
     if not rows:
         raise source.fail("holds no row; is it the right file, or was it cut?", 1)
     nominal, forward, reverse = np.array(rows).T
-    _check_type(source, file_type, nominal, forward)
+    # positions that would be read as trims, and trims that would be read as positions, are mistakes of many mm
+    span = float(np.ptp(nominal))
+    slope = float(np.ptp(forward)) / span if span > 0.0 and len(nominal) > 2 else 0.5
+    if slope > _LIKE_POSITIONS if file_type == 1 else slope < 1.0 - _LIKE_POSITIONS:
+        message = "these are trims (file type 1), and comp_file_type is 0"
+        if file_type == 1:
+            message = "these are nominal and actual positions (file type 0), and comp_file_type is 1"
+        largest = float(np.max(np.abs(forward if file_type == 1 else nominal - forward)))
+        message += f": the trims would be up to {largest:g} machine units; set comp_file_type in the machine file"
+        raise source.fail(message, 1)
     if file_type == 0:
         return CompTable(nominal, nominal - forward, nominal - reverse, mm_per_unit)
     return CompTable(nominal, forward, reverse, mm_per_unit)
-
-
-def _check_type(source: SourceFile, file_type: int, nominal: FloatArray, forward: FloatArray) -> None:
-    """Refuse positions that would be read as trims, and trims that would be read as positions: mistakes of many mm."""
-    span = float(np.ptp(nominal))
-    slope = float(np.ptp(forward)) / span if span > 0.0 and len(nominal) > 2 else 0.5
-    if file_type == 1 and slope > _LIKE_POSITIONS:
-        message = "these are nominal and actual positions (file type 0), and comp_file_type is 1: the trims would be"
-    elif file_type == 0 and slope < 1.0 - _LIKE_POSITIONS:
-        message = "these are trims (file type 1), and comp_file_type is 0: the trims would be"
-    else:
-        return
-    largest = float(np.max(np.abs(forward if file_type == 1 else nominal - forward)))
-    raise source.fail(f"{message} up to {largest:g} machine units; set comp_file_type in the machine file", 1)
 
 
 def _row(source: SourceFile, line: int, text: str, above: list[tuple[float, ...]]) -> tuple[float, ...]:

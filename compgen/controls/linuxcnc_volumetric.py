@@ -288,7 +288,15 @@ def parse_volcomp(source: SourceFile) -> VolTable:
             curve = _read_curve(words, curves)
             curves[curve.name] = curve
         elif word == "term":
-            terms.append(_read_term(words, curves, len(terms)))
+            if len(terms) == MOST_TERMS:
+                raise source.fail(f"is term {len(terms) + 1}; {MOST_TERMS} are allowed", words.line)
+            output, name = words.whole("an axis (0 X, 1 Y, 2 Z)", 0, 2), words.take("the name of a curve")
+            if name not in curves:
+                raise source.fail(f"no curve above is named {name[:SHOWN]!r}", words.line)
+            coefficient, lever = words.number("a coefficient"), words.take("a lever")
+            if lever not in LEVERS:
+                raise source.fail(f"{lever[:SHOWN]!r} is not a lever; {', '.join(LEVERS)} are", words.line)
+            terms.append(VolTerm(output, name, coefficient, lever))
         elif word == "grid" and grid is None:
             grid = _read_grid(words)
         else:
@@ -316,19 +324,6 @@ def _read_curve(words: _WordReader, known: dict[str, VolCurve]) -> VolCurve:
     count = words.whole("a number of nodes", 1, MOST_NODES)
     first_mm, step_mm = words.number("the first position"), words.step()
     return VolCurve(name, axis, first_mm, step_mm, words.numbers(count))
-
-
-def _read_term(words: _WordReader, curves: dict[str, VolCurve], count: int) -> VolTerm:
-    if count == MOST_TERMS:
-        raise words.source.fail(f"is term {count + 1}; {MOST_TERMS} are allowed", words.line)
-    output = words.whole("an axis (0 X, 1 Y, 2 Z)", 0, 2)
-    name = words.take("the name of a curve")
-    if name not in curves:
-        raise words.source.fail(f"no curve above is named {name[:SHOWN]!r}", words.line)
-    coefficient, lever = words.number("a coefficient"), words.take("a lever")
-    if lever not in LEVERS:
-        raise words.source.fail(f"{lever[:SHOWN]!r} is not a lever; {', '.join(LEVERS)} are", words.line)
-    return VolTerm(output, name, coefficient, lever)
 
 
 def _read_grid(words: _WordReader) -> VolGrid:

@@ -281,6 +281,22 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
 
     def context(self, tables: NeutralTables) -> dict[str, Any]:
         """Return field and curves in the units of the files, and the signs with worked numbers."""
+        field, errors = None, []
+        if tables.field is not None:
+            lines = tables.field.nodes_mm
+            field = {
+                "nodes": [line.tolist() for line in lines],
+                "positions": np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3).tolist(),
+                "corrections": tables.field.correction_um.reshape(-1, 3).tolist(),
+                "rows": math.prod(map(len, lines)),
+            }
+        curves = ErrorTable({}) if tables.curves is None else tables.curves
+        for name in curves.names:
+            error, curve = error_named(name), curves.curves.get(name)
+            values = curves.squareness[name][:1] if curve is None else curve.value
+            positions = [] if curve is None else curve.position_mm.tolist()
+            scaled = (np.array(values) / error.si_per_unit).tolist()
+            errors.append({"name": name, "unit": error.unit, "positions": positions, "values": scaled})
         return {
             "sign_statement": (
                 "The field (cx_um, cy_um, cz_um) is what must be ADDED to the command at the commanded machine position: "
@@ -292,8 +308,8 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
             "position_digits": POSITION_DIGITS,
             "field_digits": FIELD_DIGITS,
             "curve_digits": CURVE_DIGITS,
-            "field": _field_context(tables),
-            "errors": _curve_context(tables),
+            "field": field,
+            "errors": errors,
         }
 
     def parse(self, files: Sequence[SourceFile]) -> NeutralTables:
@@ -379,31 +395,3 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
             loss *= 2.0
         pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(nodes[:-1], nodes[1:], parts, strict=True)]
         return np.unique(np.round(np.concatenate([*pieces, nodes[-1:]]), POSITION_DIGITS))
-
-
-def _field_context(tables: NeutralTables) -> dict[str, Any] | None:
-    if tables.field is None:
-        return None
-    lines = tables.field.nodes_mm
-    vertices = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-    values = tables.field.correction_um.reshape(-1, 3)
-    return {
-        "nodes": [line.tolist() for line in lines],
-        "positions": vertices.tolist(),
-        "corrections": values.tolist(),
-        "rows": len(vertices),
-    }
-
-
-def _curve_context(tables: NeutralTables) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = []
-    for name in () if tables.curves is None else tables.curves.names:
-        error = error_named(name)
-        if tables.curves is not None and name in tables.curves.squareness:
-            values: list[float] = [tables.curves.squareness[name][0] / error.si_per_unit]
-            positions: list[float] = []
-        elif tables.curves is not None:
-            curve = tables.curves.curves[name]
-            values, positions = (curve.value / error.si_per_unit).tolist(), curve.position_mm.tolist()
-        found.append({"name": name, "unit": error.unit, "positions": positions, "values": values})
-    return found
