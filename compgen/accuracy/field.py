@@ -246,19 +246,24 @@ def _place(field: ErrorField, row: int) -> str:
     return ", ".join(f"{value:.6g}" for value in field.position_mm[row])
 
 
-def _largest_pairs(field: ErrorField, block: int = 256) -> tuple[tuple[int, int], tuple[int, int]]:
+def _largest_pairs(field: ErrorField, block: int = 64) -> tuple[tuple[int, int], tuple[int, int]]:
     """Rows of the pair with the largest difference of vectors, and of that with the largest length error."""
     best = [(-1.0, (0, 0)), (-1.0, (0, 0))]
     tip, error = field.tip_mm, field.error_mm
     for first in range(0, len(tip), block):
         rows = slice(first, first + block)
-        apart = error[rows, None] - error[None, first:]
-        line = tip[rows, None] - tip[None, first:]
-        squares = np.einsum("ijk,ijk->ij", apart, apart)
+        # One component after the other: arrays of pairs that stay in the processor's cache.
+        squares, before, after, gain = np.zeros((4, len(tip[rows]), len(tip) - first))
+        for k in range(3):
+            apart = np.subtract.outer(error[rows, k], error[first:, k])
+            line = np.subtract.outer(tip[rows, k], tip[first:, k])
+            squares += apart * apart
+            before += line * line
+            gain += line * apart
+            line += apart
+            after += line * line
         # |line + apart| - |line| without the loss of digits that the difference of two roots has
-        before = np.sqrt(np.einsum("ijk,ijk->ij", line, line))
-        after = np.sqrt(np.einsum("ijk,ijk->ij", line + apart, line + apart))
-        gain = 2.0 * np.einsum("ijk,ijk->ij", line, apart) + squares
+        before, after, gain = np.sqrt(before), np.sqrt(after), 2.0 * gain + squares
         sizes = np.abs(np.divide(gain, before + after, out=np.zeros_like(gain), where=(before + after) > 0.0))
         for k, values in enumerate((squares, sizes)):
             at = int(np.argmax(values))

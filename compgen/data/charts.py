@@ -313,9 +313,18 @@ def page_assets(*scripts: str) -> tuple[Markup, Markup, str]:
     return Markup(style), Markup(script), policy
 
 
-def rounded(values: Sequence[float], digits: int = 4) -> list[float | None]:
-    """Return numbers with ``digits`` significant digits for the data of a page; None for what is not a number."""
-    return [float(f"{value:.{digits}g}") if value == value else None for value in values]
+def rounded(values: ArrayLike, digits: int = 4) -> list[Any]:
+    """Return numbers with ``digits`` significant digits for the data of a page; None for what is not a number.
+
+    >>> rounded([0.0, 123.456, -0.0012344, float("nan")])
+    [0.0, 123.5, -0.001234, None]
+    """
+    numbers = np.asarray(values, dtype=np.float64)
+    known = np.isfinite(numbers)
+    size = np.abs(np.where(known & (numbers != 0.0), numbers, 1.0))
+    power = 10.0 ** (digits - 1 - np.floor(np.log10(size)))
+    found = np.rint(numbers * power) / power
+    return list(found.tolist() if known.all() else np.where(known, found, None).tolist())
 
 
 def _labelled(

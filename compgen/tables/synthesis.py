@@ -172,7 +172,7 @@ class _Problem:
     tools_mm: tuple[Vector3, ...] = field(compare=False)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=16)  # a few MB each: a run for all controls and its report find theirs again
 def _factorised(problem: _Problem) -> Projector:
     """Factorise once what an export, its verification and the next measurement of the machine have in common."""
     machine, basis, tools_mm = problem.machine, problem.basis, problem.tools_mm

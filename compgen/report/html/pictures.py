@@ -42,9 +42,9 @@ class CurveSeries:
 
     def data(self) -> dict[str, Any]:
         """Return the series as the page's script takes it."""
-        found = {"name": self.name, "x": rounded(self.position_mm.tolist(), 7), "y": rounded(self.value.tolist())}
+        found = {"name": self.name, "x": rounded(self.position_mm, 7), "y": rounded(self.value)}
         if self.u is not None and np.isfinite(self.u).any():
-            found["U"] = rounded((COVERAGE * self.u).tolist(), 2)
+            found["U"] = rounded(COVERAGE * self.u, 2)
         return found
 
 
@@ -314,7 +314,7 @@ def draw_slices(grid: VolumeOnGrid, number: int) -> list[Picture]:
             cells = {
                 "axes": [AXES[across], AXES[up]],
                 "cells": [len(edges[across]) - 1, len(edges[up]) - 1],
-                "values": [rounded(row, 3) for row in errors_um.reshape(-1, 3).tolist()],
+                "values": rounded(errors_um.reshape(-1, 3), 3),
             }
             note = f"{name}, at most {um_text(float(length_um.max()), whole_from=100.0)} µm"
             pictures.append(Picture(key, when.capitalize(), drawn, {**plot.data, **cells}, note))
