@@ -34,7 +34,6 @@ from compgen.kinematics.many_points import volumetric_error
 Spread = Callable[[FloatArray], float]
 Alignment = Literal["as-given", "axes", "best-fit"]
 
-ALIGNMENTS = ("as-given", "axes", "best-fit")
 _SAME_MM = 1e-6
 
 

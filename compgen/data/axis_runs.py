@@ -212,11 +212,6 @@ def along_mm(position_mm: FloatArray, name: str) -> FloatArray:
     return np.asarray(np.linalg.norm(position_mm - start, axis=1))
 
 
-def edges_mm(position_mm: FloatArray) -> FloatArray:
-    """Extent (3,) of the positions of a diagonal in X, Y, Z: the edges of its box."""
-    return np.asarray(np.ptp(position_mm, axis=0))
-
-
 def check_lines(diagonals: Diagonals) -> None:
     """Every diagonal lies on a line in the direction of its name; InputError that names the first position that does not."""
     for name in diagonals.names:

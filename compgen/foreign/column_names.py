@@ -317,11 +317,6 @@ def covariate_unit(text: str, quantity: Quantity | None = None) -> str | None:
     return unit if unit in allowed else None
 
 
-def units_of(quantity: Quantity) -> tuple[str, ...]:
-    """Return the units that are known for a quantity."""
-    return _BY_QUANTITY[quantity]
-
-
 # What the columns of a foreign table are: fields by the words of their names, units by what is in brackets.
 
 

@@ -25,12 +25,10 @@ from compgen.foreign.column_names import (
     MM_PER_LENGTH,
     S_PER_TIME,
     NamedColumn,
-    Quantity,
     covariate_unit,
     is_index,
     quantity_of,
     split_name,
-    units_of,
     way,
 )
 from compgen.foreign.findings import Kind, TableFindings
@@ -88,28 +86,11 @@ def channel_of(word: str) -> str:
     return rest[:30] or "measured"
 
 
-def _numbers(findings: TableFindings, column: NamedColumn) -> FloatArray:
-    """Return the numbers of a column; InputError with the line for one that has other cells."""
-    return np.array(findings.table.numbers(column.name))
-
-
-def _given_unit(findings: TableFindings, key: str, quantity: Quantity) -> str | None:
-    given = findings.options.units.get(key)
-    if given is None:
-        return None
-    unit = covariate_unit(given, quantity)
-    if unit is None:
-        raise InputError(
-            f"{given!r} is not a unit of {quantity}; use {', '.join(units_of(quantity))}", field=f"--unit {key}"
-        )
-    return unit
-
-
 def celsius_of(findings: TableFindings, key: str, channel: str, column: NamedColumn) -> FloatArray:
     """Temperatures in degC: by the user's word, the unit in the name, else by the only unit in which they are usual."""
-    raw = _numbers(findings, column)
+    raw = np.array(findings.table.numbers(column.name))
     name = channel.removesuffix("_c")
-    unit = _given_unit(findings, name, "temperature") or _given_unit(findings, key, "temperature")
+    unit = findings.options.given_unit(name, key, among=CELSIUS, what="temperature")
     declared = unit or column.unit
     if declared is not None and declared not in CELSIUS:
         raise InputError(f"{declared} is not a unit of temperature")
@@ -133,23 +114,16 @@ def celsius_of(findings: TableFindings, key: str, channel: str, column: NamedCol
     return values
 
 
-def amount_of(findings: TableFindings, key: str, quantity: Quantity, scales: Mapping[str, float]) -> FloatArray:
-    """Feed or load in the unit of the contract; the unit must be in the file or be given."""
+def amount_of(
+    findings: TableFindings, key: str, what: str, scales: Mapping[str, float], usual: str | None = None
+) -> FloatArray:
+    """Numbers in the unit of the contract; the unit is given, or in the file, or that of the positions (``usual``)."""
     column = findings.fields[key]
-    unit = _given_unit(findings, key, quantity) or (column.unit if column.unit in scales else None)
-    if unit is None:
+    unit = findings.options.given_unit(key, among=scales, what=what) or column.unit or usual
+    if unit is None or unit not in scales:
         raise InputError(f"its unit is not given; --unit {key}= one of {', '.join(scales)}")
-    return _numbers(findings, column) * scales[unit]
-
-
-def uncertainty_of(findings: TableFindings) -> FloatArray:
-    """Standard uncertainties of lengths, um."""
-    column = findings.fields["u_value"]
-    unit = findings.given_unit("u_value") or column.unit
-    if unit not in MM_PER_LENGTH:
-        raise InputError("its unit is not given; --unit u_value=um")
-    values = _numbers(findings, column) * MM_PER_LENGTH[unit] * 1e3
-    if values.min() <= 0:
+    values: FloatArray = np.array(findings.table.numbers(column.name)) * scales[unit]
+    if key == "u_value" and values.min() <= 0:
         raise InputError(f"{values.min():g} um is not a standard uncertainty")
     return values
 
@@ -164,24 +138,16 @@ def labels_of(findings: TableFindings, column: NamedColumn) -> NDArray[np.int64]
     return np.array([names[cell] for cell in cells], dtype=np.int64)
 
 
-def tool_of(findings: TableFindings, key: str) -> FloatArray:
-    """One component of the tool offset, mm; in its own unit, else in that of the positions."""
-    column = findings.fields[key]
-    unit = findings.given_unit(key) or column.unit or str(findings.understood.get("position_unit", "mm"))
-    if unit not in MM_PER_LENGTH:
-        raise InputError(f"{unit} is not a unit of length")
-    return _numbers(findings, column) * MM_PER_LENGTH[unit]
-
-
-def directions_of(findings: TableFindings, column: NamedColumn) -> FloatArray:
-    """Directions of travel, +1, -1, or 0 where the cell is empty or zero."""
-    ways = []
-    for cell, line in zip(findings.table.column(column.name), findings.table.lines, strict=True):
-        one = 0 if cell in ("", "0", "0.0") else way(cell)
+def directions_of(findings: TableFindings, column: NamedColumn, *, empty: bool = True) -> NDArray[np.int64]:
+    """Directions of travel, +1, -1, or with ``empty`` 0 where the cell is empty or zero."""
+    table, ways = findings.table, []
+    for cell, line in zip(table.column(column.name), table.lines, strict=True):
+        one = 0 if empty and cell in ("", "0", "0.0") else way(cell)
         if one is None:
-            raise findings.table.grid.fail(f"{shown(cell)} is not a direction; expected +1 or -1", line, column.name)
-        ways.append(float(one))
-    return np.array(ways)
+            message = f"{shown(cell)} is not a direction{'' if cell else table.grid.empty}; write + or -, +1 or -1, forward or "
+            raise table.grid.fail(f"{message}backward (known in several languages)", line, column.name)
+        ways.append(one)
+    return np.array(ways, dtype=np.int64)
 
 
 # The column of times of a foreign table as seconds since its first reading.
@@ -219,10 +185,7 @@ def times_of(
     if all(value is not None for value in numbers):
         # seconds, minutes, ... by the unit; without one days of a spreadsheet, where all of them are of this century
         values = np.array(numbers, dtype=np.float64)
-        given = findings.options.units.get("time")
-        unit = covariate_unit(given, "time") if given else column.unit
-        if given and unit is None:
-            raise InputError(f"{given!r} is not a unit of time; use {', '.join(S_PER_TIME)}", field="--unit time")
+        unit = findings.options.given_unit("time", among=S_PER_TIME, what="time") or column.unit
         if unit in S_PER_TIME:
             return values * S_PER_TIME[unit], None
         days = [found for value in values if (found := serial_date(float(value))) is not None]
@@ -407,6 +370,12 @@ _EXPANSION = ("expansion", "expansioncoefficient", "expcoeff", "coefficientofthe
 _FRACTION, _LARGEST_EXPANSION = 1e-3, 100.0
 _NUMBER = r"[+\-]?\d+(?:[.,]\d+)?(?:[eE][+\-]?\d+)?"
 
+#: Numbers with a unit: what they are, the column of the contract, and its unit for each unit.
+_AMOUNTS: Mapping[str, tuple[str, str, Mapping[str, float]]] = {
+    "feed": ("feed", "feed_mm_min", MM_MIN_PER_FEED),
+    "load": ("load", "load_kg", KG_PER_MASS),
+    "u_value": ("length", "u_length_um", {name: 1e3 * mm for name, mm in MM_PER_LENGTH.items()}),
+}
 _LABELS = ("run", "repeat", "line", "block", "setup", "pose")
 _MAIN: Mapping[str, tuple[str, ...]] = {
     "axis": ("position", "direction", "run", "axis"),
@@ -432,7 +401,7 @@ _PLACES: Mapping[Kind, tuple[str, ...]] = {
 
 @dataclass
 class RowData:
-    """Beside n rows: numbers by contract name, labels, tool and directions of approach (n, 3), and the time of the first."""
+    """What n rows contain besides readings: numbers by contract name, labels, tool, approach (n, 3), and the first time."""
 
     covariates: dict[str, FloatArray] = field(default_factory=dict)
     labels: dict[str, NDArray[np.int64]] = field(default_factory=dict)
@@ -529,21 +498,11 @@ class _Reader:
 
     def amounts(self) -> None:
         """Take feed, load and the standard uncertainty of a length."""
-        amounts: tuple[tuple[str, Quantity, str, Mapping[str, float]], ...] = (
-            ("feed", "feed", "feed_mm_min", MM_MIN_PER_FEED),
-            ("load", "load", "load_kg", KG_PER_MASS),
-        )
-        for key, quantity, name, scales in amounts:
-            column = self._column(key)
-            if column is not None:
-                values = self._try(key, column, partial(amount_of, self.findings, key, quantity, scales))
+        for key, (what, name, scales) in _AMOUNTS.items():
+            if self._column(key) is not None:
+                values = self._try(key, self.findings.fields[key], partial(amount_of, self.findings, key, what, scales))
                 if values is not None:
                     self.found.covariates[name] = values
-        column = self._column("u_value")
-        if column is not None:
-            values = self._try("u_value", column, lambda: uncertainty_of(self.findings))
-            if values is not None:
-                self.found.covariates["u_length_um"] = values
 
     def labels(self) -> None:
         """Take run, repeat, line, block, set-up and pose as whole numbers; words are numbered as they come."""
@@ -560,8 +519,11 @@ class _Reader:
             return
         tool = [column for axis in "xyz" if (column := self._column(f"tool_{axis}")) is not None]
         if len(tool) == 3:
-            read = partial(tool_of, self.findings)
-            parts = [self._try(f"tool_{a}", c, partial(read, f"tool_{a}")) for a, c in zip("xyz", tool, strict=True)]
+            usual = str(self.findings.understood.get("position_unit", "mm"))
+            parts = []
+            for key, column in zip(("tool_x", "tool_y", "tool_z"), tool, strict=True):
+                read = partial(amount_of, self.findings, key, "length", MM_PER_LENGTH, usual)
+                parts.append(self._try(key, column, read))
             if all(part is not None for part in parts):
                 self.found.tool_mm = np.column_stack(parts)
         else:
@@ -579,8 +541,8 @@ class _Reader:
         column = self._column(key)
         if column is None:
             return None
-        taken: FloatArray | None = self._try(key, column, lambda: directions_of(self.findings, column))
-        return taken
+        taken = self._try(key, column, lambda: directions_of(self.findings, column))
+        return None if taken is None else np.asarray(taken, dtype=np.float64)
 
     def report(self, *, once: bool) -> None:
         """Name the columns that were not used."""

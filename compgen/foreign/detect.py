@@ -20,7 +20,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import CompgenError, InputError
 from compgen.foreign.cells import chosen_sheet, grid_of_text, holds_readings, read_sheets
-from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, check_field, known_unit
+from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, check_field
 from compgen.foreign.covariates import surroundings_of
 from compgen.foreign.findings import (
     ABSURD_DECADES,
@@ -154,12 +154,8 @@ def _in_si(found: Renishaw, options: ImportOptions, doubts: list[str], notes: li
     angular = found.letter == "a"
     units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
     usual = 1e-5 if angular else usual_deviation_mm(float(np.ptp(found.runs.position_mm)))
-    given = options.units.get("value") or options.units.get("deviation")
-    unit = known_unit(given) if given else UNITS[found.letter]
-    if unit not in units:
-        raise InputError(
-            f"{given!r} is not a unit of {'angle' if angular else 'length'}; use {', '.join(units)}", field="--unit"
-        )
+    given = options.given_unit("value", "deviation", among=units, what="angle" if angular else "length")
+    unit = given or UNITS[found.letter]
     weighed = {name: units[name] for name in (("urad", "mrad", "arcsec") if angular else ("um", "mm"))}
     judged = unit_of_deviations(found.runs.value, weighed, usual)
     if not given and abs(decades_off(found.runs.value, units[unit], usual)) > ABSURD_DECADES:
@@ -233,11 +229,10 @@ def import_exchange(path: Path, options: ImportOptions) -> Imported:
     source = read_source(path, most=MOST_EXCHANGE_BYTES)
     table, units, scales = errors_from_etalon(source.text, path), {"linear": "mm", "angle": "rad"}, {}
     for kind, known in (("linear", MM_PER_LENGTH), ("angle", RAD_PER_ANGLE)):
-        given = options.units.get(kind)
-        unit = known_unit(given) if given else units[kind]
-        if unit not in known:
-            raise InputError(f"{given!r} is not a unit of it; use {', '.join(known)}", field=f"--unit {kind}")
-        units[kind], scales[kind] = str(unit), known[str(unit)]
+        units[kind] = (
+            options.given_unit(kind, among=known, what="angle" if kind == "angle" else "length") or units[kind]
+        )
+        scales[kind] = known[units[kind]]
     sign = -1.0 if options.sign == "correction" else 1.0
     curves = {
         name: replace(

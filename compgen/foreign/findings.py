@@ -7,7 +7,7 @@ while it is read. Units that a file does not state are weighed by the data (:fun
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +23,14 @@ from compgen.data.lengths import Lengths, format_lengths
 from compgen.data.names import AXES
 from compgen.errors import InputError
 from compgen.foreign.cells import Table
-from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, NamedColumn, is_deviation, known_unit
+from compgen.foreign.column_names import (
+    MM_PER_LENGTH,
+    RAD_PER_ANGLE,
+    NamedColumn,
+    covariate_unit,
+    is_deviation,
+    known_unit,
+)
 from compgen.foreign.laser_files import Capture, format_capture
 from compgen.foreign.source import Order, parse_number, shown
 
@@ -104,6 +111,19 @@ class ImportOptions:
         "Column, or sheet of a workbook, that is left out though it holds numbers (may be given several times).",
         metavar="NAME",
     )
+
+    def given_unit(
+        self, *keys: str, among: Collection[str] = (*MM_PER_LENGTH, *RAD_PER_ANGLE), what: str = "length or angle"
+    ) -> str | None:
+        """Return the unit that the user gave for the first of some fields that has one, or None."""
+        key = next((key for key in keys if self.units.get(key)), None)
+        if key is None:
+            return None
+        given = self.units[key]
+        unit = next((name for name in (known_unit(given), covariate_unit(given)) if name in among), None)
+        if unit is None:
+            raise InputError(f"{given!r} is not a unit of {what}; use {', '.join(among)}", field=f"--unit {key}")
+        return unit
 
 
 @dataclass(frozen=True)
@@ -363,20 +383,13 @@ class TableFindings:
         filled = [cell for cell in self.table.column(name) if cell]
         return bool(filled) and 2 * sum(parse_number(cell) is not None for cell in filled) >= len(filled)
 
-    def given_unit(self, key: str, *, value: bool = False) -> str | None:
-        """Return the unit that the user gave for a field (``value``: also by the word value), or None."""
-        given = self.options.units.get(key) or (self.options.units.get("value") if value else None)
-        if given is None:
-            return None
-        unit = known_unit(given)
-        if unit is None:
-            allowed = ", ".join([*MM_PER_LENGTH, *RAD_PER_ANGLE])
-            raise InputError(f"{given!r} is not a unit; use {allowed}", field="--unit")
-        return unit
+    def unit(self, key: str, *also: str) -> str | None:
+        """Return the unit that the user gave for a field, or for one of ``also``, else that in the column's name, or None."""
+        return self.options.given_unit(key, *also) or self.fields[key].unit
 
     def positions_mm(self, key: str, values: FloatArray) -> FloatArray:
         """Return positions in mm: by the user's word, the column's name, else by their size."""
-        unit = self.given_unit(key) or self.given_unit("position") or self.fields[key].unit
+        unit = self.unit(key, "position")
         if unit is None:
             judged = unit_of_positions(float(np.ptp(values)))
             # positions are probably in inches too where another field is
@@ -401,7 +414,7 @@ class TableFindings:
         """
         units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
         column = self.fields.get(key)
-        given = self.given_unit(key, value=True)
+        given = self.options.given_unit(key, "value")
         unit = given or (column.unit if column else None)
         if unit is None:  # above the table: ``Unit: um``, or the only unit in the lines that speak of deviations
             above = self.table.metadata

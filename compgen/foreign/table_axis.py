@@ -26,9 +26,8 @@ from compgen.foreign.column_names import (
     split_name,
     statistic_in,
     unaccented,
-    way,
 )
-from compgen.foreign.covariates import RowData, labels_of, row_data_of
+from compgen.foreign.covariates import RowData, directions_of, labels_of, row_data_of
 from compgen.foreign.findings import USUAL_URAD, TableFindings, slope_of, usual_deviation_mm
 from compgen.foreign.one_axis import IntArray, OneAxis, axis_in, cycles, motion, remarks
 from compgen.foreign.source import parse_number, shown
@@ -126,20 +125,7 @@ def _labels(findings: TableFindings) -> IntArray:
             return np.array([1 if "+" in sign else -1 for sign in signs], dtype=np.int64)
     if "direction" not in findings.fields:
         return np.zeros(rows, dtype=np.int64)
-    name = findings.fields["direction"].name
-    ways = []
-    for cell, line in zip(findings.table.column(name), findings.table.lines, strict=True):
-        one = way(cell)
-        if one is None:
-            empty = findings.table.grid.empty if not cell else ""
-            raise findings.table.grid.fail(
-                f"{shown(cell)} is not a direction{empty}; write + or -, +1 or -1, forward or backward (known in several "
-                "languages)",
-                line,
-                name,
-            )
-        ways.append(one)
-    return np.array(ways, dtype=np.int64)
+    return directions_of(findings, findings.fields["direction"], empty=False)
 
 
 def _runs_in_cells(findings: TableFindings) -> tuple[IntArray, IntArray | None]:
@@ -174,7 +160,7 @@ def _compared(findings: TableFindings, key: str) -> str:
         if reference is None:
             continue
         values, own_digit = np.array(findings.table.numbers(name, empty=True)), _last_digit(findings, name)
-        declared = findings.given_unit(other, value=True) or findings.fields[other].unit
+        declared = findings.unit(other, "value")
         one = MM_PER_LENGTH.get(declared or "")
         scales = list(_LIKELY.values()) if one is None else [one]
         found = set()
@@ -203,11 +189,11 @@ def _reference(findings: TableFindings, key: str) -> tuple[FloatArray | None, fl
     None where readings do not follow the targets in a known unit; the user is asked elsewhere.
     """
     values, digit = findings.numbers(key), _last_digit(findings, findings.fields[key].name)
-    unit = findings.given_unit(key, value=key == "deviation") or findings.fields[key].unit
+    unit = findings.unit(key, *(["value"] if key == "deviation" else []))
     if key == "deviation":
         return (values if unit in MM_PER_LENGTH else None), MM_PER_LENGTH.get(unit or "", 1.0), digit
     target = findings.numbers("position")
-    position_unit = findings.given_unit("position") or findings.fields["position"].unit or "mm"
+    position_unit = findings.unit("position") or "mm"
     ratio = slope_of(target, values).unit_ratio
     if ratio is None or position_unit not in MM_PER_LENGTH:
         return None, 1.0, digit
@@ -230,7 +216,7 @@ def _wide(findings: TableFindings, columns: Sequence[RunColumn]) -> _Rows:
             message = f"{shown(earlier)} and {shown(column.name)} are the same run and direction; say which is which: "
             raise findings.table.grid.fail(message + "--map run1+=COLUMN, run1-=COLUMN ...", findings.table.header_line)
     units = {column.name: split_name(column.name).unit for column in columns}
-    if len(set(units.values())) > 1 and findings.given_unit("deviation", value=True) is None:
+    if len(set(units.values())) > 1 and findings.options.given_unit("deviation", "value") is None:
         text = ", ".join(f"{shown(name)} {unit or 'none'}" for name, unit in units.items())
         message = f"the runs have different units ({text}); if all have one, say it with --unit deviation=UNIT"
         raise findings.table.grid.fail(message, findings.table.header_line)
@@ -325,7 +311,7 @@ def _from_readings(findings: TableFindings, rows: _Rows, target: FloatArray) -> 
     """Reading minus target; unit and sign of the readings by their slope over the targets."""
     slope = slope_of(target, rows.value)
     column = findings.fields.get("actual")
-    declared = findings.given_unit("actual") or (column.unit if column else None)
+    declared = findings.options.given_unit("actual") or (column.unit if column else None)
     scale = MM_PER_LENGTH.get(declared, 1.0) if declared else 1.0 / (slope.unit_ratio or 1.0)
     if slope.unit_ratio is None:
         findings.doubts.append(

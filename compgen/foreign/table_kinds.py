@@ -108,7 +108,7 @@ def long_errors(findings: TableFindings) -> ErrorTable:
             largest = values[rows][np.argmax(np.abs(values[rows]))]
             common = si[np.argmax(np.abs(values[rows]))] / largest if largest else float("nan")
             units = RAD_PER_ANGLE if error_named(name).kind != "linear" else MM_PER_LENGTH
-            u_si = np.asarray(u * units.get(findings.given_unit("u_value") or u_column.unit or "", common))
+            u_si = np.asarray(u * units.get(findings.unit("u_value") or "", common))
         if name in SQUARENESS_NAMES:
             if len(rows) > 1:
                 raise table.grid.fail(f"{name} is a single number, but it appears again", table.lines[int(rows[1])])
@@ -130,7 +130,7 @@ def _si(findings: TableFindings, name: str, column: NamedColumn, values: np.ndar
     key = "value"
     findings.fields = {**findings.fields, key: column}
     units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
-    declared = findings.given_unit("angle" if angular else "linear") or column.unit
+    declared = findings.options.given_unit("angle" if angular else "linear") or column.unit
     if declared in units:
         findings.understood[f"unit_{'angle' if angular else 'length'}"] = declared
         return values * units[declared]
@@ -270,8 +270,8 @@ def _positions(findings: TableFindings, keys: str) -> FloatArray:
     factor = MM_PER_LENGTH[str(findings.understood["position_unit"])]
     columns = []
     for k, key in enumerate(keys):  # the other two in their own unit if they have one, else in that of the longest axis
-        own = findings.given_unit(key) or findings.given_unit("position") or findings.fields[key].unit
-        columns.append(first if k == longest else raw[k] * MM_PER_LENGTH.get(own or "", factor))
+        unit = findings.unit(key, "position") or ""
+        columns.append(first if k == longest else raw[k] * MM_PER_LENGTH.get(unit, factor))
     return np.column_stack(columns)
 
 
@@ -281,7 +281,7 @@ def _length_scale(
     """Signed mm per unit of the lengths: declared, and compared with the geometry of each station."""
     found = [judge_lengths(position[station == k], reading[station == k]) for k in np.unique(station)]
     geometry = [item for item in found if item is not None]
-    declared = findings.given_unit("length", value=True) or findings.fields["length"].unit
+    declared = findings.unit("length", "value")
     ratio = float(np.median([item.mm_per_unit for item in geometry])) if geometry else None
     fitting = [name for name, mm in MM_PER_LENGTH.items() if ratio and abs(ratio / mm - 1.0) < UNIT_TOLERANCE]
     unit = fitting[0] if fitting else None
@@ -408,7 +408,7 @@ def check_largest(deviation_mm: FloatArray, origin: Sequence[tuple[str, int]]) -
 def _measured(findings: TableFindings, key: str, position: FloatArray) -> FloatArray:
     """Measured minus commanded coordinate; unit and sign by the slope of the one over the other."""
     values = findings.numbers(key)
-    name, declared = findings.fields[key].name, findings.given_unit(key) or findings.fields[key].unit
+    name, declared = findings.fields[key].name, findings.unit(key)
     scale = MM_PER_LENGTH.get(declared, 1.0) if declared else 1.0
     if np.ptp(position) > 0:
         slope = slope_of(position, values * scale)

@@ -413,8 +413,3 @@ def printed_run(machine: Machine, readings: SixDof, instrument: SixDofInstrument
     delta[:, axis] = terms.s * run.shift_mm[:, axis]
     delta, eps = (zeroed(machine, axis, run.position_mm, values) for values in (delta, eps))
     return AxisRun(axis, run.run, run.position_mm, delta, eps, run.direction, False, "as printed")
-
-
-def warn_as_printed() -> None:
-    """Say loudly that the result is not for a machine."""
-    warnings.warn(WARNING, CompgenWarning, stacklevel=3)
