@@ -138,7 +138,7 @@ def errors_from_etalon(text: str, path: Path | None = None) -> ErrorTable:
 
     Returns
     -------
-    the errors as they stand, squareness in the convention of ISO 230-1 (X is the reference); uncertainties unknown.
+    the errors as in the file, squareness in the convention of ISO 230-1 (X is the reference); uncertainties unknown.
     Errors of rotary axes are left out with a warning.
     """
     source = SourceFile(path or Path("exchange file"), text)

@@ -59,7 +59,7 @@ def _blocks(source: SourceFile) -> list[list[_Row]]:
         if text.startswith("#"):
             blocks.append([])
         elif "#" in text:
-            raise source.fail("a '#' ends a block and stands at the start of its own line", line)
+            raise source.fail("a '#' ends a block and must be at the start of its own line", line)
         else:
             blocks[-1].append((line, text.split()))
     filled = [block for block in blocks if block]

@@ -31,7 +31,7 @@ from compgen.controls.shared.terms import error_terms
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
-from compgen.data.machine import Chain, Machine
+from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_NAMES, error_named
 from compgen.data.toml_files import Section, axis_setting, choice, flag, setting, unless_stated, whole
 from compgen.errors import InputError
@@ -114,7 +114,7 @@ _DIRECTIONS = {
 # Volumetric compensation of the ISG kernel (Beckhoff TwinCAT CNC TF5280): what its two file formats share.
 #
 # The control reads ISO 230 errors and evaluates E = C P itself; it then takes the error off the command. The list file
-# says which chain, which axes and which sign. What no public document settles is a setting here and stands in the files.
+# says which chain, which axes and which sign. What no public document settles is a setting here and is said in the files.
 
 
 LENGTH_DIGITS, ANGLE_DIGITS, POSITION_DIGITS = 9, 12, 6
@@ -129,26 +129,6 @@ def rounded(name: str, values: FloatArray) -> FloatArray:
     digits = LENGTH_DIGITS if error_named(name).kind == "linear" else ANGLE_DIGITS
     flat = [float(fixed(value, digits)) for value in np.ravel(values).tolist()]
     return np.array(flat).reshape(np.shape(values))
-
-
-def term_field(term: Term, values: FloatArray) -> ParameterGrid:
-    """Return the control's table of one error: the term's values are the errors themselves."""
-    if term.axis is None:
-        return ParameterGrid((), (), rounded(term.name, np.asarray(values, dtype=np.float64)[0]))
-    nodes = np.array([float(fixed(node, POSITION_DIGITS)) for node in term.nodes_mm.tolist()])
-    return ParameterGrid((term.axis,), (nodes,), rounded(term.name, np.asarray(values, dtype=np.float64)))
-
-
-def error_of(
-    chain: Chain, fields: Mapping[str, ParameterGrid], position_mm: FloatArray, tool_mm: FloatArray
-) -> FloatArray:
-    """E = C P (squareness reference X) from parsed numbers, at positions (n, 3): shape (n, 3), mm."""
-    values = {name: item.at(position_mm) for name, item in fields.items()}
-    result = np.zeros((len(position_mm), 3))
-    for part in coefficients(chain, "X"):
-        if part.error in values:
-            result[:, part.output] += part.sign * factor(part.lever, position_mm, tool_mm) * values[part.error]
-    return result
 
 
 class VolumetricController(Controller[IsgSettings, IsgTables]):
@@ -185,8 +165,12 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> IsgTables:
         """Round the errors as they are written; the list file comes with them."""
-        terms = {term.name: term for term in basis}
-        fields = {name: term_field(terms[name], values[name]) for name in ERROR_NAMES if name in terms}
+        fields = {}
+        for term in sorted(basis, key=lambda term: ERROR_NAMES.index(term.name)):
+            numbers = rounded(term.name, np.asarray(values[term.name], dtype=np.float64))
+            nodes = np.array([float(fixed(node, POSITION_DIGITS)) for node in term.nodes_mm.tolist()])
+            one = ((term.axis,), (nodes,), numbers) if term.axis is not None else ((), (), numbers[0])
+            fields[term.name] = ParameterGrid(*one)
         tool = [float(fixed(value, POSITION_DIGITS)) for value in self.machine.tool_offset_mm]
         constants = dict(zip(TOOL_NAMES, tool, strict=True)) if self.settings.write_tool_position and any(tool) else {}
         return IsgTables(
@@ -241,7 +225,15 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         signs = np.array([1.0 if letter in self.settings.reversed_axes else -1.0 for letter in AXES])
         signs[[letter in negate for letter in AXES]] *= -1.0
         signs[[letter in blank for letter in AXES]] = 0.0
-        return np.asarray(error_of(chain, tables.fields, position, np.asarray(tool)) * signs + 0.0)
+        # E = C P (squareness reference X) from the parsed numbers
+        values = {name: item.at(position) for name, item in tables.fields.items()}
+        result = np.zeros((len(position), 3))
+        for part in coefficients(chain, "X"):
+            if part.error in values:
+                result[:, part.output] += (
+                    part.sign * factor(part.lever, position, np.asarray(tool)) * values[part.error]
+                )
+        return np.asarray(result * signs + 0.0)
 
     def tool_of(self, tables: IsgTables) -> FloatArray:
         """Tool offset that the control uses without a tool of its own, shape (3,), mm."""
@@ -275,17 +267,17 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
             return [f"{len(tables.files)} parameter files, the control takes {MOST_FILES}"] * (
                 len(tables.files) > MOST_FILES
             )
-        listing, wanted = tables.listing, self._list_of(self.parameter_file, self.file_format)
+        listing, required = tables.listing, self._list_of(self.parameter_file, self.file_format)
         pairs: list[tuple[str, object, object]] = [
-            ("chain", listing.chain, wanted.chain),
-            ("workpiece_axes", listing.workpiece_axes, wanted.workpiece_axes),
-            ("negate", listing.negate or "nothing", wanted.negate or "nothing"),
-            *zip(AXES, listing.logical_axes, wanted.logical_axes, strict=True),
+            ("chain", listing.chain, required.chain),
+            ("workpiece_axes", listing.workpiece_axes, required.workpiece_axes),
+            ("negate", listing.negate or "nothing", required.negate or "nothing"),
+            *zip(AXES, listing.logical_axes, required.logical_axes, strict=True),
         ]
         found = [
-            f"list file: {key} is {given if given is not None else 'missing'}, the machine file makes it {due}"
-            for key, given, due in pairs
-            if given != due
+            f"list file: {key} is {given if given is not None else 'missing'}, the machine file makes it {needed}"
+            for key, given, needed in pairs
+            if given != needed
         ]
         if len(listing.files) > MOST_FILES or max(listing.files) >= MOST_FILES:
             found.append(f"list file: {len(listing.files)} files; the control takes {MOST_FILES}, file[0] ... file[9]")

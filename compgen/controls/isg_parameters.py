@@ -54,7 +54,7 @@ KNOWN_NAMES: frozenset[str] = frozenset(
 
 @dataclass(frozen=True)
 class ErrorParameter:
-    """One parameter as a file has it, with the place where it stands; ``name`` is the control's."""
+    """One parameter as a file has it, with its place; ``name`` is the control's."""
 
     name: str
     field: ParameterGrid
@@ -88,7 +88,7 @@ def is_rotary(name: str) -> bool:
 def collect(parameters: Sequence[ErrorParameter]) -> tuple[dict[str, ParameterGrid], dict[str, float]]:
     """Return the fields by ISO name and the other constants by the control's name.
 
-    Each parameter may stand once, over all files. Parameters of rotary axes are left out with a warning; others that
+    Each parameter may be given once, over all files. Parameters of rotary axes are left out with a warning; others that
     the model of three linear axes does not have must be zero.
     """
     seen: dict[str, ErrorParameter] = {}

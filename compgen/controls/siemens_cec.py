@@ -25,8 +25,8 @@ from compgen.controls.siemens_cec_tables import (
     CecMap,
     CecTable,
     Choice,
+    around_kept,
     backlash_rows,
-    beside_kept,
     chosen_terms,
     folded_tables,
     labels_in,
@@ -153,13 +153,13 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return ordinary + product_terms(machine, errors, nodes, origin)
 
     def unwritten_products(
-        self, errors: ErrorTable, pairs: Sequence[tuple[int, int]], beside: Sequence[Term] = ()
+        self, errors: ErrorTable, pairs: Sequence[tuple[int, int]], given: Sequence[Term] = ()
     ) -> list[str]:
         """Return what stays uncorrected because the settings allow no products, in words; nothing if they do."""
         if self.settings.products:
             return []
         everything = SiemensCec(self.machine, replace(self.settings, products=True)).terms(errors, pairs)
-        return without_products(self.machine, errors, everything, beside)
+        return without_products(self.machine, errors, everything, given)
 
     def left_out(self, errors: ErrorTable) -> list[str]:
         """Return which tables the control has no room for, which products are not written, and what stays for that."""
@@ -178,7 +178,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         settings = self.settings
         travel = [axis.range_mm for axis in self.machine.axes]
         tables = folded_tables(basis, values, flip=settings.subtracts, mode=settings.mult_mode, travel_mm=travel)
-        return CecTables(beside_kept(tables, settings.kept_tables))
+        return CecTables(around_kept(tables, settings.kept_tables))
 
     def with_reversal(self, tables: CecTables, reversal: ReversalCurves) -> CecTables:
         """Return the tables with a pair DIRECTION 1 and -1 for each reversal."""
@@ -191,7 +191,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
             max_points=settings.max_points,
             step_mm=settings.step_mm,
         )
-        return CecTables(beside_kept(found, settings.kept_tables))
+        return CecTables(around_kept(found, settings.kept_tables))
 
     def context(self, tables: CecTables) -> dict[str, Any]:
         """Return tables, machine data and the sign with a number from the file."""

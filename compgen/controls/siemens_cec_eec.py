@@ -35,11 +35,11 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.data.toml_files import Section
 
-#: Sections of the machine file that describe the same control: what the own section does not say is taken from them.
+#: Sections of the machine file that describe the same control: what its own section does not say is taken from them.
 OTHER_SECTIONS = ("siemens-cec", "siemens-eec")
 #: Keys that both kinds of tables have with a meaning of their own: those of the encoder tables have this prefix.
 PREFIX, OWN_KEYS = "eec_", ("max_points", "step_mm", "decimals")
-#: A CEC table of an axis over itself may leave this much beside what it cancels (rounding), mm.
+#: A CEC table of an axis over itself may leave this much of what it cancels (rounding), mm.
 ROUNDING_MM = 2e-6
 
 _CROSS = [(output, axis) for output in range(3) for axis in range(3) if output != axis]
@@ -164,7 +164,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         return cec + self._eec.emulate(tables.eec, points)
 
     def violations(self, tables: CecEecTables) -> list[str]:
-        """Return the broken rules of either kind, and positioning that stands in both."""
+        """Return the broken rules of either kind, and positioning that is in both."""
         return [
             *self._eec.violations(tables.eec),
             *self._cec.violations(tables.cec),
@@ -210,7 +210,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         )
 
     def _double_positioning(self, tables: CecEecTables) -> list[str]:
-        """Name axes whose CEC tables over themselves do not cancel (mean of both directions) beside an encoder table."""
+        """Name axes whose CEC tables over themselves do not cancel (mean of both directions), in addition to an encoder table."""
         settings = self.settings
         first_stays, multiplier_stays = MULT_MODES[settings.mult_mode]
         entries = tables.cec.tables
@@ -231,7 +231,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
             largest = float(np.max(np.abs(total)))
             if largest > ROUNDING_MM:
                 found.append(
-                    f"the positioning of {settings.axis_names[axis]} stands in its encoder table and, with up to "
+                    f"the positioning of {settings.axis_names[axis]} is in its encoder table and, with up to "
                     f"{largest / MM_PER_UM:.3f} um, in the CEC tables {sorted(own)} as well: it would be corrected twice"
                 )
         return found

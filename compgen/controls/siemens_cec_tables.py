@@ -54,7 +54,7 @@ MODE_WORDS = {
 }
 #: Decimals of tables in mm, and of the factors of a product and the tables that hold their folds.
 MM_DECIMALS, FACTOR_DECIMALS = 6, 9
-#: Angles below this are no angles, and products that stay below half of the last decimal in mm are no products.
+#: Angles below this count as zero, and so do products that stay below half of the last decimal in mm.
 NEGLIGIBLE_RAD = 1e-12
 NEGLIGIBLE_PRODUCT_MM = 0.5 * 10.0**-MM_DECIMALS
 
@@ -115,7 +115,7 @@ def sum_into_axes(tables: CecMap, mode: str, outputs: Mapping[int, FloatArray]) 
     return totals
 
 
-def beside_kept(tables: CecMap, kept: Collection[int]) -> dict[int, CecTable]:
+def around_kept(tables: CecMap, kept: Collection[int]) -> dict[int, CecTable]:
     """Return the tables with other indices, so that none of the ``kept`` ones is used; multipliers follow."""
     free = (index for index in count() if index not in kept)
     place = {old: next(free) for old in sorted(tables)}
@@ -135,17 +135,6 @@ def term_names(tables: CecMap) -> set[str]:
         elif entry.direction == 0 and index not in factors:
             names.add(one_dimensional_name(entry.output_axis, entry.input_axis))
     return names
-
-
-def balanced_scale(largest_rad: float, largest_lever_mm: float) -> float:
-    """Return a = sqrt(z_max / e_max) in mm: with it a e and z / a have the same largest value, sqrt(e_max z_max)."""
-    return math.sqrt(largest_lever_mm / largest_rad)
-
-
-def balanced_factors(angle_rad: FloatArray, lever_mm: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Return a, the scaled angles a e (n,) and the scaled lever z / a (m,), in mm, for one product e z."""
-    scale = balanced_scale(float(np.max(np.abs(angle_rad))), float(np.max(np.abs(lever_mm))))
-    return scale, scale * np.asarray(angle_rad), np.asarray(lever_mm) / scale
 
 
 @dataclass
@@ -218,8 +207,10 @@ def _add_products(
     first_stays, multiplier_stays = MULT_MODES[mode]
     part = angles[0][0].carrier[0]
     ends_mm = lever_nodes_mm[[0, -1]] - part.origin_mm
-    scale, _, scaled_ends = balanced_factors(np.concatenate([value for _, value in angles]), ends_mm)
-    ends = np.rint(scaled_ends * _UNITS_PER_MM).astype(np.int64)
+    # balanced: with a = sqrt(z_max / e_max) in mm, a e and z / a have the same largest value, sqrt(e_max z_max)
+    largest_rad = float(np.max(np.abs(np.concatenate([value for _, value in angles]))))
+    scale = math.sqrt(float(np.max(np.abs(ends_mm))) / largest_rad)
+    ends = np.rint(ends_mm / scale * _UNITS_PER_MM).astype(np.int64)
     for term, value in angles:
         axis = int(term.axis or 0)
         units = np.rint(term.carrier[0].sign * scale * value * _UNITS_PER_MM).astype(np.int64)
@@ -270,7 +261,7 @@ def _numbered(work: _Set, nodes: Mapping[int, FloatArray]) -> dict[int, CecTable
 
 
 def written_decimals(table: LinearTable) -> int:
-    """Return with how many decimals the values of a table stand in its text, at least those of a table in mm."""
+    """Return how many decimals the values of a table have in its text, at least those of a table in mm."""
     places = [len(f"{value:f}".partition(".")[2]) for value in table.values]
     return min(max([MM_DECIMALS, *places]), FACTOR_DECIMALS)
 
@@ -289,7 +280,7 @@ def labels_in(files: Sequence[SourceFile]) -> dict[int, str]:
 # Reversal as pairs of SINUMERIK CEC tables: one acts after positive travel of its base axis, one after negative.
 #
 # Source: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 249 (DIRECTION), 264 (example of a pair).
-# With the reversal B (position reached in positive minus in negative direction) the tool stands at +B/2 after positive
+# With the reversal B (position reached in positive minus in negative direction) the tool is at +B/2 after positive
 # travel, so the correction is -B/2 in the table with DIRECTION 1 and +B/2 in the one with DIRECTION -1.
 
 
@@ -385,7 +376,7 @@ def plain_backlash_rows(
 # Which CEC tables to keep where a control has too few: those that leave the least error over the volume.
 #
 # Every table moves one axis only, so that the axes can be looked at one by one: for each set of terms of an axis the number
-# of tables that it takes and the squares that it takes out of the wanted correction (least squares over the volume). The
+# of tables that it takes and the squares that it takes out of the required correction (least squares over the volume). The
 # best sets of the three axes together within the number of tables are found exactly.
 
 
@@ -393,7 +384,7 @@ def plain_backlash_rows(
 _MOST_POINTS = 6000
 #: Directions of the normal matrix (unit diagonal) below this are not determined.
 _UNDETERMINED = 1e-9
-#: Terms whose natural values move the tool by less than this are no tables.
+#: Terms whose natural values move the tool by less than this need no table.
 _NOTHING_MM = 0.5e-6
 #: Tables of another set than the best one are as good if no more than this share above its error stays.
 _AS_GOOD = 1.1
@@ -408,27 +399,27 @@ class Choice:
     Parameters
     ----------
     kept : terms in their order.
-    dropped : (name, mm): for each term that has no room what it would take out (rms over the volume) beside the kept.
+    dropped : (name, mm): for each term that has no room what it would take out (rms over the volume) in addition.
     tables, allowed : tables that the kept terms take, and that there are (None: not limited).
-    wanted : tables that all terms would take.
+    needed : tables that all terms would take.
     left_mm : rms over the volume that all terms would take out and the kept ones do not.
-    beside : terms of tables of another kind, which are there in any case.
+    given : terms of tables of another kind, which are there in any case.
     """
 
     kept: list[Term]
     dropped: tuple[tuple[str, float], ...]
     tables: int
     allowed: int | None
-    wanted: int
+    needed: int
     left_mm: float
-    beside: tuple[Term, ...] = ()
+    given: tuple[Term, ...] = ()
 
     def statements(self) -> list[str]:
-        """Say what is left out, largest first; nothing if everything has room."""
+        """Say what is left out, largest first; nothing if there is room for everything."""
         if not self.dropped:
             return []
         return [
-            f"{self.wanted} tables would be needed, {self.allowed} may be used: not corrected are "
+            f"{self.needed} tables would be needed, {self.allowed} may be used: not corrected are "
             f"{_named(self.dropped) or 'tables of less than 0.01 um'}; together they leave "
             f"{self.left_mm / MM_PER_UM:.2f} um rms over the volume (first order)"
         ]
@@ -456,7 +447,7 @@ def chosen_terms(
     terms: Sequence[Term],
     mode: str,
     allowed: int | None,
-    beside: Sequence[Term] = (),
+    given: Sequence[Term] = (),
 ) -> Choice:
     """Return the terms that ``allowed`` tables can hold and that leave the least error.
 
@@ -466,12 +457,12 @@ def chosen_terms(
     terms : everything that the control could hold.
     mode : reading of products, a key of ``MULT_MODES``.
     allowed : number of tables, None: all of them.
-    beside : terms that tables of another kind hold in any case.
+    given : terms that tables of another kind hold in any case.
     """
-    wanted = table_count(terms, mode)
-    if allowed is None or wanted <= allowed:
-        return Choice(list(terms), (), wanted, allowed, wanted, 0.0)
-    gains = [_Gains.of(machine, errors, terms, beside, output) for output in range(3)]
+    needed = table_count(terms, mode)
+    if allowed is None or needed <= allowed:
+        return Choice(list(terms), (), needed, allowed, needed, 0.0)
+    gains = [_Gains.of(machine, errors, terms, given, output) for output in range(3)]
     # the best set of each axis such that all together take no more tables than there are, by dynamic programming
     best: dict[int, tuple[float, list[tuple[Term, ...]]]] = {0: (0.0, [])}
     for gain in gains:
@@ -489,19 +480,19 @@ def chosen_terms(
     left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, picked, strict=True))
     dropped = [item for gain, part in zip(gains, picked, strict=True) for item in gain.missed(part)]
     return Choice(
-        kept, tuple(dropped), table_count(kept, mode), allowed, wanted, float(np.sqrt(max(left, 0.0))), tuple(beside)
+        kept, tuple(dropped), table_count(kept, mode), allowed, needed, float(np.sqrt(max(left, 0.0))), tuple(given)
     )
 
 
 def without_products(
-    machine: Machine, errors: ErrorTable, terms: Sequence[Term], beside: Sequence[Term] = ()
+    machine: Machine, errors: ErrorTable, terms: Sequence[Term], given: Sequence[Term] = ()
 ) -> list[str]:
     """Say what stays uncorrected because no products are written: their names, and the rms over the volume.
 
-    ``terms`` are the ordinary ones and the products, ``beside`` as in :func:`chosen_terms`. Nothing if it is nothing.
+    ``terms`` are the ordinary ones and the products, ``given`` as in :func:`chosen_terms`. Nothing if that is zero.
     """
     ordinary = [term for term in terms if term.carrier[0].lever is None]
-    gains = [_Gains.of(machine, errors, terms, beside, output) for output in range(3)]
+    gains = [_Gains.of(machine, errors, terms, given, output) for output in range(3)]
     own = [[term for term in gain.terms if term in ordinary] for gain in gains]
     left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, own, strict=True))
     missed = [item for gain, part in zip(gains, own, strict=True) for item in gain.missed(part)]
@@ -533,10 +524,10 @@ def terms_of_tables(
     own = [term for term in terms if term.name in names]
     if not choice.dropped or not own or table_count(own, mode) > (choice.allowed or 0):
         return choice.kept
-    gains = [_Gains.of(machine, errors, terms, choice.beside, output) for output in range(3)]
+    gains = [_Gains.of(machine, errors, terms, choice.given, output) for output in range(3)]
     left = [
         sum(
-            gain.wanted - gain.taken([term for term in part if term.carrier[0].output == k])
+            gain.target - gain.taken([term for term in part if term.carrier[0].output == k])
             for k, gain in enumerate(gains)
         )
         for part in (own, choice.kept)
@@ -548,50 +539,48 @@ def terms_of_tables(
 class _Gains:
     """Least squares of the terms of one output axis; ``taken`` is in mm^2, the mean over the volume.
 
-    ``beside`` are terms that are there in any case and take no table; ``wanted`` is the square of what is to be taken out.
+    ``given`` are terms that are there in any case and take no table; ``target`` is the square of what is to be taken out.
     """
 
     terms: tuple[Term, ...]
-    beside: tuple[Term, ...]
+    given: tuple[Term, ...]
     normal: FloatArray
     right: FloatArray
-    wanted: float
+    target: float
     columns: Mapping[str, IntArray]
 
     @classmethod
     def of(
-        cls, machine: Machine, errors: ErrorTable, terms: Sequence[Term], beside: Sequence[Term], output: int
+        cls, machine: Machine, errors: ErrorTable, terms: Sequence[Term], given: Sequence[Term], output: int
     ) -> _Gains:
         nodes = tuple(
             np.unique(
-                np.concatenate(
-                    [machine.axes[axis].nodes_mm, *(t.nodes_mm for t in [*terms, *beside] if t.axis == axis)]
-                )
+                np.concatenate([machine.axes[axis].nodes_mm, *(t.nodes_mm for t in [*terms, *given] if t.axis == axis)])
             )
             for axis in range(3)
         )
         sample = volume_sample(machine, nodes, _MOST_POINTS, machine.emphasis)
         tool_mm, weight = tool_of(machine, None), sample.weight / np.sum(sample.weight)
-        wanted = -volumetric_error(machine, errors, sample.position_mm)[:, output]
+        target = -volumetric_error(machine, errors, sample.position_mm)[:, output]
         own = [term for term in terms if term.carrier[0].output == output]
-        # natural values of no more than the last decimal are no table
+        # natural values of no more than the last decimal need no table
         reach = [1.0 if (lever := t.carrier[0].lever) is None else machine.axes[lever].length_mm for t in own]
         largest = [float(np.max(np.abs(term.start), initial=0.0)) for term in own]
         own = [term for term, size, span in zip(own, largest, reach, strict=True) if size * span > _NOTHING_MM]
-        given = [term for term in beside if term.carrier[0].output == output]
+        others = [term for term in given if term.carrier[0].output == output]
         parts: list[FloatArray] = []
         columns: dict[str, IntArray] = {}
         first = 0
-        for term in [*own, *given]:
+        for term in [*own, *others]:
             carrier = term.carrier_field(sample.position_mm, tool_mm)[:, output]
             parts.append(term.curve_matrix(sample.position_mm) * carrier[:, None])
             columns[term.name] = np.arange(first, first + len(term.nodes_mm))
             first += len(term.nodes_mm)
-        design = np.hstack(parts) if parts else np.zeros((len(wanted), 0))
+        design = np.hstack(parts) if parts else np.zeros((len(target), 0))
         scale = 1.0 / np.maximum(np.sqrt(np.sum(weight[:, None] * design**2, axis=0)), 1e-12)
         design = design * scale
-        normal, right = design.T @ (weight[:, None] * design), design.T @ (weight * wanted)
-        return cls(tuple(own), tuple(given), normal, right, float(weight @ wanted**2), columns)
+        normal, right = design.T @ (weight[:, None] * design), design.T @ (weight * target)
+        return cls(tuple(own), tuple(others), normal, right, float(weight @ target**2), columns)
 
     @property
     def of_all(self) -> float:
@@ -600,7 +589,7 @@ class _Gains:
 
     def taken(self, terms: Sequence[Term]) -> float:
         """Squares that a set of terms takes out, mm^2."""
-        held = [term for term in (*terms, *self.beside) if term.name in self.columns]
+        held = [term for term in (*terms, *self.given) if term.name in self.columns]
         if not held:
             return 0.0
         where = np.concatenate([self.columns[term.name] for term in held])
@@ -608,7 +597,7 @@ class _Gains:
         return float(self.right[where] @ solution)
 
     def missed(self, kept: Sequence[Term]) -> list[tuple[str, float]]:
-        """Return (name, rms mm) of the terms beside the kept ones: what each would take out in addition."""
+        """Return (name, rms mm) of the terms that are not kept: what each would take out in addition."""
         own = self.taken(kept)
         return [
             (term.name, float(np.sqrt(max(self.taken([*kept, term]) - own, 0.0))))

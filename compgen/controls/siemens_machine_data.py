@@ -373,9 +373,9 @@ def _travels(tables: CecMap) -> list[tuple[int, ...]]:
 
 
 def largest_sums(machine: Machine, tables: CecMap, mode: str) -> list[tuple[float, tuple[float, float, float]]]:
-    """Return for each output axis the sum of largest size over the travel, with its sign (mm), and where it stands.
+    """Return for each output axis the sum of largest size over the travel, with its sign (mm), and where it is.
 
-    Sums are multilinear between nodes, so the largest stands on nodes; all are searched, up to 81 positions per axis.
+    Sums are multilinear between nodes, so the largest is at a node; all are searched, up to 81 positions per axis.
     """
     positions = [_positions(machine, tables, axis, _MOST_POSITIONS) for axis in range(3)]
     found = [(0.0, (0.0, 0.0, 0.0))] * 3

@@ -27,7 +27,7 @@ from compgen.errors import CompgenWarning, InputError
 #     assignment = "$" variable "[" index { "," index } "]" "=" value [ ";" comment ]
 #     value      = number without exponent | "(" axis name ")" | axis name in quotation marks
 #
-# The same assignments may stand in a sub-program (name ``..._SPF``) that switches the function off before them, makes
+# The same assignments may be in a sub-program (name ``..._SPF``) that switches the function off before them, makes
 # that effective by NEWCONF, and may switch it on again behind them.
 
 
@@ -35,7 +35,7 @@ from compgen.errors import CompgenWarning, InputError
 POSITION_QUANTUM_MM = Decimal("0.000001")
 POSITION_DIGITS = 6
 
-#: Switches that may stand among the tables, without ``$``, with the number of their indices (K3-2013, p. 239, 245).
+#: Switches that may be among the tables, without ``$``, with the number of their indices (K3-2013, p. 239, 245).
 SWITCHES = {
     "MA_ENC_COMP_ENABLE": 2,
     "MA_CEC_ENABLE": 1,
@@ -107,7 +107,7 @@ def read_assignments(files: Sequence[SourceFile], index_counts: Mapping[str, int
     ------
     InputError
         with file and line for an unknown variable, a wrong number of indices, a second assignment to one variable,
-        text that is no assignment, a table that is written while its function is on, a file that does not end with
+        text that is not an assignment, a table that is written while its function is on, a file that does not end with
         M17.
     """
     seen: dict[tuple[str, tuple[str, ...]], Assignment] = {}
@@ -207,7 +207,7 @@ class LinearTable:
     def at(self, position_mm: FloatArray) -> FloatArray:
         """Interpolated value at positions of any shape; what lies beyond ``last_mm`` has the value there.
 
-        The last node stands at ``last_mm``, or beyond it where that is no whole number of steps.
+        The last node is at ``last_mm``, or beyond it where that is not a whole number of steps.
         """
         start, last = float(self.start_mm), float(self.last_mm)
         position = start + np.mod(position_mm - start, last - start) if self.modulo else np.minimum(position_mm, last)
@@ -276,7 +276,7 @@ class TableParts:
     def foreign_table(self, prefix: str) -> tuple[LinearTable, int, float]:
         """Return a table as a real control may hold it, how many reserved nodes lie beyond MAX, and a doubt in um.
 
-        Where MAX is no whole number of steps from MIN, the node behind it ends the last, shorter interval; whether the
+        Where MAX is not a whole number of steps from MIN, the node behind it ends the last, shorter interval; whether the
         control interpolates to it or holds the node before is not documented, and the doubt is what that can matter.
         """
         start_mm, last_mm, step_mm = self._grid(prefix)
@@ -352,9 +352,9 @@ def axis_of(item: Assignment, name: str, axis_names: Sequence[str]) -> int:
 
 # What a SINUMERIK really holds: start-up archives, punched files and sub-programs that this program did not write.
 #
-# An archive is a chain of files. In the binary form (``.arc``) NUL bytes with the name ``_N_NC_CEC_INI`` stand before each,
+# An archive is a chain of files. In the binary form (``.arc``) NUL bytes with the name ``_N_NC_CEC_INI`` precede each,
 # in the text form a line ``%_N_NC_CEC_INI``. The tables are those of its initialisation files; part programs that
-# write the same variables are no part of what acts, and are passed over. Where a file holds one part only, that part is
+# write the same variables do not act, and are passed over. Where a file holds one part only, that part is
 # read, program or not.
 #
 # Nothing that could change a table is passed over: a line of tables that is not understood is an error with its number.
@@ -365,7 +365,7 @@ def axis_of(item: Assignment, name: str, axis_names: Sequence[str]) -> int:
 WORTH_SAYING_UM = 0.1
 #: Kinds of files whose assignments are data of the control, by the last word of their name.
 DATA_KINDS = ("INI", "TEA", "SEA", "EEC", "CEC")
-#: Machine data and variables beside the tables that do not change what a table holds; None: any value.
+#: Other machine data and variables, which do not change what a table holds; None: any value.
 HARMLESS: Mapping[str, tuple[str, ...] | None] = {
     "MN_MM_CEC_MAX_POINTS": None,
     "MA_MM_ENC_COMP_MAX_POINTS": None,
@@ -405,7 +405,7 @@ _TABLE_VARIABLES = {head + key for head in ("AN_CEC", "AA_ENC_COMP") for key in 
 
 @dataclass
 class ArchiveFindings:
-    """What was read beside the tables, for one line of summary.
+    """What was read in addition to the tables, for one line of summary.
 
     ``counts`` are by what was passed over, ``apart`` the tables of axes that the machine file lacks, ``notes`` what the
     user should know in words of their own.
@@ -470,7 +470,7 @@ class _ArchivePart:
 
 @dataclass(frozen=True)
 class ArchiveAssignments:
-    """Assignments of a real file: those of the tables, and switches that stand elsewhere in an archive."""
+    """Assignments of a real file: those of the tables, and switches elsewhere in an archive."""
 
     items: list[Assignment]
     machine_data: dict[tuple[str, tuple[str, ...]], Assignment]
@@ -489,7 +489,7 @@ def foreign_assignments(
     Parameters
     ----------
     files : archives, punched files, sub-programs; text as it was decoded, NUL bytes included.
-    tables : the variables that are wanted, without ``$``, and how many indices each has.
+    tables : the variables to be read, without ``$``, and how many indices each has.
     findings : gets what is passed over.
     """
     items: dict[tuple[str, tuple[str, ...]], Assignment] = {}
@@ -497,11 +497,11 @@ def foreign_assignments(
     for source in files:
         parts, archive = _parts(source, findings)
         for part in parts:
-            beside = archive and not part.writes_tables
+            elsewhere = archive and not part.writes_tables
             for item in _assignments_of_part(source, part, tables, findings, archive=archive):
                 key = item.variable, item.index
                 if item.variable in SWITCHES:
-                    (machine_data if beside else items)[key] = item
+                    (machine_data if elsewhere else items)[key] = item
                     continue
                 first = items.setdefault(key, item)
                 if first is not item and first.value != item.value:
@@ -526,7 +526,7 @@ def _parts(source: SourceFile, findings: ArchiveFindings) -> tuple[list[_Archive
     for number, line in enumerate(text.split("\n"), start=1):
         head, nul, rest = line.rpartition("\0")
         names = _NAME.findall(head) if nul else _TEXT_HEADER.findall(line.upper()[:120])
-        if names or nul:  # NUL bytes without a name come before what is no file of the control's memory (drives)
+        if names or nul:  # NUL bytes without a name come before files that are not in the control's memory (drives)
             found.append(_ArchivePart(name, kind, tuple(lines)))
             (name, kind), lines = names[-1] if names else ("", ""), []
         if nul or not names:
@@ -568,7 +568,7 @@ def _assignments_of_part(
             continue
         match = _ARCHIVE_ASSIGNMENT.fullmatch(" ".join(code.split())) if code.startswith("$") else None
         if match is None:
-            # what is no assignment must not change a table: inch, jumps, calculations, anything with a table in it
+            # what is not an assignment must not change a table: inch, jumps, calculations, anything with a table in it
             if _INCH_WORD.fullmatch(code):
                 raise source.fail(f"{code!r}: the file is in inch; tables are read in mm only", number)
             if not _IDLE_WORD.fullmatch(code) and (not archive or _MENTIONS_TABLE.search(code)):
@@ -592,7 +592,7 @@ def _assignments_of_part(
 def _item(
     source: SourceFile, number: int, match: re.Match[str], tables: Mapping[str, int], findings: ArchiveFindings
 ) -> Assignment | None:
-    """One assignment if it is of the wanted tables; None for what is passed over."""
+    """One assignment if it belongs to the tables; None for what is passed over."""
     variable, index_text, value = match.group(1), match.group(2) or "", match.group(3).strip()
     index = _plain_indices(index_text) if index_text.strip() else ()
     plain, unusual = _plain_value(value)

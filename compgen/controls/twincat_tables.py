@@ -31,7 +31,7 @@ MM_PER_UNIT = 1e-4
 class LeadscrewTable:
     """``kw.ssfk``: values over the axis' own position, ``neg`` for negative travel (None: one table for both).
 
-    ``setpoints`` (n,) ascend; ``interval`` is their distance, or 0 if each stands in the file. All in 0.1 um.
+    ``setpoints`` (n,) ascend; ``interval`` is their distance, or 0 if each is in the file. All in 0.1 um.
     """
 
     setpoints: FloatArray

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from compgen.controls import SourceFile, controller_named
 from compgen.controls.shared.base import Monomial, Term
 from compgen.controls.siemens_cec import CecTables
-from compgen.controls.siemens_cec_tables import balanced_factors, balanced_scale, folded_tables
+from compgen.controls.siemens_cec_tables import folded_tables
 from compgen.controls.siemens_machine_data import largest_slopes, largest_sums
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Points
@@ -251,9 +251,15 @@ def preflight(control, machine, own, tables) -> str:
 
 
 def test_balanced_scale_of_the_example_is_5000():
-    assert balanced_scale(20e-6, 500.0) == pytest.approx(5000.0, rel=1e-12)
-    scale, angles, lever = balanced_factors(np.array([0.0, 20e-6]), np.array([0.0, 500.0]))
-    assert scale == pytest.approx(5000.0, rel=1e-12)
+    """sqrt(500 mm / 20e-6 rad) = 5000 mm: the scaled angle and the scaled lever are both 0.1 mm at most."""
+    terms = [
+        Term("X(z)", 2, np.array([0.0, 500.0]), (Monomial(0),), np.zeros(2)),
+        Term("X(x)*z", 0, np.array([0.0, 100.0]), (Monomial(0, 1, 2, 0.0),), np.array([0.0, 20e-6])),
+    ]
+    tables = folded_tables(terms, {term.name: term.start for term in terms}, flip=False, mode="S2")
+    angles, lever = (tables[index].table.numbers for index in (0, 1))
+    assert angles.max() / 20e-6 == pytest.approx(5000.0, rel=1e-12)
+    assert 500.0 / lever.max() == pytest.approx(5000.0, rel=1e-12)
     np.testing.assert_allclose([angles.max(), lever.max()], 0.1, rtol=1e-12)
 
 

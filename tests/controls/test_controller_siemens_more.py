@@ -161,7 +161,7 @@ def test_no_cross_table_holds_positioning_and_one_that_does_is_a_violation():
     _, _, doubled = parsed(machine, "siemens-cec-eec", both)
     found = control(machine, settings).violations(doubled)
     assert len(found) == 3
-    assert "the positioning of AX1 stands in its encoder table and" in found[0]
+    assert "the positioning of AX1 is in its encoder table and" in found[0]
     assert "corrected twice" in found[0]
 
 

@@ -24,7 +24,7 @@ from compgen.kinematics.first_order import factor
 #
 # A control is described by its **basis**: a list of :class:`Term`, each one table (a curve over one axis, or a
 # constant) times a carrier field. The stage ``export`` finds the table values whose correction field comes closest to
-# the wanted one; the control turns them into its own numbers, parses them back from text, and emulates what it does.
+# the required one; the control turns them into its own numbers, parses them back from text, and emulates what it does.
 
 
 Settings = TypeVar("Settings")
@@ -55,10 +55,10 @@ class Term:
     axis : 0..2, or None for a constant.
     nodes_mm : positions of the values, shape (n,); a constant has one (any) position.
     carrier : the correction in mm is the value times the sum of these monomials.
-    start : natural values, shape (n,); kept in directions that the wanted correction does not determine.
+    start : natural values, shape (n,); kept in directions that the required correction does not determine.
     zero_at_mm : position where the interpolated value must be zero, or None.
-    keep_mm : positions where the value should stay at its start as far as the wanted correction leaves a choice (a
-        line may stand in a straightness or in a squareness); this keeps the zeros of the fitted curves.
+    keep_mm : positions where the value should stay at its start as far as the required correction leaves a choice (a
+        line may be in a straightness or in a squareness); this keeps the zeros of the fitted curves.
     zeros_mm : positions of nodes whose values are zero to the last digit, as in ``start``.
     """
 
@@ -317,15 +317,15 @@ def coverage_violations(machine: Machine, axis: int, first_mm: float, last_mm: f
     return [f"{what} covers {first_mm:g} ... {last_mm:g} mm of {'XYZ'[axis]}, the travel is {low:g} ... {high:g} mm"]
 
 
-# Plans for a binary transfer (``*.plan.json``) beside the text of a control: both must hold the same numbers.
+# Plans for a binary transfer (``*.plan.json``) in addition to the text of a control: both must hold the same numbers.
 
 
 def plan_contradictions(files: Sequence[SourceFile], expected: Callable[[], Mapping[str, Any]]) -> list[str]:
-    """Say where a ``.json`` file differs from the plan that the tables in the text beside it make.
+    """Say where a ``.json`` file differs from the plan that the tables in the text exported with it make.
 
     Parameters
     ----------
-    files : all files of one export; without a plan among them nothing is asked.
+    files : all files of one export; without a plan among them nothing is compared.
     expected : gives the plan of the parsed tables, by the keys of the file; other keys of the file are notes.
 
     Returns
@@ -347,15 +347,16 @@ def _contradiction(text: str, wanted: Mapping[str, Any]) -> str:
     differing = list(_differences({key: found.get(key) for key in wanted}, wanted, ""))
     if not differing:
         return ""
-    where, given, due = differing[0]
+    where, given, right = differing[0]
     more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
-    return f"{where} is {_short(given)}, but the tables beside it say {_short(due)}{more}: leave the plan out, or export again"
+    says = f"{where} is {_short(given)}, but the tables exported with it say {_short(right)}{more}"
+    return f"{says}: leave the plan out, or export again"
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
-        raise ValueError("a key stands twice in one object")
+        raise ValueError("a key is given twice in one object")
     return found
 
 
