@@ -323,8 +323,9 @@ def rounded(values: ArrayLike, digits: int = 4) -> list[Any]:
     known = np.isfinite(numbers)
     size = np.abs(np.where(known & (numbers != 0.0), numbers, 1.0))
     power = 10.0 ** (digits - 1 - np.floor(np.log10(size)))
-    found = np.rint(numbers * power) / power
-    return list(found.tolist() if known.all() else np.where(known, found, None).tolist())
+    found = (np.rint(numbers * power) / power).astype(object)
+    found[~known] = None
+    return list(found.tolist())
 
 
 def _labelled(

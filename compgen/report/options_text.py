@@ -9,10 +9,9 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from compgen.controls.shared.base import Usage
 from compgen.data.messages import um_text
 from compgen.tables.judge import Residuals
-from compgen.tables.options import CORRECTED_UM, LABELS, Capability, ControlResult, Explanation, Left, LevelResult
+from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation
 
 # What the options of a control would buy: tables for the terminal, and ``options.md``.
 
@@ -60,25 +59,16 @@ def _gain(before_um: float | None, after_um: float) -> str:
 
 def control_rows(result: Capability) -> list[list[str]]:
     """Rows control, level, left, left*, remark."""
-    return [[item.label, _level(item), *_left_cells(item.left), _remark(item)] for item in result.controls]
-
-
-def _level(item: ControlResult) -> str:
-    if item.level is None:
-        return "-"
-    return LABELS[item.level] + (", " + LABELS["directional"].lstrip("+ ") if item.directional else "")
-
-
-def _left_cells(left: Left | None) -> list[str]:
-    return ["-", "-"] if left is None else [_three(left.after), _three(left.rigid_removed)]
-
-
-def _remark(item: ControlResult) -> str:
-    if item.problem:
-        return f"cannot be exported: {item.problem}"
-    broken = [f"{len(item.broken)} limits broken, first: {item.broken[0]}"] if item.broken else []
-    other = [] if item.own else ["not as in the machine file"]
-    return "; ".join([*broken, *other, *item.notes])
+    rows = []
+    for item in result.controls:
+        directional = f", {LABELS['directional'].lstrip('+ ')}" if item.directional else ""
+        level = "-" if item.level is None else LABELS[item.level] + directional
+        left = ["-", "-"] if item.left is None else [_three(item.left.after), _three(item.left.rigid_removed)]
+        broken = [f"{len(item.broken)} limits broken, first: {item.broken[0]}"] if item.broken else []
+        other = [] if item.own else ["not as in the machine file"]
+        remark = f"cannot be exported: {item.problem}" if item.problem else "; ".join([*broken, *other, *item.notes])
+        rows.append([item.label, level, *left, remark])
+    return rows
 
 
 def _shown_levels(result: Capability) -> list[str]:
@@ -186,34 +176,21 @@ HOLDS = {
 
 def explanation_markdown(item: Explanation) -> str:
     """Return ``explain.md``."""
-    parts = [
-        f"# {item.controller} on {item.machine}\n\nThis control holds {HOLDS[item.level]}.{_improvement(item)}\n",
-        _corrected(item),
-        _stays(item),
-        _next(item),
-        _nodes(item),
-        _limits(item),
-    ]
-    return "\n".join(part for part in parts if part)
-
-
-def _improvement(item: Explanation) -> str:
-    if item.own is None or item.own.left is None:
-        return ""
-    before, after = item.options.level("nothing").left.rigid_removed, item.own.left.rigid_removed
-    return (
-        f" The error over the volume goes from {um_text(before.max_um)} to {um_text(after.max_um)} um (largest) and from "
-        f"{um_text(before.rms_um)} to {um_text(after.rms_um)} um (rms), the best-fit rigid motion taken out, "
-        "by the file as it is written."
-    )
-
-
-def _corrected(item: Explanation) -> str:
+    text = f"# {item.controller} on {item.machine}\n\nThis control holds {HOLDS[item.level]}."
+    if item.own is not None and item.own.left is not None:
+        before, after = item.options.level("nothing").left.rigid_removed, item.own.left.rigid_removed
+        text += (
+            f" The error over the volume goes from {um_text(before.max_um)} to {um_text(after.max_um)} um (largest) and from "
+            f"{um_text(before.rms_um)} to {um_text(after.rms_um)} um (rms), the best-fit rigid motion taken out, "
+            "by the file as it is written."
+        )
+    parts = [text + "\n"]
     helped = [fate for fate in item.fates if fate.after_um < LEAST_HELP * fate.before_um]
     rows = [[fate.name, um_text(fate.before_um), um_text(fate.after_um)] for fate in helped]
-    if not rows:
-        return ""
-    return "## What it corrects\n\n" + markdown_table(["error", "displacement before, um", "left, um"], rows)
+    if rows:
+        table = markdown_table(["error", "displacement before, um", "left, um"], rows)
+        parts.append("## What it corrects\n\n" + table)
+    return "\n".join([*parts, _stays(item), _next(item), _nodes(item), _limits(item)])
 
 
 def _stays(item: Explanation) -> str:
@@ -222,7 +199,11 @@ def _stays(item: Explanation) -> str:
     notes = "".join(f"\n{note[0].upper()}{note[1:]}.\n" for note in item.notes)
     other = ""
     if item.level != "volumetric":
-        tools = [f"{um_text(left.after.max_um)} um at {tool}" for tool, left in _by_tool(item)]
+        results = zip(item.options.tools_mm, item.options.level(item.level).by_tool, strict=True)
+        tools = [
+            f"{um_text(left.after.max_um)} um at {tool_name(tool) if any(tool) else 'no offset'}"
+            for tool, (left, _) in results
+        ]
         other = (
             "\nThe tables were made for the tool offset of the machine file. With others an angular error acts at another "
             f"lever; the largest error that the best table of this level leaves is {', '.join(tools)}.\n"
@@ -230,35 +211,22 @@ def _stays(item: Explanation) -> str:
     return "## What stays, and why\n\n" + table + other + notes
 
 
-def _by_tool(item: Explanation) -> list[tuple[str, Left]]:
-    results = item.options.level(item.level).by_tool
-    return [
-        (tool_name(tool) if any(tool) else "no offset", left)
-        for tool, (left, _) in zip(item.options.tools_mm, results, strict=True)
-    ]
-
-
 def _next(item: Explanation) -> str:
     current = item.options.level(item.level)
-    following = _following(item, current)
+    following, result = [], item.options.after(current.key)
+    while result is not None:
+        if not (result.key == "directional" and item.own is not None and item.own.directional):
+            following.append(result)
+        result = item.options.after(result.key)
     if not following:
         return "## What the next option would buy\n\nNothing more: this is the highest level for these errors.\n"
     rows = [
-        [result.label, um_text(result.left.rigid_removed.max_um), um_text(result.left.rigid_removed.rms_um)]
-        for result in (current, *following)
+        [level.label, um_text(level.left.rigid_removed.max_um), um_text(level.left.rigid_removed.rms_um)]
+        for level in (current, *following)
     ]
     return "## What the next option would buy\n\n" + markdown_table(
         ["tables hold", "largest left, um", "rms left, um"], rows
     )
-
-
-def _following(item: Explanation, current: LevelResult) -> list[LevelResult]:
-    found, result = [], item.options.after(current.key)
-    while result is not None:
-        if not (result.key == "directional" and item.own is not None and item.own.directional):
-            found.append(result)
-        result = item.options.after(result.key)
-    return found
 
 
 def _nodes(item: Explanation) -> str:
@@ -286,21 +254,18 @@ def _nodes(item: Explanation) -> str:
 def _limits(item: Explanation) -> str:
     text = "## Limits used\n\n"
     if item.usage:
-        text += "Smallest margin first.\n\n" + markdown_table(
-            ["limit", "used", "allowed", "used, %", "margin"], [_usage_row(usage) for usage in item.usage]
-        )
+        rows = [
+            [
+                usage.name if usage.stated else f"{usage.name}, usual default",
+                f"{usage.used:.4g} {usage.unit}",
+                f"{usage.allowed:g} {usage.unit}",
+                f"{100 * usage.share:.0f}",
+                f"{usage.allowed - usage.used:.4g}",
+            ]
+            for usage in item.usage
+        ]
+        headings = ["limit", "used", "allowed", "used, %", "margin"]
+        text += "Smallest margin first.\n\n" + markdown_table(headings, rows)
     else:
         text += "The control states no limits of its own.\n"
     return text + "".join(f"\nBroken: {violation}.\n" for violation in item.violations)
-
-
-def _usage_row(usage: Usage) -> list[str]:
-    name = usage.name if usage.stated else f"{usage.name}, usual default"
-    allowed, margin = usage.allowed, usage.allowed - usage.used
-    return [
-        name,
-        f"{usage.used:.4g} {usage.unit}",
-        f"{allowed:g} {usage.unit}",
-        f"{100 * usage.share:.0f}",
-        f"{margin:.4g}",
-    ]

@@ -12,7 +12,6 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from compgen.data.csv_files import FloatArray
 from compgen.data.messages import number_text, one_line, um_text
 from compgen.data.names import COVERAGE, error_named
 
@@ -38,9 +37,19 @@ MOST_VERDICT_REASONS = 10
 def identification_table(result: Identification) -> Group:
     """Return the summary of an identification."""
     if result.method == "sixdof":
-        return Group(*_sixdof_lines(result), _errors_table(result))
+        parts = [
+            f"{name}: mode {item['mode']}, {item['runs']} runs, {item['positions']} positions"
+            for name, item in result.details["axes"].items()
+        ]
+        lines = [f"{'; '.join(parts)}; {result.details['line']} lines", *result.details["table"]]
+        return Group(Text("\n".join(lines)), _errors_table(result))
     if result.method == "axis-runs":
-        return Group(Text("\n".join(_axis_lines(result))), _errors_table(result))
+        lines = [
+            f"{name}: {item['targets']} targets from {item['from_mm']:g} to {item['to_mm']:g} mm, {item['runs']} runs"
+            for name, item in result.details["axes"].items()
+        ]
+        lines.append(f"scatter within targets and directions {result.rms_um:.3f} um rms, method {result.method}")
+        return Group(Text("\n".join(lines)), _errors_table(result))
     if result.method == "given":
         text = f"{result.details['values']} values of errors given in {one_line(result.details['file'])}; not identified here"
         return Group(Text(text), _errors_table(result))
@@ -68,26 +77,6 @@ def identification_table(result: Identification) -> Group:
         worst = max(result.details["en"].items(), key=lambda item: item[1])
         lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")
     return Group(Text("\n".join(lines)), _errors_table(result))
-
-
-def _axis_lines(result: Identification) -> list[str]:
-    """What was measured along each axis, and how it repeats."""
-    lines = [
-        f"{name}: {item['targets']} targets from {item['from_mm']:g} to {item['to_mm']:g} mm, {item['runs']} runs"
-        for name, item in result.details["axes"].items()
-    ]
-    return [*lines, f"scatter within targets and directions {result.rms_um:.3f} um rms, method {result.method}"]
-
-
-def _sixdof_lines(result: Identification) -> list[Text]:
-    """What was measured, repeatability and uncertainty in the units of the instrument."""
-    axes = result.details["axes"]
-    parts = [
-        f"{name}: mode {item['mode']}, {item['runs']} runs, {item['positions']} positions"
-        for name, item in axes.items()
-    ]
-    lines = [f"{'; '.join(parts)}; {result.details['line']} lines", *result.details["table"]]
-    return [Text("\n".join(lines))]
 
 
 def _errors_table(result: Identification) -> Table:
@@ -256,28 +245,36 @@ def accuracy_table(found: Accuracy) -> Group:
         for key, item in group.items():
             table.add_row(key, _with_u(item) + (", U not known" if math.isnan(item.u) else ""), item.unit)
         parts.append(table)
-        if len(found.targets.get(name, {}).get("position_mm", ())) in range(1, MOST_TARGETS + 1):
-            parts.append(_targets_table(found.targets[name]))
+        columns = found.targets.get(name, {"position_mm": ()})
+        if len(columns["position_mm"]) not in range(1, MOST_TARGETS + 1):
+            continue
+        # Values at each target; U from the scatter alone.
+        parts.append(targets := Table(box=box.SIMPLE))
+        for heading, _, _ in _TARGETS:
+            targets.add_column(heading, justify="right", no_wrap=True)
+        for row in range(len(columns["position_mm"])):
+            cells = []
+            for _, column, u_column in _TARGETS:
+                value, u = float(columns[column][row]), float(columns[u_column][row]) if u_column else math.nan
+                cells.append(_number(value) + ("" if math.isnan(u) else f" +/- {COVERAGE * u:.2f}"))
+            targets.add_row(*cells)
     return Group(*parts, Text("\n".join(found.statements)))
-
-
-def _targets_table(columns: Mapping[str, FloatArray]) -> Table:
-    """Values at each target; U from the scatter alone."""
-    table = Table(box=box.SIMPLE)
-    for heading, _, _ in _TARGETS:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in range(len(columns["position_mm"])):
-        cells = []
-        for _, name, u_name in _TARGETS:
-            value, u = float(columns[name][row]), float(columns[u_name][row]) if u_name else math.nan
-            cells.append(_number(value) + ("" if math.isnan(u) else f" +/- {COVERAGE * u:.2f}"))
-        table.add_row(*cells)
-    return table
 
 
 def comparison_table(found: Comparison) -> Group:
     """Return before, after, improvement factor, E_n and verdict of every figure; the overall verdict first."""
-    return Group(Text(verdict_text(found), style="bold"), *_tables(found.groups, found.kind), *_prediction(found))
+    lines = list(found.statements)
+    if found.prediction is not None:
+        agreed = found.prediction
+        parts = [f"{key} {_with_u(item)} um" for key, item in agreed.difference.items()]
+        verdict = "cannot be judged against" if agreed.verdict == "unknown" else f"{agreed.verdict} with"
+        share = ""
+        if not math.isnan(agreed.beyond):
+            share = f"; {100 * agreed.beyond:.1f} % of {agreed.components} components beyond U"
+            share += f" (by chance up to {100 * agreed.allowed:.1f} %)"
+        lines.insert(0, f"prediction {verdict} the measurement{share}; difference: {', '.join(parts)}")
+    tables = _tables(found.groups, found.kind)
+    return Group(Text(verdict_text(found), style="bold"), *tables, Text("\n".join(lines)))
 
 
 def verdict_text(found: Comparison) -> str:
@@ -308,22 +305,6 @@ def _tables(groups: Mapping[str, Mapping[str, ComparedFigure]], kind: str) -> li
         if group:
             tables.append(table)
     return tables
-
-
-def _prediction(found: Comparison) -> list[Text]:
-    lines = list(found.statements)
-    if found.prediction is not None:
-        agreed = found.prediction
-        parts = [f"{key} {_with_u(item)} um" for key, item in agreed.difference.items()]
-        verdict = "cannot be judged against" if agreed.verdict == "unknown" else f"{agreed.verdict} with"
-        share = (
-            ""
-            if math.isnan(agreed.beyond)
-            else f"; {100 * agreed.beyond:.1f} % of {agreed.components} components beyond U"
-        )
-        share += "" if math.isnan(agreed.beyond) else f" (by chance up to {100 * agreed.allowed:.1f} %)"
-        lines.insert(0, f"prediction {verdict} the measurement{share}; difference: {', '.join(parts)}")
-    return [Text("\n".join(lines))]
 
 
 # Readable summaries of the sign crash test, of differences between tables, and of a merge.

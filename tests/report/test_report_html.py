@@ -178,7 +178,7 @@ def test_table_values_on_the_curves_are_those_in_the_file(ran):
     """isg-csv holds errors by name in mm and rad."""
     source = read_folder(ran)
     (control,) = (item for item in source.controls if item.name == "isg-csv")
-    curves = {item.name: item for item in table_curves(source.machine, source.fitted, control)}
+    curves = {item.name: item for item in table_curves(source.fitted, control)}
     assert set(curves) == set(source.fitted.names)
     assert all(item.error for item in curves.values())
     written = values_in_text((ran / "isg-csv" / "volcomp0.csv").read_text())
@@ -197,7 +197,7 @@ def test_tables_written_in_their_basis_give_back_what_the_control_adds(ran):
     """Independent of the projection: the terms' sum is evaluated here with numpy.interp and compared at random points."""
     source = read_folder(ran)
     (control,) = (item for item in source.controls if item.name == "siemens-cec")
-    curves = table_curves(source.machine, source.fitted, control)
+    curves = table_curves(source.fitted, control)
     parsed = read_tables(source.machine, [item.path for item in control.files], "siemens-cec")
     basis = {t.name: t for t in parsed.controller.basis_of(source.fitted, parsed.tables)}
     generator = np.random.default_rng(8)

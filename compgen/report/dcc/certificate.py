@@ -8,7 +8,7 @@ from typing import Any
 
 from compgen.data.names import COVERAGE
 from compgen.errors import InputError
-from compgen.report.dcc.laboratory import Certificate, Condition, Contact, Person, Thing
+from compgen.report.dcc.laboratory import Certificate, Condition, Contact, Thing
 from compgen.report.dcc.xml import (
     DCC,
     LANGUAGE,
@@ -98,10 +98,25 @@ def administrative_data(data: Mapping[str, Any], options: Certificate) -> Elemen
     control = None if options.control is None else _item(options.control, options.control.name, None)
     name = options.machine.name or str(data["title"])
     code = optional("calibrationLaboratoryCode", options.laboratory_code)
+    persons = [
+        dcc(
+            "respPerson",
+            dcc("person", given("name", person.name), optional("eMail", person.email)),
+            optional("role", person.role),
+            None if person.main_signer is None else dcc("mainSigner", "true" if person.main_signer else "false"),
+        )
+        for person in options.persons
+    ]
     return dcc(
         "administrativeData",
         dcc("dccSoftware", software(data)),
-        dcc("refTypeDefinitions", *(_definition(key, *item) for key, item in REF_TYPES.items())),
+        dcc(
+            "refTypeDefinitions",
+            *(
+                dcc("refTypeDefinition", said("name", text), dcc("namespace", namespace), dcc("link", link))
+                for namespace, (text, link) in REF_TYPES.items()
+            ),
+        ),
         dcc(
             "coreData",
             dcc("countryCodeISO3166_1", options.country),
@@ -116,7 +131,7 @@ def administrative_data(data: Mapping[str, Any], options: Certificate) -> Elemen
         ),
         dcc("items", _item(options.machine, name, said("description", machine_text(data))), control),
         dcc("calibrationLaboratory", code, _contact("contact", options.laboratory)),
-        dcc("respPersons", *(_person(item) for item in options.persons)),
+        dcc("respPersons", *persons),
         _contact("customer", options.customer),
         statements(data, options),
     )
@@ -132,10 +147,6 @@ def software(data: Mapping[str, Any]) -> Element:
         dcc("type", "application"),
         said("description", "Identification of geometric errors of machine tools, compensation tables, this document"),
     )
-
-
-def _definition(namespace: str, text: str, link: str) -> Element:
-    return dcc("refTypeDefinition", said("name", text), dcc("namespace", namespace), dcc("link", link))
 
 
 def _date(tag: str, value: datetime.date | None) -> Element | None:
@@ -181,15 +192,12 @@ def manufacturer(thing: Thing) -> Element | None:
 
 def identifications(thing: Thing) -> Element:
     """Return the numbers that identify an item or an instrument."""
-    return dcc("identifications", *_identifications(thing))
-
-
-def _identifications(thing: Thing) -> Iterator[Element]:
-    yield _identification("manufacturer", thing.serial_number, "Serial number")
+    numbers = [_identification("manufacturer", thing.serial_number, "Serial number")]
     if thing.inventory_number:
-        yield _identification("customer", thing.inventory_number, "Inventory number")
+        numbers.append(_identification("customer", thing.inventory_number, "Inventory number"))
     if thing.certificate_number and not thing.certificate_sha256:
-        yield _identification("other", thing.certificate_number, "Number of its calibration certificate")
+        numbers.append(_identification("other", thing.certificate_number, "Number of its calibration certificate"))
+    return dcc("identifications", *numbers)
 
 
 def _identification(issuer: str, value: str, name: str) -> Element:
@@ -210,12 +218,6 @@ def _contact(tag: str, contact: Contact) -> Element:
     )
 
 
-def _person(person: Person) -> Element:
-    signer = None if person.main_signer is None else dcc("mainSigner", "true" if person.main_signer else "false")
-    inner = dcc("person", given("name", person.name), optional("eMail", person.email))
-    return dcc("respPerson", inner, optional("role", person.role), signer)
-
-
 # Instruments and conditions of a measurement, as far as they were stated or come with the readings.
 
 
@@ -224,32 +226,44 @@ NOT_STATED = "The conditions during the measurement were not stated."
 
 def measuring_equipments(options: Certificate) -> Element:
     """Return the instruments; the hash of a calibration certificate where it was given."""
-    return dcc("measuringEquipments", *(_equipment(item) for item in options.equipment))
-
-
-def _equipment(thing: Thing) -> Element:
-    certificate = None
-    if thing.certificate_sha256:
-        certificate = dcc(
-            "certificate",
-            said("referral", "Calibration certificate"),
-            dcc("referralID", flat(thing.certificate_number)),
-            dcc("procedure", "SHA-256"),
-            dcc("value", thing.certificate_sha256),
+    found = []
+    for thing in options.equipment:
+        certificate = None
+        if thing.certificate_sha256:
+            certificate = dcc(
+                "certificate",
+                said("referral", "Calibration certificate"),
+                dcc("referralID", flat(thing.certificate_number)),
+                dcc("procedure", "SHA-256"),
+                dcc("value", thing.certificate_sha256),
+            )
+        model = optional("model", thing.model)
+        found.append(
+            dcc(
+                "measuringEquipment",
+                given("name", thing.name),
+                certificate,
+                manufacturer(thing),
+                model,
+                identifications(thing),
+            )
         )
-    return dcc(
-        "measuringEquipment",
-        given("name", thing.name),
-        certificate,
-        manufacturer(thing),
-        optional("model", thing.model),
-        identifications(thing),
-    )
+    return dcc("measuringEquipments", *found)
 
 
 def influence_conditions(data: Mapping[str, Any], options: Certificate, version: str) -> Element:
     """Return the conditions that were stated and the temperatures of the scales; says so where nothing is known."""
-    found = [_condition(item, version) for item in (*options.conditions, *scale_temperatures(data))]
+    found = []
+    for item in (*options.conditions, *scale_temperatures(data)):  # a single value, or the lowest and the highest one
+        parts = [("Min", item.lowest, "Lowest value"), ("Max", item.highest, "Highest value")]
+        if item.lowest == item.highest:
+            parts = [("", item.lowest, item.name)]
+        quantities = [
+            dcc("quantity", said("name", name), real(value, item.unit, version), **_ref_type(item.ref_type, end))
+            for end, value, name in parts
+        ]
+        values = dcc("data", *quantities)
+        found.append(dcc("influenceCondition", said("name", item.name), values, **_ref_type(item.ref_type, "")))
     if not found:
         text = dcc("data", dcc("text", dcc("content", NOT_STATED, lang=LANGUAGE)))
         found = [dcc("influenceCondition", said("name", "Conditions"), text)]
@@ -263,20 +277,6 @@ def scale_temperatures(data: Mapping[str, Any]) -> Iterator[Condition]:
         if {"lowest_c", "highest_c"} <= set(item):
             name = f"Temperature of the {axis} scale, from the readings; corrected to 20 degrees Celsius"
             yield Condition(name, "\\degreeCelsius", item["lowest_c"], item["highest_c"], "basic_temperature")
-
-
-def _condition(item: Condition, version: str) -> Element:
-    """One condition: a single value, or the lowest and the highest one."""
-    parts = (
-        (("", item.lowest, item.name),)
-        if item.lowest == item.highest
-        else (("Min", item.lowest, "Lowest value"), ("Max", item.highest, "Highest value"))
-    )
-    quantities = [
-        dcc("quantity", said("name", name), real(value, item.unit, version), **_ref_type(item.ref_type, end))
-        for end, value, name in parts
-    ]
-    return dcc("influenceCondition", said("name", item.name), dcc("data", *quantities), **_ref_type(item.ref_type, ""))
 
 
 def _ref_type(stem: str, end: str) -> dict[str, str]:

@@ -215,25 +215,17 @@ def read_schema(path: str | Path) -> DccSchema:
                 uri_mapper=lambda uri: local_copy(uri, folder),
             )
     except (XMLSchemaException, Warning, OSError, SyntaxError) as error:
-        raise InputError(f"cannot be used as a schema: {_reason(error)}", file=source) from error
-    return DccSchema(source, _release(rules, source), rules)
-
-
-def _release(rules: XMLSchema10, source: Path) -> str:
+        reason = str(error).strip().partition("\n")[0].rstrip(":. ")[:400]
+        if "remote" in reason or isinstance(error, Warning):
+            reason += "; put the schemas that it imports into its folder (compgen uses no network)"
+        raise InputError(f"cannot be used as a schema: {reason}", file=source) from error
     if rules.target_namespace != DCC:
         raise InputError(f"describes {rules.target_namespace or 'no namespace'}, not {DCC}; give dcc.xsd", file=source)
     try:
-        return check_version(str(rules.root.get("version", "")))
+        release = check_version(str(rules.root.get("version", "")))
     except InputError as error:
         raise InputError(error.message, file=source) from None
-
-
-def _reason(error: BaseException) -> str:
-    """The first line of the message, with what to do about an import that is not on the disk."""
-    text = str(error).strip().partition("\n")[0].rstrip(":. ")[:400]
-    if "remote" in text or isinstance(error, Warning):
-        text += "; put the schemas that it imports into its folder (compgen uses no network)"
-    return text
+    return DccSchema(source, release, rules)
 
 
 def local_copy(uri: str, folder: Path) -> str:

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from compgen.accuracy.evaluate import axis_figures, diagonal_figures, groups_of_errors, statements_of, volume_fields
-from compgen.accuracy.field import Correction, error_source, volume_figures
+from compgen.accuracy.field import error_source, volume_figures
 from compgen.accuracy.figure import Figure
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.messages import um_text
 from compgen.data.names import COVERAGE, error_named
 from compgen.errors import CompgenError
-from compgen.report.html.folder import ControlFolder, ResultFolder, read_back
+from compgen.report.html.folder import ControlFolder, ResultFolder
 from compgen.report.html.pictures import describe_error
 from compgen.tables import program_version
 from compgen.tables.verification import coverage_of
@@ -73,6 +73,12 @@ def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> di
         for name, group in found.items()
     ]
     independent = "uncertainties from those of the single values, taken as independent"
+    with_tables = []
+    for control in source.controls:
+        if control.tables is not None:
+            moved = error_source(machine, errors, None, control.correction)
+            figures = {**axis_figures(moved), **diagonal_figures(moved)}
+            with_tables.append({"name": control.name, "figures": {key: item.value for key, item in figures.items()}})
     return {
         "groups": groups,
         "statements": [
@@ -81,20 +87,8 @@ def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> di
             "the machine as identified, without tables",
             *([partial] if coverage.missing else []),
         ],
-        "with_tables": _with_tables(source, machine, errors),
+        "with_tables": with_tables,
     }
-
-
-def _with_tables(source: ResultFolder, machine: Machine, errors: ErrorTable) -> list[dict[str, Any]]:
-    """Positioning and diagonals of the machine with the tables of each control, um, by the name of the control."""
-    found = []
-    for control in source.controls:
-        correction: Correction | None = read_back(machine, control)
-        if correction is not None:
-            moved = error_source(machine, errors, None, correction)
-            figures = {**axis_figures(moved), **diagonal_figures(moved)}
-            found.append({"name": control.name, "figures": {key: item.value for key, item in figures.items()}})
-    return found
 
 
 def _rows(group: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -193,9 +187,17 @@ VERDICTS = {
 }
 
 
+#: What the report takes over from ``identify.json``, where there is something.
+MEASUREMENT = (
+    "method", "readings", "readings_used", "residual_rms_um", "residual_max_um", "reduced_chi_square", "degrees_of_freedom",
+    "rank", "unknowns", "u_length", "u_deviation", "unobservable", "rejected", "segments", "stations", "corrections",
+    "worst_standard_uncertainty", "systematic", "objections",
+)  # fmt: skip
+
+
 def content(source: ResultFolder) -> dict[str, Any]:
     """Return the numbers of the report; only plain values, every text as in the files."""
-    controls = [_control(item) for item in source.controls]
+    controls, identify = [_control(item) for item in source.controls], source.identify
     return {
         "format": "compgen report 1",
         "kind": source.kind,
@@ -203,7 +205,7 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "verdict": _verdict(source, controls),
         "controls": controls,
         "errors": _errors(source.identified),
-        "measurement": _measurement(source),
+        "measurement": {key: identify[key] for key in MEASUREMENT if identify.get(key) not in (None, [], {})},
         "accuracy": accuracy_groups(source),
         "compare": comparison_groups(source),
         "machine": _machine(source),
@@ -305,12 +307,29 @@ def um(value: Any) -> str:
     return um_text(value, whole_from=100.0)
 
 
+#: Verdicts of a comparison in words.
+COMPARED = {
+    "better": "Better: the bands before and after separate",
+    "worse": "Worse: the bands before and after separate",
+    "not separated": "No difference beyond the uncertainty",
+    "smaller": "Smaller, by figures without uncertainty",
+    "larger": "Larger, by figures without uncertainty",
+}
+
+
 def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     if controls:
         state = max((str(item["state"]) for item in controls), key=list(VERDICTS).index)
         return {"state": state, "headline": _headline(state, controls), "text": _verdict_text(controls)}
     if source.kind == "compare":
-        return _compare_verdict(source.compare)
+        # Green only where the bands separate.
+        word = str(source.compare.get("verdict", ""))
+        decided = ", ".join(map(str, source.compare.get("decided_by", [])))
+        return {
+            "state": {"better": "accepted", "worse": "rejected"}.get(word, "neutral"),
+            "headline": COMPARED.get(word, "Before and after compared"),
+            "text": f"Decided by {decided}." if decided else "",
+        }
     if source.kind == "accuracy":
         return {
             "state": "neutral",
@@ -329,21 +348,6 @@ def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dic
         f"{identify.get('readings', '–')} readings; residual {um(identify.get('residual_rms_um'))} µm rms."
     )
     return {"state": "neutral", "headline": "Errors identified", "text": text}
-
-
-def _compare_verdict(compare: Mapping[str, Any]) -> dict[str, str]:
-    """The verdict of a comparison in words; green only where the bands separate."""
-    word = str(compare.get("verdict", ""))
-    state = {"better": "accepted", "worse": "rejected"}.get(word, "neutral")
-    headline = {
-        "better": "Better: the bands before and after separate",
-        "worse": "Worse: the bands before and after separate",
-        "not separated": "No difference beyond the uncertainty",
-        "smaller": "Smaller, by figures without uncertainty",
-        "larger": "Larger, by figures without uncertainty",
-    }.get(word, "Before and after compared")
-    decided = ", ".join(map(str, compare.get("decided_by", [])))
-    return {"state": state, "headline": headline, "text": f"Decided by {decided}." if decided else ""}
 
 
 def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
@@ -403,31 +407,6 @@ def _errors(table: ErrorTable | None) -> list[dict[str, Any]]:
             row |= {"value": (curve.value / unit.si_per_unit).tolist(), "u": (curve.u / unit.si_per_unit).tolist()}
         rows.append(row)
     return rows
-
-
-def _measurement(source: ResultFolder) -> dict[str, Any]:
-    keys = (
-        "method",
-        "readings",
-        "readings_used",
-        "residual_rms_um",
-        "residual_max_um",
-        "reduced_chi_square",
-        "degrees_of_freedom",
-        "rank",
-        "unknowns",
-        "u_length",
-        "u_deviation",
-        "unobservable",
-        "rejected",
-        "segments",
-        "stations",
-        "corrections",
-        "worst_standard_uncertainty",
-        "systematic",
-        "objections",
-    )
-    return {key: source.identify[key] for key in keys if source.identify.get(key) not in (None, [], {})}
 
 
 def _machine(source: ResultFolder) -> dict[str, Any]:

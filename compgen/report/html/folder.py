@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,6 +35,9 @@ Kind = Literal["run", "identify", "verify", "compare", "accuracy"]
 MARKS = ("result.json", "identify.json", "compare.json", "accuracy.json")
 #: Lines and characters of a controller file that the report shows.
 PREVIEW_LINES, PREVIEW_CHARACTERS = 40, 4000
+#: What is raised where machine file, errors and tables of a folder do not fit each other any more. The figures are in
+#: result.json; only what needs the tables themselves is left out then.
+UNFIT = (CompgenError, ValueError, ArithmeticError, LookupError, OSError)
 #: A larger JSON file is not a result of compgen.
 MOST_JSON = 50_000_000
 
@@ -67,7 +70,11 @@ class ListedFile:
 
 @dataclass(frozen=True)
 class ControlFolder:
-    """What the folder contains for one control: ``result.json``, ``manifest.json``, ``preflight.md``, files and the volume."""
+    """What the folder contains for one control: ``result.json``, ``manifest.json``, ``preflight.md``, files and the volume.
+
+    ``tables`` are the files read back with ``machine``, which has the settings of the export; None where they cannot be
+    read with it.
+    """
 
     name: str
     folder: Path
@@ -76,6 +83,13 @@ class ControlFolder:
     preflight: str
     files: tuple[ListedFile, ...]
     volume: Volume | None
+    machine: Machine | None = None
+    tables: ReadTables | None = None
+
+    def correction(self, points: Points) -> FloatArray:
+        """Return what the tables add at points, (n, 3), mm."""
+        assert self.machine is not None and self.tables is not None
+        return self.tables.mean_correction(self.machine, points.position_mm)
 
 
 @dataclass(frozen=True)
@@ -142,7 +156,7 @@ def read_folder(folder: str | Path) -> ResultFolder:
         residuals=_residuals(base / "residuals.csv"),
         controls=tuple(
             sorted(
-                (_control(path) for path in control_folders),
+                (_control(path, machine) for path in control_folders),
                 key=lambda c: (not c.result.get("accepted"), bool(c.result.get("partial")), c.name),
             )
         ),
@@ -225,13 +239,23 @@ def _volume(path: Path) -> Volume | None:
     return Volume(position_mm, values_mm[:, :3], values_mm[:, 3:])
 
 
-def _control(folder: Path) -> ControlFolder:
+def _control(folder: Path, machine: Machine | None) -> ControlFolder:
     result, manifest = _json(folder / "result.json"), _json(folder / "manifest.json")
     preflight = folder / "preflight.md"
     text = read_text(preflight) if preflight.is_file() else ""
-    files = tuple(_files(folder, result))
+    files, volume = tuple(_files(folder, result)), _volume(folder / "volume.csv")
     name = str(result.get("controller", folder.name))
-    return ControlFolder(name, folder, result, manifest, text, files, _volume(folder / "volume.csv"))
+    found = ControlFolder(name, folder, result, manifest, text, files, volume)
+    if machine is None or not files or name not in CONTROLLERS:
+        return found
+    settings = manifest.get("settings")  # options of the run may differ from the machine file
+    try:
+        for key, value in (settings if isinstance(settings, dict) else {}).items():
+            machine = machine.with_setting(name, key, value)
+        tables = read_tables(machine, [item.path for item in files], name)
+    except UNFIT:
+        return found
+    return replace(found, machine=machine, tables=tables)
 
 
 def _files(folder: Path, result: Mapping[str, Any]) -> list[ListedFile]:
@@ -256,12 +280,7 @@ def _files(folder: Path, result: Mapping[str, Any]) -> list[ListedFile]:
     return found
 
 
-# What the tables of a control hold, in its own basis, from the files of the folder.
-
-
-#: What is raised where machine file, errors and tables of a folder do not fit each other any more. The figures are in
-#: result.json; only what needs the tables themselves is left out then.
-UNFIT = (CompgenError, ValueError, ArithmeticError, LookupError, OSError)
+# What the tables of a control contain, in its own basis, from the files of the folder.
 
 
 @dataclass(frozen=True)
@@ -280,53 +299,23 @@ class TableCurve:
     error: bool
 
 
-def table_curves(machine: Machine | None, errors: ErrorTable | None, control: ControlFolder) -> tuple[TableCurve, ...]:
+def table_curves(errors: ErrorTable | None, control: ControlFolder) -> tuple[TableCurve, ...]:
     """Return the tables of a control as they act: its emulation, written in the basis of its tables.
 
     The values are those that reproduce the emulated correction over the volume best, which is all there is to tell
-    where a control lets one table stand for another. Empty where machine, errors or files are missing, or where the
-    control cannot read them.
+    where a control lets one table stand for another. Empty where errors are missing or the files cannot be read.
     """
-    if machine is None or errors is None or not control.files or control.name not in CONTROLLERS:
+    machine, tables = control.machine, control.tables
+    if machine is None or tables is None or errors is None:
         return ()
     try:
-        parsed = _parsed(machine, control)
-        return _curves(_as_exported(machine, control), errors, parsed)
+        basis = tables.controller.basis_of(errors, tables.tables)
+        solver = projector(machine, basis, anchored=tables.controller.anchored)
+        start = np.concatenate([term.start for term in basis])
+        values = solver.by_name(solver.project(tables.mean_correction(machine, solver.position_mm), start))
+        return tuple(_curve(term, values[term.name]) for term in basis)
     except UNFIT:
         return ()
-
-
-def read_back(machine: Machine, control: ControlFolder) -> Callable[[Points], FloatArray] | None:
-    """Return what the files of a control add at points, (n, 3), mm; None where they cannot be read with this machine."""
-    try:
-        parsed = _parsed(machine, control)
-    except UNFIT:
-        return None
-    if control.name not in CONTROLLERS or not control.files:
-        return None
-    moved = _as_exported(machine, control)
-    return lambda points: parsed.mean_correction(moved, points.position_mm)
-
-
-def _as_exported(machine: Machine, control: ControlFolder) -> Machine:
-    """The machine with the settings that the manifest states; options of the run may differ from the machine file."""
-    settings = control.manifest.get("settings")
-    for key, value in (settings if isinstance(settings, dict) else {}).items():
-        machine = machine.with_setting(control.name, key, value)
-    return machine
-
-
-def _parsed(machine: Machine, control: ControlFolder) -> ReadTables:
-    return read_tables(_as_exported(machine, control), [item.path for item in control.files], control.name)
-
-
-def _curves(machine: Machine, errors: ErrorTable, parsed: ReadTables) -> tuple[TableCurve, ...]:
-    basis = parsed.controller.basis_of(errors, parsed.tables)
-    solver = projector(machine, basis, anchored=parsed.controller.anchored)
-    start = np.concatenate([term.start for term in basis])
-    held = parsed.mean_correction(machine, solver.position_mm)
-    values = solver.by_name(solver.project(held, start))
-    return tuple(_curve(term, values[term.name]) for term in basis)
 
 
 def _curve(term: Term, values: FloatArray) -> TableCurve:

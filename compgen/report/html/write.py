@@ -123,6 +123,14 @@ def markdown(text: str) -> Markup:
 _SPECIAL = "\\`*_{}[]<>()#+!|&~"
 
 
+#: What the dossier says of the tables of a control, and of their verification.
+TABLES = ("name", "format", "evidence", "settings", "sign_statement", "parameters", "files")
+VERIFICATION = (
+    "name", "state", "headline", "measured", "objections", "points", "before", "after", "before_rigid", "after_rigid",
+    "unrepresentable_um", "uncorrected", "reasons", "notes",
+)  # fmt: skip
+
+
 def dossier_data(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the sections of the dossier from the numbers of the report (:func:`compgen.report.html.content.content`)."""
     return {
@@ -136,35 +144,8 @@ def dossier_data(data: Mapping[str, Any]) -> dict[str, Any]:
         },
         "identification": data["measurement"],
         "identified_errors": data["errors"],
-        "tables": [
-            {
-                key: item[key]
-                for key in ("name", "format", "evidence", "settings", "sign_statement", "parameters", "files")
-            }
-            for item in data["controls"]
-        ],
-        "verification": [
-            {
-                key: item[key]
-                for key in (
-                    "name",
-                    "state",
-                    "headline",
-                    "measured",
-                    "objections",
-                    "points",
-                    "before",
-                    "after",
-                    "before_rigid",
-                    "after_rigid",
-                    "unrepresentable_um",
-                    "uncorrected",
-                    "reasons",
-                    "notes",
-                )
-            }
-            for item in data["controls"]
-        ],
+        "tables": [{key: item[key] for key in TABLES} for item in data["controls"]],
+        "verification": [{key: item[key] for key in VERIFICATION} for item in data["controls"]],
         "accuracy": data["accuracy"],
         "comparison": data["compare"],
         "limits": data["limitations"],
@@ -190,9 +171,33 @@ def dossier_text(dossier: Mapping[str, Any]) -> str:
     lines += _section("1. Machine and model", [*_pairs(machine), *_pairs(dossier["model"])])
     inputs = [[item["name"], f"`{one_line(item['sha256'])}`"] for item in dossier["measured"]["inputs"]]
     lines += _section("2. What was measured", _table(["file", "SHA-256"], inputs, raw=1))
-    lines += _section("3. Identification", [*_pairs(dossier["identification"]), "", *_errors_section(dossier)])
-    lines += _section("4. Tables", [line for item in dossier["tables"] for line in _control_tables(item)])
-    lines += _section("5. Verification", [line for item in dossier["verification"] for line in _verified(item)])
+    rows = []
+    for item in dossier["identified_errors"]:
+        at = "" if item["at_mm"] is None else f"{item['at_mm']:g}"
+        rows.append(
+            [item["error"], item["meaning"], f"{item['largest']:+.3f}", at, number_text(item["U"]), item["unit"]]
+        )
+    errors = _table(["error", "meaning", "largest", "at (mm)", "U (k = 2)", "unit"], rows)
+    lines += _section("3. Identification", [*_pairs(dossier["identification"]), "", *errors])
+    tables: list[str] = []
+    for item in dossier["tables"]:
+        tables += [f"### {plain_markdown(item['name'])}", ""]
+        tables += _pairs({key: item[key] for key in ("format", "evidence", "settings", "sign_statement")})
+        files = [[f["name"], f"`{one_line(f['sha256'])}`", f["bytes"], f["lines"]] for f in item["files"]]
+        tables += ["", *_table(["file", "SHA-256", "bytes", "lines"], files, raw=1)]
+    lines += _section("4. Tables", tables)
+    verified: list[str] = []
+    for item in dossier["verification"]:
+        verified += [f"### {plain_markdown(item['name'])}: {item['state']}, {item['points']} points", ""]
+        parts = ("before", "after", "before_rigid", "after_rigid")
+        figures = [[text, *(um(item[part].get(key)) for part in parts)] for key, text in FIGURES]
+        headings = ["um", "before", "after", "before, rigid motion removed", "after, rigid motion removed"]
+        verified += _table(headings, figures)
+        verified += [f"- {plain_markdown(text)}" for text in (item["headline"], *item["objections"]) if text]
+        verified += [f"- Cannot be expressed by this control: {um(item['unrepresentable_um'])} um"]
+        verified += [f"- Stays: {row['error']} {um(row['um'])} um; {row['why']}" for row in item["uncorrected"]]
+        verified += [*(f"- {plain_markdown(text)}" for text in (*item["reasons"], *item["notes"])), ""]
+    lines += _section("5. Verification", verified)
     lines += _section(
         "6. Accuracy figures and comparison", [*_accuracy(dossier["accuracy"]), *_compared(dossier["comparison"])]
     )
@@ -236,16 +241,6 @@ def _table(head: list[str], rows: list[list[Any]], raw: int | None = None) -> li
     return [*lines, ""]
 
 
-def _errors_section(dossier: Mapping[str, Any]) -> list[str]:
-    rows = []
-    for item in dossier["identified_errors"]:
-        at = "" if item["at_mm"] is None else f"{item['at_mm']:g}"
-        rows.append(
-            [item["error"], item["meaning"], f"{item['largest']:+.3f}", at, number_text(item["U"]), item["unit"]]
-        )
-    return _table(["error", "meaning", "largest", "at (mm)", "U (k = 2)", "unit"], rows)
-
-
 def _figure(value: Any, u: Any) -> str:
     return number_text(value, 2) + ("" if value is None or u is None else f" ± {u:.2f}")
 
@@ -278,24 +273,6 @@ def _statements(data: Mapping[str, Any]) -> list[str]:
     return [*(f"- {plain_markdown(text)}" for text in data.get("statements", [])), ""]
 
 
-def _control_tables(item: Mapping[str, Any]) -> list[str]:
-    lines = [f"### {plain_markdown(item['name'])}", ""]
-    lines += _pairs({key: item[key] for key in ("format", "evidence", "settings", "sign_statement")})
-    rows = [[f["name"], f"`{one_line(f['sha256'])}`", f["bytes"], f["lines"]] for f in item["files"]]
-    return [*lines, "", *_table(["file", "SHA-256", "bytes", "lines"], rows, raw=1)]
-
-
-def _verified(item: Mapping[str, Any]) -> list[str]:
-    lines = [f"### {plain_markdown(item['name'])}: {item['state']}, {item['points']} points", ""]
-    parts = ("before", "after", "before_rigid", "after_rigid")
-    rows = [[text, *(um(item[part].get(key)) for part in parts)] for key, text in FIGURES]
-    lines += _table(["um", "before", "after", "before, rigid motion removed", "after, rigid motion removed"], rows)
-    lines += [f"- {plain_markdown(text)}" for text in (item["headline"], *item["objections"]) if text]
-    lines += [f"- Cannot be expressed by this control: {um(item['unrepresentable_um'])} um"]
-    lines += [f"- Stays: {item['error']} {um(item['um'])} um; {item['why']}" for item in item["uncorrected"]]
-    return [*lines, *(f"- {plain_markdown(text)}" for text in (*item["reasons"], *item["notes"])), ""]
-
-
 # ``calibration.json``: the results in the order of a Digital Calibration Certificate, as documented JSON.
 #
 # It is not a DCC: that is an XML document of PTB's schema (namespace ``https://ptb.de/dcc``), issued and signed by a
@@ -315,6 +292,17 @@ STATEMENT = (
 
 def calibration_record(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the contents of ``calibration.json`` from the numbers of the report."""
+    results = [
+        {
+            "name": item["error"],
+            "meaning": item["meaning"],
+            "positions": _list(item["position_mm"], "mm"),
+            "values": _list(item["value"], item["unit"], item["u"]),
+        }
+        for item in data["errors"]
+    ]
+    method = data["measurement"].get("method")
+    errors = {"name": "geometric errors (ISO 230-1)", "usedMethod": method, "results": results}
     return {
         "format": "compgen calibration record 1",
         "statement": STATEMENT,
@@ -331,7 +319,7 @@ def calibration_record(data: Mapping[str, Any]) -> dict[str, Any]:
             "respPersons": None,
             "customer": None,
         },
-        "measurementResults": [_record_of_errors(data), *(_verification(item) for item in data["controls"])],
+        "measurementResults": [errors, *(_verification(item) for item in data["controls"])],
         "comment": data["limitations"],
         "documents": data["provenance"]["inputs"],
     }
@@ -348,16 +336,6 @@ def _list(values: Sequence[Any], unit: str, standard: Sequence[Any] = ()) -> dic
             "distribution": "normal",
         }
     return found
-
-
-def _record_of_errors(data: Mapping[str, Any]) -> dict[str, Any]:
-    results = []
-    for item in data["errors"]:
-        values = _list(item["value"], item["unit"], item["u"])
-        positions = _list(item["position_mm"], "mm")
-        results.append({"name": item["error"], "meaning": item["meaning"], "positions": positions, "values": values})
-    method = data["measurement"].get("method")
-    return {"name": "geometric errors (ISO 230-1)", "usedMethod": method, "results": results}
 
 
 def _verification(item: Mapping[str, Any]) -> dict[str, Any]:
@@ -439,9 +417,7 @@ def write_report(
 def draw(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, list[Picture]]:
     """Return the pictures of a report by group, see :func:`compgen.report.html.write.render_page`."""
     errors = source.fitted or source.identified
-    tables: dict[str, tuple[TableCurve, ...]] = {
-        item.name: table_curves(source.machine, errors, item) for item in source.controls
-    }
+    tables: dict[str, tuple[TableCurve, ...]] = {item.name: table_curves(errors, item) for item in source.controls}
     found: dict[str, list[Picture]] = {"curves": [], "squareness": [], "measurement": []}
     if source.identified is not None:
         found["curves"] = draw_curves(source.identified, source.fitted, tables)
