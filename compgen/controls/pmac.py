@@ -20,7 +20,7 @@ from compgen.controls.pmac_tables import (
     parse_foreign_pmac,
     parse_pmac,
 )
-from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis, travel_of
 from compgen.controls.shared.grids import equidistant_grid, loss_setting
 from compgen.controls.shared.terms import continued, one_dimensional_terms, product_terms
 from compgen.data import toml_files
@@ -370,7 +370,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         if not np.any(size):
             return size
         axis = self.settings.motors.index(motor)
-        travel = np.zeros(len(points)) if points.approach is None else points.approach[:, axis]
+        travel = travel_of(points, axis)
         if np.any(travel == 0):
             message = (
                 f"motor {motor} has backlash compensation, and some points do not say from where they were approached: "

@@ -187,6 +187,22 @@ def test_a_reversal_along_the_axis_becomes_a_bilateral_table():
     assert 0.5 * (up + down) == pytest.approx(-0.0009, abs=TENTH_UM)
 
 
+def test_a_reversal_that_bends_between_the_nodes_is_held_where_it_was_measured():
+    """Up and down differ by the reversal at each of its positions, whatever nodes the leadscrew table has."""
+    machine = machine_with(tool=(0.0, 0.0, 0.0))
+    at, size = np.array([TRAVELS[0][0], 130.0, TRAVELS[0][1]]), np.array([-0.002, -0.010, -0.004])
+    reversal = ReversalCurves({(0, 0): compgen.Curve(at, size, np.full(3, np.nan))})
+    _, tables = made(machine, errors_of(EXX=(1e-5, 10.0)), reversal)
+    up, down = (added(tables, [[x, 0, 0] for x in at], machine, [sign, 1, 1])[:, 0] for sign in (1, -1))
+    assert up - down == pytest.approx(-size, abs=2 * TENTH_UM)
+
+
+def test_a_table_over_a_travel_in_whole_units_ends_where_the_travel_ends():
+    _, tables = made(machine_with(tool=(0.0, 0.0, 0.0)), errors_of(EXX=(1e-5, 10.0)))
+    ends = np.array(TRAVELS[0]) * 10_000
+    assert tables.lists[0].screw.setpoints[[0, -1]] == pytest.approx(ends, abs=0)
+
+
 # --- limits ----------------------------------------------------------------------------------------------------------
 
 
