@@ -51,7 +51,7 @@ from compgen.kinematics.first_order import tool_of
 # Records of three-dimensional compensation data as a file punched from the user's own control shows them.
 #
 # No public document describes that file. What can be told from a sample is taken over: how records look, and in which
-# number the first point stands. In which order the points come cannot be told; ``order`` in the machine file says it.
+# number the first point has. In which order the points come cannot be told; ``order`` in the machine file says it.
 
 
 #: Parameters of the function: axes, points per axis, number of the reference point, magnification, interval.
@@ -62,7 +62,7 @@ FORMS = {"APAPAP": "axis words", "XYZ": "axis letters", "P": "a record per value
 
 @dataclass(frozen=True)
 class VolumeStyle:
-    """Style of the records, one of :data:`FORMS`, number of the first record, whether parameters stand beside them."""
+    """Style of the records, one of :data:`FORMS`, number of the first record, whether the file has parameters too."""
 
     style: FanucStyle
     form: str
@@ -110,7 +110,7 @@ def volume_style_of(file: SourceFile) -> VolumeStyle:
     style = replace(whole_numbers_of(style, texts), point_digits=width_of(data, 5), digits=width_of(parameters, 5))
     notes = (
         f"records of the form {FORMS[form]}, the first is N{data[0].number}, {len(data)} of them",
-        f"parameters {'stand' if parameters else 'do not stand'} in the same file",
+        f"parameters {'are' if parameters else 'are not'} in the same file",
         "the order of the points cannot be told from the sample; `order` in the machine file says it",
     )
     return VolumeStyle(style, form, data[0].number, bool(parameters), notes)
@@ -256,7 +256,7 @@ def _rows(file: SourceFile) -> tuple[dict[str, tuple[str, int]], list[Row]]:
         elif bare:
             rows.append(_row(file, bare, line))
             if len(rows) > MOST_ROWS:
-                raise file.fail(f"holds more than {MOST_ROWS} rows; that is no table", line)
+                raise file.fail(f"has more than {MOST_ROWS} rows; a table has fewer", line)
     if not rows:
         raise file.fail("holds no vertex", len(file.text.splitlines()) or 1)
     declared = keys.get("rows", ("none", 1))
@@ -525,7 +525,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
                 raise file.fail(f"point {number} is missing")
             if by_number[number][1] != due:
                 order = "".join(AXES[k] for k in self.settings.order)
-                raise file.fail(f"point {number} does not stand where order = {order!r} has it", by_number[number][3])
+                raise file.fail(f"point {number} is not where order = {order!r} has it", by_number[number][3])
         return table
 
     def _read_records(self, file: SourceFile, beside: VolumeTable | None) -> VolumeTable:

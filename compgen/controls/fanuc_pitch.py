@@ -61,7 +61,7 @@ def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, ax
     """Return the section ends of an axis, the reference point among them.
 
     Points that the sample of the control shows are kept: their section ends are taken as they are. The user's interval
-    is taken as it is. Otherwise the fewest sections are taken with which linear interpolation of the wanted correction
+    is taken as it is. Otherwise the fewest sections are taken with which linear interpolation of the requested correction
     loses nothing that matters and every increment, with a margin, stays within the limit (one count with a staircase),
     as far as the point numbers of this axis and the least interval permit.
     """
@@ -129,9 +129,9 @@ def _extended(position_mm: FloatArray, nodes_mm: FloatArray, value: FloatArray) 
     return np.asarray(inner + below + above, dtype=np.float64)
 
 
-# From wanted curves to the numbers of stored pitch error compensation: best whole numbers, and a place for each block.
+# From requested curves to the numbers of stored pitch error compensation: best whole numbers, and a place for each block.
 #
-# Bi-directional: with the reversal B (position reached in positive minus in negative direction) the tool stands at +B/2
+# Bi-directional: with the reversal B (position reached in positive minus in negative direction) the tool is at +B/2
 # after positive travel, so the correction is the mean one minus B/2 there, and plus B/2 after negative travel. The curve of
 # the direction of the reference return is zero at the reference point, the other one has parameter 3627 there.
 
@@ -263,7 +263,7 @@ def _change(sample: Sample, parameter: int, axis: int, text: str) -> str:
 
 # FANUC stored pitch error compensation: positioning of X, Y and Z, whole-number increments per section of travel.
 #
-# What the control is taken to do, and how sure that is, stands in ``templates/fanuc-pitch/format.toml``.
+# What the control is taken to do, and how sure that is, is in ``templates/fanuc-pitch/format.toml``.
 
 
 class FanucPitch(Controller[PitchSettings, PitchTables]):
@@ -421,7 +421,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
     def _tables_of(
         self, wanted: Sequence[RequestedPitch | None], reversal: ReversalCurves | None = None
     ) -> PitchTables:
-        """Return the best whole tables for wanted curves, with the reversal of each axis along itself, and their numbers."""
+        """Return the best whole tables for requested curves, with the reversal of each axis along itself, and their numbers."""
         blocks: list[PitchBlock | None] = [None, None, None]
         shortfalls: list[PitchShortfall] = []
         for axis, curve in enumerate(wanted):

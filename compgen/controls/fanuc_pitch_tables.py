@@ -335,7 +335,7 @@ class PitchTables:
     """Tables of X, Y, Z (None: the axis has none); ``others`` holds (axis number, first, last) of further axes.
 
     ``turns`` holds (axis number, sum of the values over a revolution) of rotary axes among these. ``shortfalls`` and
-    ``wanted`` are known of tables that were built; tables read from text do not say what was wanted, but what ``remarks``
+    ``wanted`` are known of tables that were built; tables read from text do not say what was requested, but what ``remarks``
     there are on the reading.
     """
 
@@ -545,10 +545,10 @@ def pitch_violations(machine: Machine, settings: PitchSettings, tables: PitchTab
 
 
 def shortfall_text(settings: PitchSettings, shortfall: PitchShortfall) -> str:
-    """Say that the limit of the change per section keeps a table from what was wanted, and what helps."""
+    """Say that the limit of the change per section keeps a table from what was requested, and what helps."""
     numbers = ", ".join(map(str, shortfall.sections[:5])) + (", ..." if len(shortfall.sections) > 5 else "")
     return (
-        f"{AXES[shortfall.axis]}: the wanted curve is too steep, the limit is {settings.increment_limit} counts per "
+        f"{AXES[shortfall.axis]}: the requested curve is too steep, the limit is {settings.increment_limit} counts per "
         f"section: {len(shortfall.sections)} sections are full (points {numbers}), and even the best table misses by up "
         f"to {shortfall.missed_counts * settings.count_mm(shortfall.axis) / MM_PER_UM:.1f} um; a shorter interval or a larger "
         f"magnification is needed"

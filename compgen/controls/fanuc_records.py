@@ -143,11 +143,11 @@ class FanucStyle:
 
     Parameters
     ----------
-    eol, block_end, space : line end, what stands before it (``;`` or nothing), what stands between words.
+    eol, block_end, space : line end, what is before it (``;`` or nothing), what is between words.
     mark : first and last line.
     digits, point_digits : digits of the N words of parameters and of compensation points, filled with zeros.
     q_word, q_last : type word Q1 (parameter) or Q0 (pitch data), behind the other words if ``q_last``.
-    value_first : the value word stands before its axis word.
+    value_first : the value word comes before its axis word.
     axes_together : all axes of a parameter in one record.
     real_letter, real_point, decimals : value word of lengths, whether it has a decimal point, digits behind it (None: as
         few as needed, but one).
@@ -268,7 +268,7 @@ Parameters = dict[tuple[int, int], tuple[str, Record]]
 
 @dataclass(frozen=True)
 class PointGrid:
-    """Compensation points of one axis: point n stands at the reference point plus (n - ``reference``) intervals.
+    """Compensation points of one axis: point n is at the reference point plus (n - ``reference``) intervals.
 
     Parameters 3620 (``reference``), 3621 and 3622 (``first`` and ``last``), 3624 (``interval_mm``).
     """

@@ -329,7 +329,7 @@ def _gain_of_inner_knots(sums: tuple[FloatArray, ...]) -> FloatArray:
 
 # FANUC straightness compensation: one axis shifted as a function of another, a polyline of four knots each.
 #
-# What the control is taken to do, and how little of it is settled, stands in ``templates/fanuc-straightness/format.toml``.
+# What the control is taken to do, and how little of it is settled, is in ``templates/fanuc-straightness/format.toml``.
 
 
 class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
@@ -776,7 +776,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         return np.asarray(positions[first : last + 1])
 
     def _fitted(self, errors: ErrorTable, output: int, axis: int) -> Polyline:
-        """Best polyline for the wanted correction of ``output`` over ``axis`` at mid-volume."""
+        """Best polyline for the requested correction of ``output`` over ``axis`` at mid-volume."""
         candidates = self._candidates_mm(axis)
         position = np.unique(np.concatenate([candidates, curve_nodes_mm(self.machine, errors, axis)]).round(9))
         position = np.unique(np.concatenate([position, 0.5 * (position[1:] + position[:-1])]).round(9))

@@ -365,7 +365,7 @@ def _largest(tables: ComTables) -> tuple[int, int, int]:
 # HEIDENHAIN compensation-value tables: .COM files over each axis and the .CMA file that assigns them.
 #
 # Sources: TNC 407/415/425 technical manual (01.98), p. 151-156, 622; MANUALplus 620 technical manual, p. 708, 716, 718;
-# iTNC 530 HSCI technical manual (07.2013), p. 647-686. What none of them settles stands in
+# iTNC 530 HSCI technical manual (07.2013), p. 647-686. What none of them settles is in
 # ``templates/heidenhain-com/format.toml``.
 
 
@@ -530,8 +530,8 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
     def with_reversal(self, tables: ComTables, reversal: ReversalCurves) -> ComTables:
         """Put half of each reversal into the axis' own column and the other direction into the column BACKLASH.
 
-        With the reversal B the tool stands at +B/2 after positive travel, so the correction is -B/2 then and +B/2
-        after negative travel, beside what the curves say.
+        With the reversal B the tool is at +B/2 after positive travel, so the correction is -B/2 then and +B/2
+        after negative travel, in addition to what the curves say.
         """
         settings = self.settings
         found = dict(tables.tables)

@@ -145,7 +145,7 @@ def _entries(table: TextTable, column: str) -> tuple[Decimal, ...]:
 #
 # Source: iTNC 530 HSCI technical manual (07.2013), p. 666-686, 722. For a linear axis X the columns are C1 EXX, C2 EYX,
 # C3 EZX, C4 EAX, C5 EBX, C6 ECX; rows ``Trans`` of the kinematics table refer to them in the column COMPTAB. What no
-# document settles stands in ``templates/heidenhain-kinematics/format.toml``; the maker of the machine must integrate it.
+# document settles is in ``templates/heidenhain-kinematics/format.toml``; the maker of the machine must integrate it.
 
 
 class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
@@ -310,7 +310,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
         return [list(row) for row in zip(*columns, strict=True)]
 
     def _chain_rows(self, tables: DraftTables) -> list[list[str]]:
-        """Cells DOC, KEY, AXIS, COORD, COMPTAB from the tool to the workpiece; errors stand before their axis (p. 680)."""
+        """Cells DOC, KEY, AXIS, COORD, COMPTAB from the tool to the workpiece; errors come before their axis (p. 680)."""
         settings = self.settings
         rows = []
         for axis in (*reversed(self.machine.chain.tool_side), *self.machine.chain.workpiece_side):

@@ -131,7 +131,7 @@ def _row(file: SourceFile, columns: Sequence[TableColumn], line: str, number: in
     """Cells of one row: one word per column by their order, or, where some are blank, by the fields."""
     found = list(_WORD.finditer(line))
     if len(found) > len(columns):
-        raise file.fail(f"{len(found)} values stand in {len(columns)} columns", number)
+        raise file.fail(f"{len(found)} values are given for {len(columns)} columns", number)
     if len(found) == len(columns):
         cells = {column.name: match.group() for column, match in zip(columns, found, strict=True)}
     else:

@@ -149,11 +149,11 @@ class VolTable:
         return error
 
     def forward(self, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
-        """Where the tip stands, less the tool offset, with the axes at positions (n, 3): shape (n, 3), mm."""
+        """Where the tip is, less the tool offset, with the axes at positions (n, 3): shape (n, 3), mm."""
         return position_mm + self.error(position_mm, tool_mm)
 
     def inverse(self, wanted_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
-        """Axis positions at which the tip stands at ``wanted_mm`` (n, 3), less the tool offset: shape (n, 3), mm.
+        """Axis positions at which the tip is at ``wanted_mm`` (n, 3), less the tool offset: shape (n, 3), mm.
 
         InputError where the iteration does not end: no machine has such errors, and the control refuses to move.
         """
@@ -216,7 +216,7 @@ _MAGIC = ("volcomp", "1")
 
 
 class _WordReader:
-    """The words of a file one by one, with the line they stand in; all that were taken count for the checksum."""
+    """The words of a file one by one, with the line that they are in; all that were taken count for the checksum."""
 
     def __init__(self, source: SourceFile) -> None:
         self.source, self.line, self.taken = source, 1, list[str]()
@@ -243,7 +243,7 @@ class _WordReader:
 
     def number(self, what: str) -> float:
         """Return the next word as a finite number."""
-        word = self.take(what)  # first: it may stand in the next line
+        word = self.take(what)  # first: it may be in the next line
         return number_in(self.source, self.line, word, what)
 
     def whole(self, what: str, low: int, high: int) -> int:

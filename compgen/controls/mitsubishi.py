@@ -68,7 +68,7 @@ def _row(number: int, value: str, meaning: str) -> dict[str, str]:
 
 # Mitsubishi machine error compensation: positioning and relative position errors as a set sheet of whole numbers.
 #
-# What the control is taken to do, and how sure that is, stands in ``templates/mitsubishi/format.toml``.
+# What the control is taken to do, and how sure that is, is in ``templates/mitsubishi/format.toml``.
 
 
 #: The final curve may be steeper than the estimate by this factor: angular errors are spread over the volume.
@@ -288,7 +288,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return found
 
     def _no_longer_used(self, tables: MitsubishiTables) -> list[ControlSet]:
-        """Sets of X, Y, Z in the control's file that hold none of the tables: they would go on acting beside them."""
+        """Sets of X, Y, Z in the control's file that hold none of the tables: they would still act, with the new ones."""
         written = {table.index for table in tables.sets}
         others = self.settings.sample.others(self.settings.axis_names)
         return [item for item in self.settings.sample.sets if item.index not in written and item not in others]

@@ -36,7 +36,7 @@ from compgen.errors import CompgenWarning, InputError
 
 #: Increment or absolute system, for all sets alike; unit of the values.
 SYSTEM, UNIT = 4000, 1006
-#: Parameters of set k stand at these numbers plus 10 (k - 1).
+#: Parameters of set k have these numbers plus 10 (k - 1).
 BASE, OUTPUT, REFERENCE, NEGATIVE, POSITIVE, SCALE, INTERVAL = range(4001, 4008)
 SET_STEP, SETS = 10, 10
 #: Numbers of compensation values: the last one of most controls, and of an M80.
@@ -405,7 +405,7 @@ def read_mitsubishi_settings(machine: Machine) -> MitsubishiSettings:
 #
 #     A[n] = A[n-1] + v[n] on the positive side,   A[n] = A[n+1] - v[n] on the negative side.
 #
-# In the absolute system (#4000 = 0) the value of a point is A itself, but for a constant: what stands at the reference number
+# In the absolute system (#4000 = 0) the value of a point is A itself, but for a constant: the value at the reference number
 # shifts the zero of the axis and nothing else. That system holds for the sets of all axes.
 
 
@@ -461,7 +461,7 @@ class SetTable:
 
 @dataclass(frozen=True)
 class SetShortfall:
-    """How far the limit of the values keeps a table from what was wanted, in counts."""
+    """How far the limit of the values keeps a table from what was requested, in counts."""
 
     output: int
     base: int
@@ -493,7 +493,7 @@ def values_of(curve: NDArray[np.int64], at: int, at_reference: int = 0, *, absol
 def parse_tables(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
     """Read set sheets, or the control's own parameter file; files that end in ``.json`` (the plan) are left out.
 
-    A parameter file beside a sheet must hold the same tables.
+    A parameter file that is given with a sheet must hold the same tables.
     """
     texts = [file for file in files if file.path.suffix.lower() != ".json"]
     if not texts:
@@ -644,7 +644,7 @@ def set_name(table: SetTable) -> str:
 
 
 def shortfall_text(settings: MitsubishiSettings, item: SetShortfall) -> str:
-    """Say that the range of the values keeps a table from what was wanted, and what helps."""
+    """Say that the range of the values keeps a table from what was requested, and what helps."""
     count_um = settings.count_mm((item.output, item.base)) / MM_PER_UM
     return (
         f"the table {one_dimensional_name(item.output, item.base)} is too steep for {HIGHEST_VALUE} counts of "

@@ -263,7 +263,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
     def with_reversal(self, tables: PmacTables, reversal: ReversalCurves) -> PmacTables:
         """Return the tables with Ixx86 and, where the reversal varies, a backlash table and its half in the pitch table.
 
-        With the reversal B the control takes -B off after negative travel, so both directions stand at +B/2 of the
+        With the reversal B the control takes -B off after negative travel, so both directions are at +B/2 of the
         mean; -(B - B at zero)/2 goes into the pitch table, the rest is a constant. B, both halves and "positive" are those
         of the motor: a motor that counts against its axis sees the same B in its counts.
         """

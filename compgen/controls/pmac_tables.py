@@ -29,8 +29,8 @@ PER_COUNT = 16.0
 class CompTable1D:
     """``DEFINE COMP entries,#source,#target,length``: the table of motor ``motor``.
 
-    ``entries`` (n,): the first stands at one spacing (length / n) from the source's zero, where the value is 0 by
-    definition; the last stands at ``length``. ``desired``: over the commanded position of the source.
+    ``entries`` (n,): the first is at one spacing (length / n) from the source's zero, where the value is 0 by
+    definition; the last is at ``length``. ``desired``: over the commanded position of the source.
     """
 
     motor: int
@@ -74,7 +74,7 @@ class CompTable2D:
 
 @dataclass(frozen=True)
 class BacklashTable:
-    """``DEFINE BLCOMP entries,length`` of motor ``motor``: taken off after negative travel only, beside Ixx86."""
+    """``DEFINE BLCOMP entries,length`` of motor ``motor``: taken off after negative travel only, in addition to Ixx86."""
 
     motor: int
     length: int
@@ -149,7 +149,7 @@ class _Open:
 
     @property
     def count(self) -> int:
-        """Number of entries that are due."""
+        """Expected number of entries."""
         if len(self.shape) == 1:
             return self.shape[0]
         return (self.shape[0] + 1) * (self.shape[1] + 1) - 1
@@ -297,7 +297,7 @@ def _joined(readers: Sequence[_DownloadReader]) -> PmacTables:
 def parse_foreign_pmac(files: Sequence[SourceFile]) -> tuple[PmacTables, list[str]]:
     """Return the tables of files that this program did not write, and what was passed over in one line.
 
-    A size may stand before the sources without a comma, entries may be separated by commas, comments hold any character.
+    A size may be before the sources without a comma, entries may be separated by commas, comments hold any character.
     Motion and PLC programs and commands that have nothing to do with tables are passed over; a line with a table or its
     switch that is not understood is an InputError.
     """

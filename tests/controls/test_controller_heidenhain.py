@@ -433,7 +433,7 @@ def test_columns_carry_the_names_of_the_control(tmp_path, make_errors):
         ("0.0020", "nan", 4, "not a number"),
         ("0.0020", "inf", 4, "not a number"),
         ("0.0020     0.0040", "0.0020", 4, "column Z is blank"),
-        ("0.0020     0.0040", "0.0020     0.0040   7", 4, "6 values stand in 5 columns"),
+        ("0.0020     0.0040", "0.0020     0.0040   7", 4, "6 values are given for 5 columns"),
         ("0.0020     0.0040", "           0.0040", 4, "column Y is blank"),
         ("10.0000 ", "-40.0000", 5, "ascend"),
         ("10.0000 ", "-60.0000", 5, "ascend"),

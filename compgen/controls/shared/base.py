@@ -140,7 +140,7 @@ class Controller(ABC, Generic[Settings, Tables]):
     anchored: bool = False
     #: True if tables may act in one direction of travel only, so that a reversal goes into them.
     bidirectional: bool = False
-    #: True if tables are looked up where the axes stand, after the correction, and not at the command.
+    #: True if tables are looked up where the axes are, after the correction, and not at the command.
     at_axes: bool = False
     #: True if the correction is not the sum of the tables: the control moves the chain by finite rotations.
     finite_rotations: bool = False

@@ -73,7 +73,7 @@ def _pieces(position_mm: FloatArray, values: FloatArray) -> tuple[np.ndarray, Fl
     return fits, np.maximum(squares, 0.0)
 
 
-# Node positions for tables: as few as hold the error curves within a wanted loss, equidistant where a control demands it.
+# Node positions for tables: as few as hold the error curves within a requested loss, equidistant where a control demands it.
 
 
 #: Loss by interpolation between table nodes that is not worth another node, as a displacement of the tool.
@@ -86,7 +86,7 @@ RANGE_SHARE = 0.02
 MOST_INTERVALS = 400
 #: Every number of intervals is tried up to this one, then 5 % more each.
 EVERY_COUNT = 60
-#: Where no grid reaches the wanted loss: the coarsest is taken that loses at most this much more than the best.
+#: Where no grid reaches the requested loss: the coarsest is taken that loses at most this much more than the best.
 NEARLY_BEST = 1.25
 #: Where a bent curve is looked at within an interval; no simple fractions, which refined nodes would hit.
 BETWEEN = np.array([0.13, 0.29, 0.41, 0.53, 0.67, 0.79, 0.91])
@@ -338,7 +338,7 @@ def trilinear(vertices: FloatArray, start_mm: FloatArray, step_mm: FloatArray, p
 
     Parameters
     ----------
-    vertices : values (nx, ny, nz, k) in any unit; index [i, j, l] stands at ``start_mm + (i, j, l) step_mm``. An
+    vertices : values (nx, ny, nz, k) in any unit; index [i, j, l] is at ``start_mm + (i, j, l) step_mm``. An
         axis with a single vertex is constant along itself.
     start_mm, step_mm : position of vertex [0, 0, 0] and the (positive) distances, shape (3,), mm.
     position_mm : shape (n, 3), mm; outside the grid the value of its surface holds (clamped).
@@ -407,7 +407,7 @@ def grid_order(
 ) -> tuple[tuple[FloatArray, ...], np.ndarray]:
     """Return the nodes (ascending) of each argument, and the order that sorts the rows into the grid's C order.
 
-    Raises InputError with the line for a position that stands twice, and if positions of the grid are missing.
+    Raises InputError with the line for a position that is given twice, and if positions of the grid are missing.
     """
     if not arguments:
         if len(lines) > 1:

@@ -129,7 +129,7 @@ def error_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatAr
     """Return one term per error for controls that evaluate E = C P themselves in the convention of ISO 230-1.
 
     Values are the errors (mm, rad); the carrier is minus the column of C. The controls know X as the only squareness
-    reference: for a machine with reference Y the squareness EC0Y stands as the slope of EYX, with EC0Y = 0.
+    reference: for a machine with reference Y the squareness EC0Y is taken as the slope of EYX, with EC0Y = 0.
     """
     carriers: dict[str, list[Monomial]] = {}
     for part in coefficients(machine.chain, "X"):
