@@ -339,8 +339,7 @@ def _pose_columns(readings: _Readings, *, free_scale: bool) -> FloatArray:
 def _error_columns(machine: Machine, layout: ErrorParameters, readings: _Readings) -> FloatArray:
     """Derivative of the readings by the unknown errors in the units of :func:`_kinds`, (k, size): rows of C times bases."""
     columns = c_matrix(machine, readings.position_mm, readings.tool_mm)
-    bases = [layout.basis(axis, readings.position_mm[:, axis]) for axis in range(3)]
-    design = layout.design(columns, bases)
+    design = layout.design(columns, layout.bases(readings.position_mm))
     return np.asarray(design[np.arange(len(design)), readings.component] * _kinds(layout)[1])
 
 
@@ -626,10 +625,9 @@ def _problem(
     tools = np.broadcast_to(tool_mm, deviations.position_mm.shape)
     weight = np.zeros(3 * count)
     weight[index] = 1.0 / sigma_mm**2
-    bases = tuple(layout.basis(axis, deviations.position_mm[:, axis]) for axis in range(3))
     return SeparationProblem(
         parameters=layout,
-        bases=bases,  # type: ignore[arg-type]
+        bases=layout.bases(deviations.position_mm),
         position_mm=deviations.position_mm,
         tool_mm=tools,
         measured_mm=deviations.position_mm + tools + np.nan_to_num(deviations.deviation_mm),

@@ -13,12 +13,12 @@ from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths
 from compgen.data.names import MM_PER_UM
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
-from compgen.identify.adjust.problem import LEVER_MM, SeparationProblem, frame_rotation
+from compgen.identify.adjust.problem import LEVER_MM, PointEquations, SeparationProblem, Sights, frame_rotation
 from compgen.identify.adjust.rank import determined_factor
 from compgen.identify.adjust.robust import MOST_ROUNDS, Rejected, accepted_readings, check_rejected
 from compgen.identify.adjust.solver import LeastSquaresSolution, factorise, solve
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State
-from compgen.kinematics.exact_chain import cross_matrices, tip_position
+from compgen.kinematics.exact_chain import cross_matrices
 from compgen.kinematics.first_order import tool_of
 
 # Tracers and points as a network of distances: its normal equations with the points eliminated one by one.
@@ -37,11 +37,6 @@ class Sightings:
     group: IntArray
     length_mm: FloatArray
     sigma_mm: FloatArray
-
-    def taken(self, rows: IntArray) -> Sightings:
-        """Return the readings of these rows, in this order."""
-        where = self.point[rows], self.station[rows], self.group[rows]
-        return Sightings(*where, self.length_mm[rows], self.sigma_mm[rows])
 
 
 @dataclass(frozen=True)
@@ -63,33 +58,27 @@ class Frame:
 
 @dataclass(frozen=True)
 class Network:
-    """Sightings in the order of their points, the first reading of each point (m,), and the free unknowns (q,)."""
+    """Sightings, and the free unknowns of the stations (q,)."""
 
     sightings: Sightings
-    first: IntArray
     free: IntArray
 
 
 @dataclass(frozen=True)
 class Linear:
-    """Readings linearised at a frame: residuals, cost, and the normal equations with the points split off.
+    """Readings linearised at a frame.
 
     Parameters
     ----------
     residual_mm, cost : model minus reading (n,), and half the weighted sum of squares.
-    information, coupling, station_matrix : blocks of points (m, 3, 3), points by stations (m, 3, q), stations (q, q).
-    reduced : stations with the points eliminated, (q, q).
-    point_gradient, station_gradient : (m, 3) and (q,).
+    equations : of the points and the free unknowns of the stations (q,).
+    reduced : of the stations with the points eliminated, (q, q).
     """
 
     residual_mm: FloatArray
     cost: float
-    information: FloatArray
-    coupling: FloatArray
-    station_matrix: FloatArray
+    equations: PointEquations
     reduced: FloatArray
-    point_gradient: FloatArray
-    station_gradient: FloatArray
 
 
 def residuals(data: Network, frame: Frame) -> tuple[FloatArray, FloatArray]:
@@ -111,53 +100,11 @@ def linearise(data: Network, frame: Frame) -> Linear:
     seen = data.sightings
     residual, unit = residuals(data, frame)
     weight = 1.0 / seen.sigma_mm**2
-    points, columns = len(frame.points_mm), frame.stations_mm.size + len(frame.dead_length_mm)
-    outer = weight[:, None, None] * unit[:, :, None] * unit[:, None, :]
-    information = np.add.reduceat(outer, data.first, axis=0)
-    pulled = (weight * residual)[:, None] * unit
-    own = 3 * seen.station[:, None] + np.arange(3)
-    dead = frame.stations_mm.size + seen.group
-    coupling = _scatter(seen.point, own, outer, points, columns)
-    coupling += _scatter(seen.point, dead[:, None], weight[:, None, None] * unit[:, :, None], points, columns)
-    station_matrix = _station_matrix(own, dead, outer, weight[:, None] * unit, columns)
-    gradient = np.zeros(columns)
-    gradient -= np.bincount(own.ravel(), pulled.ravel(), columns)
-    gradient -= np.bincount(dead, weight * residual, columns)
-    free = data.free
-    coupling, station_matrix = -coupling[:, :, free], station_matrix[np.ix_(free, free)]
-    flat = coupling.reshape(-1, len(free))
-    reduced = station_matrix - flat.T @ solved(information, coupling).reshape(-1, len(free))
-    return Linear(
-        residual_mm=residual,
-        cost=0.5 * float(np.dot(weight, residual**2)),
-        information=information,
-        coupling=coupling,
-        station_matrix=station_matrix,
-        reduced=0.5 * (reduced + reduced.T),
-        point_gradient=np.add.reduceat(pulled, data.first, axis=0),
-        station_gradient=gradient[free],
-    )
-
-
-def _station_matrix(
-    own: IntArray, dead: IntArray, outer: FloatArray, weighted_unit: FloatArray, columns: int
-) -> FloatArray:
-    """Block of stations and dead lengths: columns ``own`` (n, 3) and ``dead`` (n,) of each reading."""
-    matrix = np.zeros((columns, columns))
-    np.add.at(matrix, (own[:, :, None], own[:, None, :]), outer)
-    cross = np.zeros((columns, columns))
-    np.add.at(cross, (own, dead[:, None]), weighted_unit)
-    matrix += cross + cross.T
-    weight = np.einsum("nii->n", outer)  # u is a unit vector
-    matrix[np.diag_indices(columns)] += np.bincount(dead, weight, columns)
-    return matrix
-
-
-def _scatter(point: IntArray, column: IntArray, values: FloatArray, points: int, columns: int) -> FloatArray:
-    """Sum values (n, 3, k) into (points, 3, columns) at point (n,) and column (n, k)."""
-    index = (point[:, None, None] * 3 + np.arange(3)[:, None]) * columns + column[:, None, :]
-    summed = np.bincount(index.ravel(), values.ravel(), points * 3 * columns)
-    return np.asarray(summed, dtype=np.float64).reshape(points, 3, columns)
+    counts = len(frame.points_mm), len(frame.stations_mm), len(frame.dead_length_mm)
+    equations = Sights(seen.point, seen.station, seen.group, counts).equations(unit, weight, residual).of(data.free)
+    flat = equations.coupling.reshape(-1, len(data.free))
+    reduced = equations.own - flat.T @ solved(equations.information, equations.coupling).reshape(flat.shape)
+    return Linear(residual, 0.5 * float(np.dot(weight, residual**2)), equations, 0.5 * (reduced + reduced.T))
 
 
 def solved(information: FloatArray, right: FloatArray) -> FloatArray:
@@ -258,25 +205,32 @@ def self_calibrate(sightings: Sightings, start: Frame) -> SelfCalibration:
     ConvergenceError
         if no optimum is reached.
     """
-    order = np.argsort(sightings.point, kind="stable")
     unknowns = np.arange(start.stations_mm.size + len(start.dead_length_mm))
-    data = Network(
-        sightings.taken(order),
-        np.searchsorted(sightings.point[order], np.arange(len(start.points_mm))),
-        np.setdiff1d(unknowns, _fixed_coordinates(start.stations_mm)).astype(np.int64),
-    )
-    frame, step, iterations = _minimise(data, _to_own_frame(start))
-    residual = np.empty(len(order))
-    residual[order] = step.residual_mm
+    # the six zeros of eq. 17 among the coordinates of all stations
+    first, second, third = frame_stations(start.stations_mm)
+    zeros = [3 * first, 3 * first + 1, 3 * first + 2, 3 * second + 1, 3 * second + 2, 3 * third + 2]
+    data = Network(sightings, np.setdiff1d(unknowns, zeros).astype(np.int64))
+    # turned and shifted into that frame
+    origin, along, across = start.stations_mm[[first, second, third]]
+    x = (along - origin) / np.linalg.norm(along - origin)
+    y = (across - origin) - x * float(x @ (across - origin))
+    if (length := float(np.linalg.norm(y))) < 1e-6:
+        raise UndeterminedError("all stations lie on one line; the tracers cannot locate themselves", [])
+    y /= length
+    rotation = np.stack([x, y, np.cross(x, y)])
+    frame = start.moved(rotation, -rotation @ origin)
+    frame.stations_mm.flat[zeros] = 0.0
+    frame, step, iterations = _minimise(data, frame)
+    equations = step.equations
     return SelfCalibration(
         frame=frame,
         free=data.free,
-        information=step.information,
-        lever=-solved(step.information, step.coupling),
+        information=equations.information,
+        lever=-solved(equations.information, equations.coupling),
         station_information=step.reduced,
-        residual_mm=residual,
+        residual_mm=step.residual_mm,
         chi_square=2.0 * step.cost,
-        degrees_of_freedom=len(order) - 3 * len(start.points_mm) - len(data.free),
+        degrees_of_freedom=len(sightings.point) - 3 * len(start.points_mm) - len(data.free),
         iterations=iterations,
     )
 
@@ -290,28 +244,6 @@ def frame_stations(stations_mm: FloatArray) -> tuple[int, int, int]:
     )
     third = int(np.argmax(sine > OFF_THE_LINE)) if np.any(sine > OFF_THE_LINE) else int(np.argmax(sine))
     return 0, 1, 2 + third
-
-
-def _to_own_frame(start: Frame) -> Frame:
-    """Turn and shift into the frame of eq. 17."""
-    origin, second, third = (start.stations_mm[k] for k in frame_stations(start.stations_mm))
-    x = (second - origin) / np.linalg.norm(second - origin)
-    y = (third - origin) - x * float(x @ (third - origin))
-    length = float(np.linalg.norm(y))
-    if length < 1e-6:
-        raise UndeterminedError("all stations lie on one line; the tracers cannot locate themselves", [])
-    y /= length
-    rotation = np.stack([x, y, np.cross(x, y)])
-    frame = start.moved(rotation, -rotation @ origin)
-    coordinates = frame.stations_mm.ravel()
-    coordinates[_fixed_coordinates(start.stations_mm)] = 0.0
-    return replace(frame, stations_mm=coordinates.reshape(-1, 3))
-
-
-def _fixed_coordinates(stations_mm: FloatArray) -> list[int]:
-    """Places of the six zeros of eq. 17 among the coordinates of all stations."""
-    first, second, third = frame_stations(stations_mm)
-    return [3 * first, 3 * first + 1, 3 * first + 2, 3 * second + 1, 3 * second + 2, 3 * third + 2]
 
 
 def _minimise(data: Network, start: Frame) -> tuple[Frame, Linear, int]:
@@ -339,17 +271,18 @@ def _minimise(data: Network, start: Frame) -> tuple[Frame, Linear, int]:
 
 def _step(linear: Linear, damping: float) -> tuple[FloatArray, FloatArray]:
     """Steps of the points (m, 3) and of the free unknowns of the stations (q,)."""
-    information, reduced = linear.information, linear.reduced
-    flat = linear.coupling.reshape(-1, linear.coupling.shape[2])
+    equations, reduced = linear.equations, linear.reduced
+    information, coupling = equations.information, equations.coupling
+    flat = coupling.reshape(-1, coupling.shape[2])
     if damping:
         information = information * (1.0 + damping * np.eye(3))
-        damped = linear.station_matrix + damping * np.diag(np.diag(linear.station_matrix))
-        reduced = damped - flat.T @ solved(information, linear.coupling).reshape(flat.shape)
-    own = solved(information, linear.point_gradient[:, :, None])[:, :, 0]
+        damped = equations.own + damping * np.diag(np.diag(equations.own))
+        reduced = damped - flat.T @ solved(information, coupling).reshape(flat.shape)
+    own = solved(information, equations.force[:, :, None])[:, :, 0]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), 1e-300))
-    right = (linear.station_gradient - flat.T @ own.ravel()) * scale
+    right = (equations.own_force - flat.T @ own.ravel()) * scale
     stations = -scale * np.linalg.solve(reduced * np.outer(scale, scale), right)
-    moved = solved(information, (linear.coupling @ stations)[:, :, None])[:, :, 0]
+    moved = solved(information, (coupling @ stations)[:, :, None])[:, :, 0]
     return -own - moved, stations
 
 
@@ -362,15 +295,15 @@ def _moved(frame: Frame, points: FloatArray, stations: FloatArray, free: IntArra
 
 def _check_rank(linear: Linear, data: Network) -> None:
     """UndeterminedError if the points leave more of the stations open than the frame of eq. 17."""
-    freedom = len(linear.residual_mm) - linear.point_gradient.size - len(data.free)
-    if freedom < 0:
+    coordinates = linear.equations.force.size
+    if len(linear.residual_mm) < coordinates + len(data.free):
         raise UndeterminedError(
-            f"the self-calibration has {len(linear.residual_mm)} readings for {linear.point_gradient.size} coordinates "
+            f"the self-calibration has {len(linear.residual_mm)} readings for {coordinates} coordinates "
             f"of points and {len(data.free)} unknowns of the stations; more points seen by four stations are needed, or "
             "the joint method, which needs no point of its own",
             [],
         )
-    scale = 1.0 / np.sqrt(np.diag(linear.station_matrix))
+    scale = 1.0 / np.sqrt(np.diag(linear.equations.own))
     eigenvalues = np.linalg.eigvalsh(linear.reduced * np.outer(scale, scale))
     open_directions = int(np.count_nonzero(eigenvalues < ZERO_EIGENVALUE))
     if open_directions:
@@ -593,27 +526,16 @@ def locate_points(readings: TracerReadings, poses: FloatArray, pose: IntArray, r
     measured = placement.apply(calibration.frame.points_mm)
     shared = calibration.station_covariance()
     covariance = placed_covariance(turn @ own @ turn.T, turn @ calibration.lever, shared, measured, weight)
-    deviations = _deviations(readings, position_mm, tool_mm, measured, covariance)
-    return Located(
-        rows, point, position_mm, tool_mm, calibration, placement, anchor is not None, deviations, covariance
-    )
-
-
-def _deviations(
-    readings: TracerReadings,
-    position_mm: FloatArray,
-    tool_mm: FloatArray,
-    measured_mm: FloatArray,
-    covariance: FloatArray,
-) -> Deviations:
-    lengths = readings.lengths
     kept = {key: lengths.metadata[key] for key in ("date",) if key in lengths.metadata}
-    return Deviations(
+    deviations = Deviations(
         position_mm=position_mm,
-        deviation_mm=measured_mm - position_mm - tool_mm,
+        deviation_mm=measured - position_mm - tool_mm,
         u_mm=np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)),
         tool_mm=None if lengths.tool_mm is None else tool_mm,
         metadata={"machine": readings.layout.machine.name, **kept, "source": "compgen identify"},
+    )
+    return Located(
+        rows, point, position_mm, tool_mm, calibration, placement, anchor is not None, deviations, covariance
     )
 
 
@@ -656,37 +578,49 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
     for _ in range(MOST_ROUNDS):
         used = keep & locatable_readings(readings, pose, keep)
         located = locate_points(readings, poses, pose, np.flatnonzero(used))
-        problem = _separation(readings, located)
+        turn, calibration = located.placement.rotation, located.calibration
+        problem = SeparationProblem(
+            parameters=readings.layout,
+            position_mm=located.position_mm,
+            tool_mm=located.tool_mm,
+            bases=readings.layout.bases(located.position_mm),
+            measured_mm=located.measured_mm,
+            information=turn @ calibration.information @ turn.T,
+            lever=turn @ calibration.lever,
+            station_information=calibration.station_information,
+        )
         solution = _solve(problem, located, readings)
-        state = _joint_state(problem, solution.state, located)
-        residual = _length_residuals(readings, poses, pose, state)
+        joint = _joint(problem, solution, located, float(readings.sigma_mm.min()))
+        state = joint.state
+        # also of the readings that were not used
+        sight = readings.layout.tips(state.errors, poses[:, :3], poses[:, 3:])[pose]
+        sight = sight - state.stations_mm[readings.lengths.station]
+        distance = np.linalg.norm(sight, axis=1)
+        residual = distance - state.dead_length_mm[readings.group] - readings.lengths.length_mm
         lonely = np.flatnonzero(keep & ~used)
         again = accepted_readings(residual / readings.sigma_mm) if reject else keep
         check_rejected(again, TOO_MANY)
         if np.array_equal(again, keep):
             break
         keep = again
+    lengths, rejected = readings.lengths, []
+    for row in lonely.tolist():
+        rejected.append(
+            Rejected(
+                row,
+                lengths.stations[lengths.station[row]],
+                str(lengths.point[row]),
+                float(-residual[row]) / MM_PER_UM,
+                "fewer than three stations see its point, so that it cannot be located; the joint method uses the reading",
+                *(lengths.origin[row] if lengths.origin else ("", 0)),
+            )
+        )
     return TwoSteps(
-        solution=_joint_solution(problem, solution, located, state, float(readings.sigma_mm.min())),
+        solution=joint,
         accepted=used,
-        rejected=_not_located(readings.lengths, lonely, residual),
+        rejected=tuple(rejected),
         located=located,
         summary=_summary(readings, located, solution),
-    )
-
-
-def _separation(readings: TracerReadings, located: Located) -> SeparationProblem:
-    turn, calibration = located.placement.rotation, located.calibration
-    bases = tuple(readings.layout.basis(axis, located.position_mm[:, axis]) for axis in range(3))
-    return SeparationProblem(
-        parameters=readings.layout,
-        bases=bases,  # type: ignore[arg-type]
-        position_mm=located.position_mm,
-        tool_mm=located.tool_mm,
-        measured_mm=located.measured_mm,
-        information=turn @ calibration.information @ turn.T,
-        lever=turn @ calibration.lever,
-        station_information=calibration.station_information,
     )
 
 
@@ -703,66 +637,41 @@ def _solve(problem: SeparationProblem, located: Located, readings: TracerReading
     return solve(problem, problem.start, factor)
 
 
-def _joint_state(problem: SeparationProblem, state: State, located: Located) -> State:
-    """Errors, stations and dead lengths in the machine frame."""
-    calibration = located.calibration
+def _joint(
+    problem: SeparationProblem, solution: LeastSquaresSolution, located: Located, sigma_mm: float
+) -> LeastSquaresSolution:
+    """The same optimum with the joint method's unknowns; readings of ``sigma_mm`` get weight 1.
+
+    Stations s and dead lengths d in the machine frame follow from those of the tracers' frame, b their errors, by the
+    placement (t, w) of that frame about the centre c: s = R(w) (R_0 (s_0 + b) + t_0 - c) + c + t. The normal matrix is
+    that of the separation, with the derivative of (s, d) by (t, w, b) in place.
+    """
+    state, calibration, placement = solution.state, located.calibration, located.placement
     frame = calibration.frame
     everything = np.concatenate([frame.stations_mm.ravel(), frame.dead_length_mm])
     everything[calibration.free] += state.dead_length_mm
-    split = frame.stations_mm.size
-    stations = located.placement.apply(everything[:split].reshape(-1, 3)) - problem.centre_mm
-    turned = stations @ frame_rotation(-state.stations_mm[1])[0]
-    return State(state.errors, turned + problem.centre_mm + state.stations_mm[0], everything[split:])
+    split, count = frame.stations_mm.size, len(frame.stations_mm)
+    shift = state.stations_mm[0]
+    turn_back, _ = frame_rotation(-state.stations_mm[1])
+    turned = (placement.apply(everything[:split].reshape(-1, 3)) - problem.centre_mm) @ turn_back
+    joint = State(state.errors, turned + problem.centre_mm + shift, everything[split:])
 
-
-def _joint_solution(
-    problem: SeparationProblem, solution: LeastSquaresSolution, located: Located, state: State, sigma_mm: float
-) -> LeastSquaresSolution:
-    """The same optimum with the joint method's unknowns; readings of ``sigma_mm`` get weight 1."""
+    forward, jacobian = frame_rotation(state.stations_mm[1])
+    turn = np.eye(len(everything))
+    turn[:split, :split] = np.kron(np.eye(count), forward @ placement.rotation)
+    arms = cross_matrices(joint.stations_mm - problem.centre_mm - shift)
     size, errors = problem.size, problem.parameters.size
     change = np.eye(size)
-    change[errors:, errors:] = _station_derivative(problem, solution.state, located, state)
+    change[errors:, errors:] = 0.0
+    change[errors : errors + split, errors : errors + 3] = np.tile(np.eye(3), (count, 1))
+    change[errors : errors + split, errors + 3 : errors + 6] = (-arms @ jacobian).reshape(-1, 3) / LEVER_MM
+    change[errors:, errors + 6 :] = turn[:, calibration.free]
     back = np.linalg.inv(change)
-    matrix = back.T @ problem.normal_matrix(solution.state) @ back * sigma_mm**2
+    matrix = back.T @ problem.normal_matrix(state) @ back * sigma_mm**2
     factor = factorise(0.5 * (matrix + matrix.T))
     return LeastSquaresSolution(
-        state, solution.cost * sigma_mm**2, factor, solution.iterations, solution.factorisations
+        joint, solution.cost * sigma_mm**2, factor, solution.iterations, solution.factorisations
     )
-
-
-def _station_derivative(problem: SeparationProblem, state: State, located: Located, joint: State) -> FloatArray:
-    """Derivative of stations and dead lengths in the machine frame by placement and b, (6 + q, 6 + q)."""
-    forward, jacobian = frame_rotation(state.stations_mm[1])
-    stations = len(joint.stations_mm)
-    derivative = np.zeros((3 * stations + len(joint.dead_length_mm), 6 + len(state.dead_length_mm)))
-    arms = cross_matrices(joint.stations_mm - problem.centre_mm - state.stations_mm[0])
-    derivative[: 3 * stations, :3] = np.tile(np.eye(3), (stations, 1))
-    derivative[: 3 * stations, 3:6] = (-arms @ jacobian).reshape(-1, 3) / LEVER_MM
-    turn = np.eye(len(derivative))
-    turn[: 3 * stations, : 3 * stations] = np.kron(np.eye(stations), forward @ located.placement.rotation)
-    derivative[:, 6:] = turn[:, located.calibration.free]
-    return derivative
-
-
-def _length_residuals(readings: TracerReadings, poses: FloatArray, pose: IntArray, state: State) -> FloatArray:
-    """Model minus reading of every reading, also of those that were not used, (n,), mm."""
-    layout = readings.layout
-    values = layout.values(state.errors, [layout.basis(axis, poses[:, axis]) for axis in range(3)])
-    tip = tip_position(layout.machine, values, poses[:, :3], poses[:, 3:])
-    distance = np.linalg.norm(tip[pose] - state.stations_mm[readings.lengths.station], axis=1)
-    return np.asarray(distance - state.dead_length_mm[readings.group] - readings.lengths.length_mm)
-
-
-def _not_located(lengths: Lengths, rows: IntArray, residual_mm: FloatArray) -> tuple[Rejected, ...]:
-    """TracerReadings of points that fewer than three stations see."""
-    reason = "fewer than three stations see its point, so that it cannot be located; the joint method uses the reading"
-    found = []
-    for row in rows.tolist():
-        file, line = lengths.origin[row] if lengths.origin else ("", 0)
-        station = lengths.stations[lengths.station[row]]
-        residual_um = float(-residual_mm[row]) / MM_PER_UM
-        found.append(Rejected(row, station, str(lengths.point[row]), residual_um, reason, file, line))
-    return tuple(found)
 
 
 def _summary(readings: TracerReadings, located: Located, solution: LeastSquaresSolution) -> dict[str, Any]:

@@ -78,7 +78,7 @@ class Planned:
     ) -> FloatArray:
         """Derivative of E by the unknown errors at commanded points (n, 3): C B, shape (n, 3, errors)."""
         chosen = layout or self.problem.parameters
-        bases = [chosen.basis(axis, position_mm[:, axis]) for axis in range(3)]
+        bases = chosen.bases(position_mm)
         return chosen.design(c_matrix(self.machine, position_mm, tool_mm), bases)
 
     def nodes_without_data(self) -> dict[str, list[float]]:

@@ -1,7 +1,8 @@
-"""The least-squares problems with the exact machine model: tracer lengths (Zha & Zhang 2024, eq. 22) and measured positions."""
+"""The least-squares problems with the exact machine model, lengths and positions, and their normal equations."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,44 +10,169 @@ import numpy as np
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.data.names import ERROR_INDEX
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State
 from compgen.kinematics.exact_chain import cross_matrices, exact_columns, level_rotations, tip_position
 from compgen.kinematics.first_order import tool_of
 
-# The least-squares problem of the tracer lengths (Zha & Zhang 2024, eq. 22) with the exact machine model.
+# Normal equations point by point, for lengths, positions, and networks of distances alike.
 #
-# Reading = |tip - station| - dead length. A row of the Jacobian is [u^T D B, -u^T, -1] with u the unit line of sight,
-# D the derivative of the tip by the 21 errors and B the curve basis. The block of the errors depends on the stations
-# only through G = sum over readings of w u u^T at a pose, so it is assembled per pose, whatever the number of readings.
+# A reading says something about one point p, which moves by dx, and about the unknowns q of the instrument:
+#
+#     r = r0 + u . dx + a . dq        minimise sum of w r^2
+#
+# Only five sums are needed, whatever the number of readings: U = sum w u u^T and K = sum w u a^T of each point, and
+# N = sum w a a^T; f = sum w r0 u of each point, and g = sum w r0 a. Where points move with the errors P of the machine,
+# dx = D dP, the normal equations are
+#
+#     | sum D^T U D   sum D^T K |          | sum D^T f |
+#     | sum K^T D         N     |   and    |     g     |
+#
+# Where every point is unknown (self-calibration), the points are eliminated: N - sum K^T U^-1 K.
+
+
+@dataclass(frozen=True)
+class PointEquations:
+    """The five sums, of m points and q unknowns of the instrument.
+
+    Parameters
+    ----------
+    information, coupling, force : U (m, 3, 3), K (m, 3, q) and f (m, 3).
+    own, own_force : N (q, q) and g (q,).
+    """
+
+    information: FloatArray
+    coupling: FloatArray
+    force: FloatArray
+    own: FloatArray
+    own_force: FloatArray
+
+    def add_to(self, design: FloatArray, matrix: FloatArray, gradient: FloatArray) -> None:
+        """Add the normal matrix (k + q, k + q) and the gradient (k + q,) for points that move by ``design`` D (m, 3, k)."""
+        count = design.shape[2]
+        flat = design.reshape(-1, count)
+        matrix[:count, :count] += flat.T @ (self.information @ design).reshape(flat.shape)
+        cross = flat.T @ self.coupling.reshape(len(flat), -1)
+        matrix[:count, count:] += cross
+        matrix[count:, :count] += cross.T
+        matrix[count:, count:] += self.own
+        self.add_gradient(design, gradient)
+
+    def add_gradient(self, design: FloatArray, gradient: FloatArray) -> None:
+        """Add the gradient alone."""
+        count = design.shape[2]
+        gradient[:count] += design.reshape(-1, count).T @ self.force.ravel()
+        gradient[count:] += self.own_force
+
+    def of(self, columns: IntArray) -> PointEquations:
+        """Return the equations of some of the instrument's unknowns; the others are fixed."""
+        own = self.own[np.ix_(columns, columns)]
+        return PointEquations(self.information, self.coupling[:, :, columns], self.force, own, self.own_force[columns])
+
+
+def summed(values: FloatArray, index: IntArray, count: int) -> FloatArray:
+    """Sum values (n, ...) with the same index (n,) below ``count``: shape (count, ...)."""
+    flat = values.reshape(len(values), -1)
+    sums = [np.bincount(index, flat[:, k], count) for k in range(flat.shape[1])]
+    return np.stack(sums, axis=1).astype(np.float64, copy=False).reshape(count, *values.shape[1:])
+
+
+@dataclass(frozen=True)
+class Sights:
+    """n readings along lines of sight: point, station and dead length of each, with their numbers in all.
+
+    ``point``, ``station``, ``group`` (n,) are indices below ``counts``.
+    """
+
+    point: IntArray
+    station: IntArray
+    group: IntArray
+    counts: tuple[int, int, int]
+
+    def equations(self, unit: FloatArray, weight: FloatArray, residual: FloatArray) -> PointEquations:
+        """Return the sums for unit vectors (n, 3) from station to point, weights (n,) and model minus reading (n,).
+
+        A point adds u to the derivative of a reading, its station -u, its dead length -1.
+        """
+        points, stations, groups = self.counts
+        along = weight[:, None] * unit
+        outer = along[:, :, None] * unit[:, None, :]
+        pulled = residual[:, None] * along
+        by_station = summed(outer, self.point * stations + self.station, points * stations)
+        by_station = by_station.reshape(points, stations, 3, 3)
+        by_group = summed(along, self.point * groups + self.group, points * groups).reshape(points, groups, 3)
+        own = np.zeros((3 * stations + groups, 3 * stations + groups))
+        for k, block in enumerate(by_station.sum(axis=0)):
+            own[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = block
+        cross = summed(along, self.station * groups + self.group, stations * groups).reshape(stations, groups, 3)
+        own[: 3 * stations, 3 * stations :] = cross.transpose(0, 2, 1).reshape(-1, groups)
+        own[3 * stations :, : 3 * stations] = own[: 3 * stations, 3 * stations :].T
+        dead = np.arange(3 * stations, len(own))
+        own[dead, dead] = np.bincount(self.group, weight, groups)
+        by_places = by_station.transpose(0, 2, 1, 3).reshape(points, 3, -1)
+        return PointEquations(
+            information=by_station.sum(axis=1),
+            coupling=-np.concatenate([by_places, by_group.transpose(0, 2, 1)], axis=2),
+            force=summed(pulled, self.point, points),
+            own=own,
+            own_force=-np.concatenate(
+                [summed(pulled, self.station, stations).ravel(), np.bincount(self.group, weight * residual, groups)]
+            ),
+        )
+
+
+# What problems at poses of the machine have in common: tips and their derivatives, in chunks of constant memory.
 
 
 CHUNK_POSES = 2048
 
 
 @dataclass(frozen=True)
-class LengthProblem:
+class Poses:
+    """The unknown errors and m poses of the machine: positions, tools (m, 3), and the curve bases there."""
+
+    parameters: ErrorParameters
+    bases: tuple[FloatArray, FloatArray, FloatArray]
+    position_mm: FloatArray
+    tool_mm: FloatArray
+
+    def tip_mm(self, state: State) -> FloatArray:
+        """Tips of the model in the machine frame, (m, 3)."""
+        values = self.parameters.values(state.errors, self.bases)
+        return tip_position(self.parameters.machine, values, self.position_mm, self.tool_mm)
+
+    def chunks(self, state: State) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
+        """Poses, tips (p, 3) and derivatives of the tips by the unknown errors (p, 3, size)."""
+        for first in range(0, len(self.position_mm), CHUNK_POSES):
+            rows = slice(first, first + CHUNK_POSES)
+            bases = [basis[rows] for basis in self.bases]
+            values = self.parameters.values(state.errors, bases)
+            tip, columns = exact_columns(self.parameters.machine, values, self.position_mm[rows], self.tool_mm[rows])
+            yield rows, tip, self.parameters.design(columns, bases)
+
+
+# The least-squares problem of the tracer lengths (Zha & Zhang 2024, eq. 22) with the exact machine model:
+#
+#     reading = |tip - station| - dead length
+
+
+@dataclass(frozen=True)
+class LengthProblem(Poses):
     """Readings by pose and station; n readings, m poses (distinct positions with distinct tools).
 
     Parameters
     ----------
-    parameters : the unknown errors.
-    position_mm, tool_mm : poses, each (m, 3).
+    parameters, position_mm, tool_mm, bases : as for :class:`Poses`.
     pose, station, group : index of pose, station and dead length of each reading, each (n,).
     length_mm : readings, (n,).
     weight : 1/variance of each reading in 1/mm^2, zero for a rejected one, (n,).
     known : stations whose coordinates were observed as well.
     """
 
-    parameters: ErrorParameters
-    position_mm: FloatArray
-    tool_mm: FloatArray
     pose: IntArray
     station: IntArray
     group: IntArray
     length_mm: FloatArray
     weight: FloatArray
-    bases: tuple[FloatArray, FloatArray, FloatArray]
     known: KnownPositions | None = None
 
     @property
@@ -70,89 +196,40 @@ class LengthProblem:
 
     def residuals(self, state: State) -> FloatArray:
         """Model minus reading, shape (n,), mm."""
-        values = self.parameters.values(state.errors, self.bases)
-        tip = tip_position(self.parameters.machine, values, self.position_mm, self.tool_mm)
-        distance = np.linalg.norm(tip[self.pose] - state.stations_mm[self.station], axis=1)
-        return np.asarray(distance - state.dead_length_mm[self.group] - self.length_mm)
+        return np.asarray(self.distances(state) - state.dead_length_mm[self.group] - self.length_mm)
 
     def distances(self, state: State) -> FloatArray:
         """Distance from the station of every reading, shape (n,), mm."""
-        still = State(state.errors, state.stations_mm, np.zeros_like(state.dead_length_mm))
-        return self.residuals(still) + self.length_mm
+        sight = self.tip_mm(state)[self.pose] - state.stations_mm[self.station]
+        return np.asarray(np.linalg.norm(sight, axis=1))
 
     def evaluate(self, state: State) -> tuple[float, FloatArray]:
         """Half the weighted sum of squares, and its gradient (size,)."""
-        cost, gradient = 0.5 * float(np.dot(self.weight, self.residuals(state) ** 2)), self.normal_equations(state)[1]
+        cost, gradient = 0.5 * float(np.dot(self.weight, self.residuals(state) ** 2)), np.zeros(self.size)
+        for equations, design in self._equations(state):
+            equations.add_gradient(design, gradient)
         return cost + (self.known.add_gradient(state, gradient) if self.known else 0.0), gradient
 
     def normal_matrix(self, state: State) -> FloatArray:
         """J^T W J (size, size) with the exact derivative at ``state``."""
-        matrix, _ = self.normal_equations(state)
+        matrix, gradient = np.zeros((self.size, self.size)), np.zeros(self.size)
+        for equations, design in self._equations(state):
+            equations.add_to(design, matrix, gradient)
         if self.known:
             self.known.add_weight(state, matrix)
         return matrix
 
-    def normal_equations(self, state: State) -> tuple[FloatArray, FloatArray]:
-        """Normal matrix J^T W J (size, size) and gradient J^T W r (size,) of the readings, derivative at ``state``."""
-        matrix = np.zeros((self.size, self.size))
-        gradient = np.zeros(self.size)
+    def _equations(self, state: State) -> Iterator[tuple[PointEquations, FloatArray]]:
         order = np.argsort(self.pose, kind="stable")
-        bounds = np.searchsorted(self.pose[order], np.arange(0, len(self.position_mm) + CHUNK_POSES, CHUNK_POSES))
-        for chunk, (first, last) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
-            poses = slice(chunk * CHUNK_POSES, (chunk + 1) * CHUNK_POSES)
-            self._add_chunk(matrix, gradient, state, poses, order[first:last])
-        lower = np.tril_indices(self.size, -1)
-        matrix[lower] = matrix.T[lower]
-        return matrix, gradient
-
-    def _add_chunk(self, matrix: FloatArray, gradient: FloatArray, state: State, poses: slice, rows: IntArray) -> None:
-        bases = [basis[poses] for basis in self.bases]
-        values = self.parameters.values(state.errors, bases)
-        tip, columns = exact_columns(self.parameters.machine, values, self.position_mm[poses], self.tool_mm[poses])
-        design = self.parameters.design(columns, bases)
-        count, errors = len(tip), self.parameters.size
-        local, station, group = self.pose[rows] - poses.start, self.station[rows], self.group[rows]
-        sight = tip[local] - state.stations_mm[station]
-        distance = np.linalg.norm(sight, axis=1)
-        unit = sight / distance[:, None]
-        residual = distance - state.dead_length_mm[group] - self.length_mm[rows]
-        weight = self.weight[rows]
-        outer = weight[:, None, None] * unit[:, :, None] * unit[:, None, :]
-
-        by_station = np.zeros((count, self.stations, 3, 3))
-        np.add.at(by_station, (local, station), outer)
-        by_group = np.zeros((count, self.groups, 3))
-        np.add.at(by_group, (local, group), weight[:, None] * unit)
-        pulled = np.zeros((count, 3))
-        np.add.at(pulled, local, (weight * residual)[:, None] * unit)
-
-        flat = design.reshape(3 * count, errors)
-        seen = np.einsum("pab,pbk->pak", by_station.sum(axis=1), design).reshape(3 * count, errors)
-        s0, g0 = errors, errors + 3 * self.stations
-        matrix[:s0, :s0] += flat.T @ seen
-        matrix[:s0, s0:g0] -= flat.T @ by_station.transpose(0, 2, 1, 3).reshape(3 * count, -1)
-        matrix[:s0, g0:] -= flat.T @ by_group.transpose(0, 2, 1).reshape(3 * count, -1)
-        gradient[:s0] += flat.T @ pulled.ravel()
-        self._add_stations(matrix, gradient, rows, unit, residual)
-
-    def _add_stations(
-        self, matrix: FloatArray, gradient: FloatArray, rows: IntArray, unit: FloatArray, residual: FloatArray
-    ) -> None:
-        s0, g0 = self.parameters.size, self.parameters.size + 3 * self.stations
-        weight, station, group = self.weight[rows], self.station[rows], self.group[rows]
-        outer = np.zeros((self.stations, 3, 3))
-        np.add.at(outer, station, weight[:, None, None] * unit[:, :, None] * unit[:, None, :])
-        for k in range(self.stations):
-            block = slice(s0 + 3 * k, s0 + 3 * k + 3)
-            matrix[block, block] += outer[k]
-        cross = np.zeros((self.stations, self.groups, 3))
-        np.add.at(cross, (station, group), weight[:, None] * unit)
-        matrix[s0:g0, g0:] += cross.transpose(0, 2, 1).reshape(-1, self.groups)
-        matrix[range(g0, self.size), range(g0, self.size)] += np.bincount(group, weight, self.groups)
-        pulled = np.zeros((self.stations, 3))
-        np.add.at(pulled, station, (weight * residual)[:, None] * unit)
-        gradient[s0:g0] -= pulled.ravel()
-        gradient[g0:] -= np.bincount(group, weight * residual, self.groups)
+        sorted_pose = self.pose[order]
+        for poses, tip, design in self.chunks(state):
+            rows = order[slice(*np.searchsorted(sorted_pose, [poses.start, poses.stop]).tolist())]
+            local, station, group = self.pose[rows] - poses.start, self.station[rows], self.group[rows]
+            sight = tip[local] - state.stations_mm[station]
+            distance = np.linalg.norm(sight, axis=1)
+            residual = distance - state.dead_length_mm[group] - self.length_mm[rows]
+            sights = Sights(local, station, group, (len(tip), self.stations, self.groups))
+            yield sights.equations(sight / distance[:, None], self.weight[rows], residual), design
 
 
 def length_problem(
@@ -168,18 +245,16 @@ def length_problem(
     if group is None:
         setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
         _, group = np.unique(np.column_stack([lengths.station, setup]), axis=0, return_inverse=True)
-    position_mm = unique[:, :3]
-    bases = tuple(parameters.basis(axis, position_mm[:, axis]) for axis in range(3))
     return LengthProblem(
         parameters=parameters,
-        position_mm=position_mm,
+        position_mm=unique[:, :3],
         tool_mm=unique[:, 3:],
+        bases=parameters.bases(unique[:, :3]),
         pose=pose.ravel().astype(np.int64),
         station=lengths.station,
         group=group.ravel().astype(np.int64),
         length_mm=lengths.length_mm,
         weight=np.ones(len(lengths)),
-        bases=bases,  # type: ignore[arg-type]
     )
 
 
@@ -198,13 +273,12 @@ def length_problem(
 # correlation between the points counts in full, and nothing larger than the unknowns is ever inverted.
 
 
-CHUNK_POINTS = 2048
 #: The unknown rotation of the frame is counted in mm at this lever, as the solver counts angles.
 LEVER_MM = 1000.0
 
 
 @dataclass(frozen=True)
-class SeparationProblem:
+class SeparationProblem(Poses):
     """Positions measured at m poses; it has the interface of :class:`compgen.identify.adjust.unknowns.LeastSquaresProblem`.
 
     In the state, ``stations_mm`` (2, 3) holds translation and rotation vector (times 1000 mm) of the frame, and
@@ -212,17 +286,12 @@ class SeparationProblem:
 
     Parameters
     ----------
-    parameters, bases : the unknown errors and the curve bases at the poses.
-    position_mm, tool_mm : poses, each (m, 3).
+    parameters, position_mm, tool_mm, bases : as for :class:`Poses`.
     measured_mm : measured tip positions (m, 3), the placement known roughly.
     information : U_j, (m, 3, 3), 1/mm^2; zero in the directions that were not measured.
     lever, station_information : L_j (m, 3, q) and B (q, q).
     """
 
-    parameters: ErrorParameters
-    bases: tuple[FloatArray, FloatArray, FloatArray]
-    position_mm: FloatArray
-    tool_mm: FloatArray
     measured_mm: FloatArray
     information: FloatArray
     lever: FloatArray
@@ -248,74 +317,58 @@ class SeparationProblem:
         root = np.sqrt(weight).reshape(-1, 3)
         return replace(self, information=root[:, :, None] * self.information * root[:, None, :])
 
-    def tip_mm(self, state: State) -> FloatArray:
-        """Tips of the model in the machine frame, (m, 3)."""
-        values = self.parameters.values(state.errors, self.bases)
-        return tip_position(self.parameters.machine, values, self.position_mm, self.tool_mm)
-
     def residuals(self, state: State) -> FloatArray:
         """Model minus measured, components of each point one after another, (3 m,), mm."""
-        return self._rest(state, self._seen(state, self.tip_mm(state))).ravel()
+        everything = slice(None)
+        return self._rest(state, everything, self._seen(state, self.tip_mm(state))).ravel()
 
     def _seen(self, state: State, tip_mm: FloatArray) -> FloatArray:
         """Tips as vectors from the centre in the measured frame, (m, 3)."""
         return np.asarray((tip_mm - self.centre_mm - state.stations_mm[0]) @ frame_rotation(-state.stations_mm[1])[0].T)
 
-    def _rest(self, state: State, seen: FloatArray) -> FloatArray:
-        return seen + self.centre_mm - self.measured_mm - self.lever @ state.dead_length_mm
+    def _rest(self, state: State, rows: slice, seen: FloatArray) -> FloatArray:
+        return seen + self.centre_mm - self.measured_mm[rows] - self.lever[rows] @ state.dead_length_mm
 
     def evaluate(self, state: State) -> tuple[float, FloatArray]:
         """Half the weighted sum of squares, and its exact gradient (size,)."""
-        values = self.parameters.values(state.errors, self.bases)
-        tip, columns = exact_columns(self.parameters.machine, values, self.position_mm, self.tool_mm)
-        seen = self._seen(state, tip)
-        rest = self._rest(state, seen)
-        force = np.einsum("mij,mj->mi", self.information, rest)
-        back, jacobian = frame_rotation(-state.stations_mm[1])
-        held = self.station_information @ state.dead_length_mm
-        cost = 0.5 * (float(np.vdot(force, rest)) + float(state.dead_length_mm @ held))
-        pull = force @ back  # forces on the tips, in the machine frame
+        rest = self.residuals(state).reshape(-1, 3)
+        own = self.station_information @ state.dead_length_mm
+        cost = 0.5 * float(np.einsum("mi,mij,mj->", rest, self.information, rest) + state.dead_length_mm @ own)
         gradient = np.zeros(self.size)
-        first = self.parameters.size
-        gradient[:first] = self._by_errors(np.einsum("mi,mie->me", pull, columns))
-        gradient[first : first + 3] = -pull.sum(axis=0)
-        gradient[first + 3 : first + 6] = jacobian.T @ -np.cross(seen, force).sum(axis=0) / LEVER_MM
-        gradient[first + 6 :] = held - np.einsum("miq,mi->q", self.lever, force)
+        for equations, design in self._equations(state):
+            equations.add_gradient(design, gradient)
+        gradient[self.parameters.size + 6 :] += own
         return cost, gradient
-
-    def _by_errors(self, by_value: FloatArray) -> FloatArray:
-        """Gradient by the unknown errors from that by the 21 values at each pose (m, 21)."""
-        gradient = np.zeros(self.parameters.size)
-        for curve in self.parameters.curves:
-            nodal = self.bases[curve.error.axis].T @ by_value[:, ERROR_INDEX[curve.error.name]]
-            gradient[curve.columns] = curve.free.T @ nodal
-        for k, name in enumerate(
-            self.parameters.squareness, start=self.parameters.size - len(self.parameters.squareness)
-        ):
-            gradient[k] = by_value[:, ERROR_INDEX[name]].sum()
-        return gradient
 
     def normal_matrix(self, state: State) -> FloatArray:
         """J^T W J (size, size) with the exact derivative at ``state``."""
-        matrix = np.zeros((self.size, self.size))
-        values = self.parameters.values(state.errors, self.bases)
-        for first in range(0, len(self.position_mm), CHUNK_POINTS):
-            rows = slice(first, first + CHUNK_POINTS)
-            jacobian = self._jacobian(state, values[rows], rows)
-            seen = self.information[rows] @ jacobian
-            matrix += jacobian.reshape(-1, self.size).T @ seen.reshape(-1, self.size)
+        matrix, gradient = np.zeros((self.size, self.size)), np.zeros(self.size)
+        for equations, design in self._equations(state):
+            equations.add_to(design, matrix, gradient)
         own = slice(self.parameters.size + 6, None)
         matrix[own, own] += self.station_information
         return matrix
 
-    def _jacobian(self, state: State, values: FloatArray, rows: slice) -> FloatArray:
-        """Derivative of r_j by all unknowns, (poses, 3, size)."""
-        machine, bases = self.parameters.machine, [basis[rows] for basis in self.bases]
-        tip, columns = exact_columns(machine, values, self.position_mm[rows], self.tool_mm[rows])
+    def _equations(self, state: State) -> Iterator[tuple[PointEquations, FloatArray]]:
+        """The five sums: r_j moves by R(-w) with its tip, by a shift, a turn and -L_j with placement and stations."""
         back, jacobian = frame_rotation(-state.stations_mm[1])
-        turn = cross_matrices(self._seen(state, tip)) @ jacobian / LEVER_MM
-        shift = np.broadcast_to(-back, turn.shape)
-        return np.concatenate([back @ self.parameters.design(columns, bases), shift, turn, -self.lever[rows]], axis=2)
+        for rows, tip, design in self.chunks(state):
+            seen = self._seen(state, tip)
+            turn = cross_matrices(seen) @ jacobian / LEVER_MM
+            by_own = np.concatenate([np.broadcast_to(-back, turn.shape), turn, -self.lever[rows]], axis=2)
+            pull = np.einsum("mij,mj->mi", self.information[rows], self._rest(state, rows, seen))
+            weighted = self.information[rows] @ by_own
+            size = by_own.shape[2]
+            yield (
+                PointEquations(
+                    information=back.T @ self.information[rows] @ back,
+                    coupling=back.T @ weighted,
+                    force=pull @ back,
+                    own=by_own.reshape(-1, size).T @ weighted.reshape(-1, size),
+                    own_force=np.einsum("miq,mi->q", by_own, pull),
+                ),
+                design,
+            )
 
     def unknown_names(self, station_unknowns: tuple[str, ...] = ()) -> list[str]:
         """Names of all unknowns for messages; ``station_unknowns`` (q,) names b."""

@@ -18,7 +18,6 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import InputError
 from compgen.identify.adjust.solver import Factor
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State
-from compgen.kinematics.exact_chain import exact_columns
 
 if TYPE_CHECKING:
     from compgen.identify.adjust.problem import LengthProblem
@@ -190,7 +189,7 @@ def responses(
     """
     from compgen.identify.adjust.problem import length_problem
 
-    linear = _Linear(machine, length_problem(machine, lengths, layout, adjustment.group), adjustment)
+    linear = _Linear(length_problem(machine, lengths, layout, adjustment.group), adjustment)
     found = {}
     for name, value in inputs.items():
         if value > 0:
@@ -220,10 +219,21 @@ _PATTERNS: dict[str, Callable[[Machine, Lengths, Sight], FloatArray]] = {
     "target_station_um": lambda machine, lengths, sight: _by_member(
         MM_PER_UM * sight.unit, _numbered(_mountings(lengths), lengths.station)
     ),
-    "drift_um": lambda machine, lengths, sight: _by_member(
-        -MM_PER_UM * sight.unit * _elapsed(lengths)[:, None], lengths.station
-    ),
+    "drift_um": lambda machine, lengths, sight: _drift(lengths, sight),
 }
+
+
+def _drift(lengths: Lengths, sight: Sight) -> FloatArray:
+    """Movement of each station, which grows with time from its first to its last reading; by row without ``time_s``."""
+    time = lengths.covariates.get("time_s")
+    if time is None or not np.isfinite(time).all():
+        time = np.arange(len(lengths), dtype=np.float64)
+    share = np.zeros(len(lengths))
+    for k in range(len(lengths.stations)):
+        own = lengths.station == k
+        first, last = time[own].min(), time[own].max()
+        share[own] = (time[own] - first) / (last - first) if last > first else 0.0
+    return _by_member(-MM_PER_UM * sight.unit * share[:, None], lengths.station)
 
 
 def _mountings(lengths: Lengths) -> IntArray:
@@ -246,40 +256,14 @@ def _by_member(pattern: FloatArray, member: IntArray) -> FloatArray:
     return spread.reshape(len(pattern), 3 * count)
 
 
-def _elapsed(lengths: Lengths) -> FloatArray:
-    """Time of each reading as a share of its station's, 0 to 1, (n,); by row where ``time_s`` is not known."""
-    time = lengths.covariates.get("time_s")
-    if time is None or not np.isfinite(time).all():
-        time = np.arange(len(lengths), dtype=np.float64)
-    share = np.zeros(len(lengths))
-    for k in range(len(lengths.stations)):
-        own = lengths.station == k
-        first, last = time[own].min(), time[own].max()
-        share[own] = (time[own] - first) / (last - first) if last > first else 0.0
-    return share
-
-
 class _Linear:
     """The readings linearised at the optimum: products with J and with J^T W, in chunks of poses."""
 
-    def __init__(self, machine: Machine, problem: LengthProblem, adjustment: Adjustment) -> None:
-        self.machine, self.problem, self.adjustment = machine, problem, adjustment
-        tip = np.concatenate([tip for _, tip, _ in self._chunks()])
-        vector = tip[problem.pose] - adjustment.state.stations_mm[problem.station]
+    def __init__(self, problem: LengthProblem, adjustment: Adjustment) -> None:
+        self.problem, self.adjustment = problem, adjustment
+        vector = problem.tip_mm(adjustment.state)[problem.pose] - adjustment.state.stations_mm[problem.station]
         distance = np.linalg.norm(vector, axis=1)
         self.sight = Sight(vector / distance[:, None], distance)
-
-    def _chunks(self) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
-        """Poses, tips (m, 3) and derivatives of the tips by the unknown errors (m, 3, size)."""
-        from compgen.identify.adjust.problem import CHUNK_POSES
-
-        problem, errors = self.problem, self.adjustment.state.errors
-        for first in range(0, len(problem.position_mm), CHUNK_POSES):
-            poses = slice(first, first + CHUNK_POSES)
-            bases = [basis[poses] for basis in problem.bases]
-            values = problem.parameters.values(errors, bases)
-            tip, columns = exact_columns(self.machine, values, problem.position_mm[poses], problem.tool_mm[poses])
-            yield poses, tip, problem.parameters.design(columns, bases)
 
     def response(self, pattern_mm: FloatArray) -> FloatArray:
         """Return the change of the unknowns (size, q) for disturbances (n, q) of the readings."""
@@ -294,7 +278,8 @@ class _Linear:
     def forward(self, unknowns: FloatArray) -> FloatArray:
         """J times changes of the unknowns (size, q): changes of the readings (n, q)."""
         problem, errors = self.problem, self.problem.parameters.size
-        moved = np.concatenate([design @ unknowns[:errors] for _, _, design in self._chunks()])  # (poses, 3, q)
+        chunks = problem.chunks(self.adjustment.state)
+        moved = np.concatenate([design @ unknowns[:errors] for _, _, design in chunks])  # (poses, 3, q)
         stations = unknowns[errors : errors + 3 * problem.stations].reshape(problem.stations, 3, -1)
         dead = unknowns[errors + 3 * problem.stations :]
         result = np.empty((len(problem.pose), unknowns.shape[1]))
@@ -318,6 +303,6 @@ class _Linear:
                 by_station[:, c, k] = np.bincount(problem.station, force, problem.stations)
         size = problem.parameters.size
         errors = np.zeros((size, quantities))
-        for chunk, _, design in self._chunks():
+        for chunk, _, design in problem.chunks(self.adjustment.state):
             errors += design.reshape(-1, size).T @ pulled[chunk].reshape(-1, quantities)
         return np.vstack([errors, -by_station.reshape(-1, quantities), -by_group])

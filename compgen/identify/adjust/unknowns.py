@@ -14,6 +14,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, SQUARENESS_NAMES, ErrorName, error_named
 from compgen.errors import InputError
 from compgen.kinematics.curves import free_basis, hat_matrix, spline_matrix
+from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.first_order import modelled_errors, observable_errors, tool_of
 
 # The unknown curves: their basis, the constraints that fix the gauge, and the place of each in the vector.
@@ -50,6 +51,15 @@ class ErrorParameters:
         nodes = self.machine.axes[axis].nodes_mm
         build = spline_matrix if self.machine.curves == "cubic" else hat_matrix
         return build(nodes, position_mm)
+
+    def bases(self, position_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Basis matrices of the curves of X, Y, Z at positions (m, 3)."""
+        x, y, z = (self.basis(axis, position_mm[:, axis]) for axis in range(3))
+        return x, y, z
+
+    def tips(self, unknowns: FloatArray, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
+        """Tool tips of the exact model for the unknown errors, at positions (m, 3) with tools (3,) or (m, 3)."""
+        return tip_position(self.machine, self.values(unknowns, self.bases(position_mm)), position_mm, tool_mm)
 
     def values(self, unknowns: FloatArray, bases: Sequence[FloatArray]) -> FloatArray:
         """All 21 errors at points whose basis matrices are ``bases`` (one per axis): shape (m, 21), mm and rad."""
@@ -101,12 +111,21 @@ def error_parameters(machine: Machine, names: Sequence[str], *, several_tools: b
         error = error_named(name)
         released = several_tools and error.kind == "angular" and error.axis == bare and name not in single_tool
         key = (error.axis, error.is_straightness, released)
+        nodes_mm = machine.axes[error.axis].nodes_mm
         if key not in known:
-            known[key] = _free_coefficients(machine, error, released=released)
+            reference_mm = machine.reference_point_mm[error.axis]
+            zeros = [*machine.axes[error.axis].range_mm] if error.is_straightness else [reference_mm]
+            fixed = (nodes_mm[:, None] == np.array(zeros)).any(axis=1)
+            if released:
+                known[key] = np.eye(len(nodes_mm))
+            elif machine.curves == "linear" and np.count_nonzero(fixed) == len(zeros):
+                known[key] = np.eye(len(nodes_mm))[:, ~fixed]
+            else:
+                build = spline_matrix if machine.curves == "cubic" else hat_matrix
+                rows = build(nodes_mm, np.array(zeros))
+                known[key] = free_basis(np.where(np.abs(rows) < 1e-14, 0.0, rows), len(nodes_mm))
         free = known[key]
-        curves.append(
-            CurveParameters(error, machine.axes[error.axis].nodes_mm, free, slice(size, size + free.shape[1]))
-        )
+        curves.append(CurveParameters(error, nodes_mm, free, slice(size, size + free.shape[1])))
         size += free.shape[1]
     squareness = tuple(name for name in names if name in SQUARENESS_NAMES)
     return ErrorParameters(machine, tuple(curves), squareness, size + len(squareness))
@@ -124,20 +143,6 @@ def parameters_for_tools(machine: Machine, tool_mm: FloatArray) -> ErrorParamete
     several = tool_mm.ndim == 2
     names = modelled_errors(machine, np.unique(tool_mm, axis=0) if several else None)
     return error_parameters(machine, names, several_tools=several)
-
-
-def _free_coefficients(machine: Machine, error: ErrorName, *, released: bool) -> FloatArray:
-    axis = machine.axes[error.axis]
-    count = len(axis.nodes_mm)
-    if released:
-        return np.eye(count)
-    zeros = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
-    held = (axis.nodes_mm[:, None] == np.array(zeros)).any(axis=1)
-    if machine.curves == "linear" and np.count_nonzero(held) == len(zeros):
-        return np.eye(count)[:, ~held]
-    build = spline_matrix if machine.curves == "cubic" else hat_matrix
-    rows = build(axis.nodes_mm, np.array(zeros))
-    return free_basis(np.where(np.abs(rows) < 1e-14, 0.0, rows), count)
 
 
 # The values of all unknowns of an identification.
