@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
 from compgen.data.names import SQUARENESS_NAMES
 from compgen.identify.adjust.levels import LevelGrid, MotionMap, ToolData, levels_of, merge, motion_map
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State
@@ -226,7 +227,7 @@ def _contract_first(table: FloatArray, powers: FloatArray) -> FloatArray:
 
 
 #: Place of the entries of w u u^T and w u in the ten moments, one row for each component of u.
-_ENTRIES = np.array([[0, 3, 4, 6], [3, 1, 5, 7], [4, 5, 2, 8]])
+ENTRIES = np.array([[0, 3, 4, 6], [3, 1, 5, 7], [4, 5, 2, 8]])
 
 
 def add_normal(grid: LevelGrid, moments: Moments, tool_mm: FloatArray, state: State, matrix: FloatArray) -> None:
@@ -239,9 +240,9 @@ def add_normal(grid: LevelGrid, moments: Moments, tool_mm: FloatArray, state: St
     state : gives the directions of travel.
     """
     directions, derivatives = grid.travel_directions(state)
-    levers = _levers(grid, directions)
+    levers = lever_directions(grid.parameters.machine, directions)
     motion = grid.motion.with_squareness(grid.parameters, grid.levels_mm, derivatives)
-    first, second = grid.parameters.size, grid.parameters.size + 3 * grid.stations
+    first = grid.parameters.size
     by_levels = np.zeros((motion.shape[0], motion.shape[0]))
     by_group = np.zeros((first, grid.groups, 4))
     if grid.compiled:
@@ -253,23 +254,39 @@ def add_normal(grid: LevelGrid, moments: Moments, tool_mm: FloatArray, state: St
         _pairs(grid, moments, levers, tool_mm, by_levels)
         matrix[:first, :first] += np.asarray(to_unknowns @ np.asarray(to_unknowns @ by_levels).T)
         by_group += np.asarray(to_unknowns @ _stations(grid, moments, levers, tool_mm)).reshape(by_group.shape)
-    sums = moments.levels[0][:, :, 0].sum(axis=1)
-    for group, station in enumerate(grid.station_of.tolist()):
-        columns = slice(first + 3 * station, first + 3 * station + 3)
-        matrix[:first, columns] -= by_group[:, group, :3]
-        matrix[:first, second + group] -= by_group[:, group, 3]
-        matrix[columns, columns] += sums[group, _ENTRIES[:, :3]]
-        matrix[columns, second + group] += sums[group, 6:9]
-        matrix[second + group, second + group] += sums[group, 9]
+    add_own_blocks(matrix, first, grid.station_of, by_group, moments.levels[0][:, :, 0].sum(axis=1))
 
 
-def _levers(grid: LevelGrid, directions: FloatArray) -> FloatArray:
+def lever_directions(machine: Machine, directions: FloatArray) -> FloatArray:
     """Directions of the axes that are part of the lever arm of each axis, others zero: [axis, lever, component]."""
     levers = np.zeros((3, 3, 3))
     for axis in range(3):
-        for lever in grid.parameters.machine.chain.lever_axes(axis):
+        for lever in machine.chain.lever_axes(axis):
             levers[axis, lever] = directions[lever]
     return levers
+
+
+def add_own_blocks(
+    matrix: FloatArray, first: int, station_of: IntArray, by_group: FloatArray, totals: FloatArray
+) -> None:
+    """Add the blocks of stations and dead lengths, which follow ``first`` unknown errors, to a normal matrix (size, size).
+
+    Parameters
+    ----------
+    station_of : station of each dead length, (G,).
+    by_group : sums of the derivatives by the errors times w u (x, y, z) and w, (first, G, 4).
+    totals : sums of w u u^T (xx, yy, zz, xy, xz, yz), w u and w of all readings of each dead length, (G, 10).
+    """
+    second = len(matrix) - len(station_of)
+    for group, station in enumerate(station_of.tolist()):
+        columns = slice(first + 3 * station, first + 3 * station + 3)
+        matrix[:first, columns] -= by_group[:, group, :3]
+        matrix[:first, second + group] -= by_group[:, group, 3]
+        matrix[columns, columns] += totals[group, ENTRIES[:, :3]]
+        matrix[columns, second + group] += totals[group, 6:9]
+        matrix[second + group, second + group] += totals[group, 9]
+    matrix[first:, :first] = matrix[:first, first:].T
+    matrix[second:, first:second] = matrix[first:second, second:].T
 
 
 def _ordered(grid: LevelGrid, moments: Moments) -> list[tuple[IntArray, FloatArray, bool, bool]]:
@@ -336,7 +353,7 @@ def _pairs(grid: LevelGrid, moments: Moments, levers: FloatArray, tool_mm: Float
 
 def _extended(table: FloatArray) -> FloatArray:
     """Moments of (u, q u) with the coordinate q of the third axis: (first, second, 6, 6)."""
-    moments = table[:, _ENTRIES[:, :3]].transpose(3, 4, 0, 1, 2)  # [first, second, power, 3, 3]
+    moments = table[:, ENTRIES[:, :3]].transpose(3, 4, 0, 1, 2)  # [first, second, power, 3, 3]
     sums = np.empty((*moments.shape[:2], 6, 6))
     sums[:, :, :3, :3] = moments[:, :, 0]
     sums[:, :, :3, 3:] = sums[:, :, 3:, :3] = moments[:, :, 1]
@@ -365,7 +382,7 @@ def _stations(grid: LevelGrid, moments: Moments, levers: FloatArray, tool_mm: Fl
     parts: dict[int, FloatArray] = {}
     for (axis, *others), table in zip(_with_levers(grid), moments.levels, strict=True):
         groups, count = table.shape[:2]
-        sums = table[..., _ENTRIES].reshape(groups, count, 9, 4)
+        sums = table[..., ENTRIES].reshape(groups, count, 9, 4)
         arm = tool_mm + grid.levels_mm[axis][:, None] * levers[axis, axis]
         maps = np.zeros((count, 6, 9))
         maps[:, :3, :3] = np.eye(3)
@@ -517,9 +534,6 @@ class GridProblem(LevelGrid):
         for k, data in enumerate(self.tools):
             sums = compiled_moments(self, data, state) if self.compiled else moments(self, data, places[k][-1], state)
             add_normal(self, sums, data.tool_mm, state, matrix)
-        first, second = self.parameters.size, self.parameters.size + 3 * self.stations
-        matrix[first:, :first] = matrix[:first, first:].T
-        matrix[second:, first:second] = matrix[first:second, second:].T
         if self.known:
             self.known.add_weight(state, matrix)
         return matrix

@@ -1,0 +1,314 @@
+"""Lengths at positions that form no grid, as a tracer reads them on the fly: the compiled form, and large numbers in chunks.
+
+The normal matrix needs the derivative of the tip by delta and eps of each carriage, interpolated between the nodes next to
+the reading. In the cell of those nodes everything is a polynomial of the local coordinates, x = left + h xi: a hat
+function is 1 - xi or xi, a lever arm is linear, so the derivative is u times a polynomial of degree 2, with u the line of
+sight. Hence the sums of w u u^T times the 35 monomials of degree 4 and less hold all that the readings of a cell say, and
+the cost of the matrix does not grow with the number of unknowns. As on a grid, it uses C in place of the exact
+derivative: the matrix steers the iteration, the optimum is where the exact gradient vanishes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.names import SQUARENESS_NAMES
+from compgen.identify.adjust.grid_problem import ENTRIES, add_own_blocks, lever_directions
+from compgen.identify.adjust.levels import MotionMap, motion_map
+from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State
+from compgen.kinematics.exact_chain import passing_order, travel_directions
+
+#: Readings from which this form pays against the plain one, which is slower but needs no compiled code.
+ENOUGH = 20_000
+#: Numbers that the sums of all cells may hold; with more nodes the plain form is used.
+MOST_SUMS = 40_000_000
+#: Cells whose blocks are made at a time.
+CELLS = 512
+_CELL_SUMS, _GROUP_SUMS = 6 * 36, 9 * 12
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """n readings: coordinates x, y, z, station, dead length and reading, each (n,)."""
+
+    position_mm: tuple[FloatArray, FloatArray, FloatArray]
+    station: IntArray
+    group: IntArray
+    length_mm: FloatArray
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard uncertainty a + b d of a reading over the distance d, mm; its weight is (scale / (a + b d))^2.
+
+    A reading whose residual exceeds ``limit`` of them has no weight.
+    """
+
+    constant_mm: float = 1.0
+    proportional: float = 0.0
+    scale_mm: float = 1.0
+    limit: float = np.inf
+
+
+@dataclass
+class Sums:
+    """What passes over readings add up: see :func:`compgen.identify.adjust.path_kernels.pass_over`."""
+
+    gradient: FloatArray
+    #: Of each dead length: readings used, the square sum of their residuals, and their weights, (G, 3).
+    by_group: FloatArray
+    matrix: FloatArray | None = None
+    cost: float = 0.0
+
+
+@dataclass(frozen=True)
+class PathModel:
+    """The unknowns of a machine with one tool, laid out for the compiled pass; only curves that are linear between nodes.
+
+    ``station_of`` (G,) is the station of each dead length.
+    """
+
+    parameters: ErrorParameters
+    tool_mm: FloatArray
+    station_of: IntArray
+    motion: MotionMap
+
+    @property
+    def stations(self) -> int:
+        """Number of stations."""
+        return int(self.station_of.max()) + 1
+
+    @property
+    def groups(self) -> int:
+        """Number of dead lengths."""
+        return len(self.station_of)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.parameters.size + 3 * self.stations + self.groups
+
+    @property
+    def nodes_mm(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Nodes of X, Y and Z."""
+        x, y, z = (axis.nodes_mm for axis in self.parameters.machine.axes)
+        return x, y, z
+
+    @property
+    def first(self) -> list[int]:
+        """First node of X, Y and Z in one list of all, and the number of all."""
+        return np.cumsum([0, *(len(nodes) for nodes in self.nodes_mm)]).tolist()
+
+    @property
+    def cells(self) -> int:
+        """Number of cells between the nodes."""
+        return int(np.prod([len(nodes) - 1 for nodes in self.nodes_mm]))
+
+    def directions(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Directions of travel and their derivatives, see ``travel_directions``."""
+        names = self.parameters.squareness
+        known = dict(zip(names, state.errors[self.parameters.size - len(names) :].tolist(), strict=True))
+        return travel_directions(
+            self.parameters.machine, np.array([known.get(name, 0.0) for name in SQUARENESS_NAMES])
+        )
+
+    def sums(
+        self,
+        state: State,
+        chunks: Iterator[tuple[Chunk, FloatArray, FloatArray]],
+        noise: Noise,
+        *,
+        matrix: bool,
+        look: Callable[[Chunk, FloatArray], None] = lambda *_: None,
+    ) -> Sums:
+        """Pass over chunks of readings with their weights (n,) and room for their residuals (n,), which ``look`` sees."""
+        from compgen.identify.adjust.path_kernels import pass_over
+
+        directions, derivatives = self.directions(state)
+        sides, first = dict(passing_order(self.parameters.machine)), self.first
+        counts = [len(nodes) for nodes in self.nodes_mm]
+        order = [axis for axis, _ in passing_order(self.parameters.machine)]
+        chain = np.array([order, first[:3], counts, [int(sides[axis]) for axis in range(3)]], dtype=np.int64)
+        motion = (self.motion.dense @ state.errors).reshape(-1, 6)
+        nodes, tool = np.concatenate(self.nodes_mm), np.array(self.tool_mm)
+        by_motion, by_travel = np.zeros_like(motion), np.zeros((3, 3))
+        by_station, by_group = np.zeros((self.stations, 3)), np.zeros((self.groups, 4))
+        cells = self.cells if matrix else 0
+        of_cells, of_groups = np.zeros((cells, 6, 36)), np.zeros((self.groups, cells, 9, 12))
+        model = chain, nodes, directions, motion, tool, state.stations_mm, state.dead_length_mm
+        limits = noise.constant_mm, noise.proportional, noise.scale_mm, noise.limit
+        totals, tables = (by_motion, by_travel, by_station, by_group), (matrix, of_cells, of_groups)
+        square_sum = 0.0
+        for chunk, weight, residual in chunks:
+            readings = chunk.position_mm, chunk.station, chunk.group, chunk.length_mm, weight
+            square_sum += pass_over(*model, *readings, limits, *totals, residual, *tables)
+            look(chunk, residual)
+        gradient = np.concatenate([by_motion.ravel() @ self.motion.dense, by_station.ravel(), by_group[:, 0]])
+        start = self.parameters.size - len(self.parameters.squareness)
+        by_squareness = np.einsum("ai,aik->k", by_travel, derivatives)
+        for k, name in enumerate(self.parameters.squareness):
+            gradient[start + k] += by_squareness[SQUARENESS_NAMES.index(name)]
+        found = Sums(gradient, by_group[:, 1:], cost=0.5 * square_sum)
+        if matrix:
+            found.matrix = self._normal(directions, derivatives, of_cells, of_groups, by_group[:, 3])
+        return found
+
+    def _normal(
+        self,
+        directions: FloatArray,
+        derivatives: FloatArray,
+        of_cells: FloatArray,
+        of_groups: FloatArray,
+        weights: FloatArray,
+    ) -> FloatArray:
+        """Normal matrix (size, size) from the sums by cell: first by delta and eps at the nodes, then by the unknowns."""
+        from compgen.identify.adjust.path_kernels import LOW, PRODUCT
+
+        count, groups = self.first[3], self.groups
+        by_nodes, by_group = np.zeros((6 * count) ** 2), np.zeros((6 * count, groups, 4))
+        for start in range(0, self.cells, CELLS):
+            cells = np.arange(start, min(start + CELLS, self.cells))
+            rows, maps = self._cell_maps(cells, directions)  # (c, 36), (c, 36, 10 monomials, 3 of u)
+            sums = of_cells[cells][:, ENTRIES[:, :3]][..., PRODUCT]  # (c, 3, 3, 10, 10)
+            sums = sums.transpose(0, 3, 1, 4, 2).reshape(len(cells), 3 * LOW, 3 * LOW)
+            flat = maps.reshape(len(cells), 36, 3 * LOW)
+            blocks = flat @ sums @ flat.swapaxes(1, 2)
+            place = rows[:, :, None] * (6 * count) + rows[:, None, :]
+            by_nodes += np.bincount(place.ravel(), blocks.ravel(), len(by_nodes))
+            for group in range(groups):
+                along = of_groups[group, cells][:, ENTRIES, :LOW].transpose(0, 3, 1, 2)  # (c, 10, 3, 4)
+                part = flat @ along.reshape(len(cells), 3 * LOW, 4)
+                for k in range(4):
+                    by_group[:, group, k] += np.bincount(rows.ravel(), part[:, :, k].ravel(), 6 * count)
+        motion = self.motion.with_squareness(self.parameters, self.nodes_mm, derivatives).dense
+        size = self.parameters.size
+        matrix = np.zeros((self.size, self.size))
+        matrix[:size, :size] = motion.T @ by_nodes.reshape(6 * count, -1) @ motion
+        by_unknowns = np.tensordot(motion, by_group, axes=(0, 0))
+        totals = np.column_stack([of_groups[:, :, :, 0].sum(axis=1), weights])
+        add_own_blocks(matrix, size, self.station_of, by_unknowns, totals)
+        return matrix
+
+    def _cell_maps(self, cells: IntArray, directions: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Places (c, 36) of delta and eps at the nodes of cells, and the derivatives by them (c, 36, 10, 3).
+
+        The derivative by delta is u, by eps arm x u; both times the hat function of the node.
+        """
+        from compgen.identify.adjust.path_kernels import LOW, PRODUCT
+
+        index = np.unravel_index(cells, [len(nodes) - 1 for nodes in self.nodes_mm])
+        left = np.stack([nodes[k] for nodes, k in zip(self.nodes_mm, index, strict=True)], axis=1)
+        step = np.stack([np.diff(nodes)[k] for nodes, k in zip(self.nodes_mm, index, strict=True)], axis=1)
+        levers = lever_directions(self.parameters.machine, directions)
+        place = (3, 2, 1)  # of the local coordinates of X, Y, Z among the monomials
+        rows, maps = np.zeros((len(cells), 36), dtype=np.int64), np.zeros((len(cells), 3, 2, 6, LOW, 3))
+        for axis in range(3):
+            arm = np.zeros((len(cells), 4, 3))  # constant, and along z, y, x as the monomials are sorted
+            arm[:, 0] = self.tool_mm + left @ levers[axis]
+            for other in range(3):
+                arm[:, place[other]] = step[:, [other]] * levers[axis, other]
+            for side in range(2):
+                hat = {0: 1.0 - side, place[axis]: 2.0 * side - 1.0}
+                at = 6 * (self.first[axis] + index[axis] + side)
+                rows[:, 12 * axis + 6 * side : 12 * axis + 6 * side + 6] = at[:, None] + np.arange(6)
+                for monomial, factor in hat.items():
+                    for k in range(3):
+                        n, o = (k + 1) % 3, (k + 2) % 3
+                        maps[:, axis, side, k, monomial, k] += factor
+                        for linear in range(4):
+                            where = PRODUCT[monomial, linear]
+                            maps[:, axis, side, 3 + k, where, o] += factor * arm[:, linear, n]
+                            maps[:, axis, side, 3 + k, where, n] -= factor * arm[:, linear, o]
+        return rows, maps.reshape(len(cells), 36, LOW, 3)
+
+
+def path_model(parameters: ErrorParameters, tool_mm: FloatArray, station_of: IntArray) -> PathModel | None:
+    """Lay out the compiled pass; None for several tools, cubic curves, or so many nodes that the sums grow too large."""
+    machine = parameters.machine
+    if tool_mm.ndim != 1 or machine.curves != "linear":
+        return None
+    bases = [np.eye(len(axis.nodes_mm)) for axis in machine.axes]
+    found = PathModel(parameters, tool_mm, station_of, motion_map(parameters, bases))
+    return found if found.cells * (_CELL_SUMS + found.groups * _GROUP_SUMS) <= MOST_SUMS else None
+
+
+@dataclass(frozen=True)
+class PathProblem:
+    """n readings in memory, their weights (n,), and stations whose coordinates were observed as well."""
+
+    model: PathModel
+    readings: Chunk
+    weight: FloatArray
+    known: KnownPositions | None = None
+    _rest: FloatArray = field(default_factory=lambda: np.zeros(0), repr=False)
+
+    @property
+    def parameters(self) -> ErrorParameters:
+        """The unknown errors."""
+        return self.model.parameters
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.model.size
+
+    def weighted(self, weight: FloatArray) -> PathProblem:
+        """Return the same problem with other weights."""
+        return replace(self, weight=np.require(weight, np.float64, ["C"]))
+
+    def _sums(self, state: State, residual: FloatArray, *, matrix: bool) -> Sums:
+        return self.model.sums(state, iter([(self.readings, self.weight, residual)]), Noise(), matrix=matrix)
+
+    def evaluate(self, state: State) -> tuple[float, FloatArray]:
+        """Half the weighted sum of squares with the exact model, and its exact gradient (size,)."""
+        found = self._sums(state, np.empty(len(self.weight)), matrix=False)
+        return found.cost + (self.known.add_gradient(state, found.gradient) if self.known else 0.0), found.gradient
+
+    def normal_matrix(self, state: State) -> FloatArray:
+        """J^T W J (size, size) with C in place of the exact derivative."""
+        matrix = self._sums(state, np.empty(len(self.weight)), matrix=True).matrix
+        assert matrix is not None
+        if self.known:
+            self.known.add_weight(state, matrix)
+        return matrix
+
+    def residuals(self, state: State) -> FloatArray:
+        """Model minus reading of every reading, shape (n,), mm."""
+        residual = np.empty(len(self.weight))
+        self._sums(state, residual, matrix=False)
+        return residual
+
+    def distances(self, state: State) -> FloatArray:
+        """Distance from the station of every reading, shape (n,), mm."""
+        return self.residuals(state) + self.readings.length_mm + state.dead_length_mm[self.readings.group]
+
+
+def path_problem(
+    parameters: ErrorParameters,
+    position_mm: FloatArray,
+    tool_mm: FloatArray,
+    station: IntArray,
+    group: IntArray,
+    reading_mm: FloatArray,
+) -> PathProblem | None:
+    """Sort readings for the compiled pass, all weights 1; None where :func:`path_model` has no such form."""
+    station_of = np.zeros(int(group.max()) + 1, dtype=np.int64)
+    station_of[group] = station
+    model = path_model(parameters, tool_mm, station_of)
+    if model is None:
+        return None
+    return PathProblem(model, chunk_of(position_mm.T, station, group, reading_mm), np.ones(len(reading_mm)))
+
+
+def chunk_of(
+    position_mm: FloatArray | tuple[FloatArray, ...], station: NDArray[np.integer], group: IntArray, length_mm: FloatArray
+) -> Chunk:
+    """Return readings as the compiled pass takes them: numbers of 8 bytes, in a row, positions by axis (3, n)."""
+    x, y, z = (np.require(along, np.float64, ["C", "W"]) for along in position_mm)
+    whole = [np.require(values, np.int64, ["C", "W"]) for values in (station, group)]
+    return Chunk((x, y, z), whole[0], whole[1], np.require(length_mm, np.float64, ["C", "W"]))
