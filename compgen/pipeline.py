@@ -18,7 +18,7 @@ from compgen.controls import controller_named
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.display import Bars, Drawable, Overview, Panel
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, format_errors, format_reversal
-from compgen.data.files import OutputFolder, Provenance, read_bytes, sha256_of, working_folder
+from compgen.data.files import OutputFolder, Provenance, sha256_of_file, working_folder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
@@ -109,7 +109,7 @@ class RunResult(Drawable):
 def provenance_of(*paths: str | Path | None) -> Provenance:
     """Return name and SHA-256 of the given files."""
     files = [Path(path) for path in paths if path is not None]
-    return Provenance(tuple((path.name, sha256_of(read_bytes(path))) for path in files))
+    return Provenance(tuple((path.name, sha256_of_file(path)) for path in files))
 
 
 def identification_files(

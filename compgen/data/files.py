@@ -45,6 +45,15 @@ class Provenance:
     inputs: Sequence[tuple[str, str]] = ()
 
 
+def sha256_of_file(path: str | Path) -> str:
+    """Return the SHA-256 of a file of any size; InputError for one that cannot be read."""
+    try:
+        with Path(path).open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from error
+
+
 def json_values(value: Any) -> Any:
     """Return ``value`` as JSON knows it: keys are texts, and a number that is not known (nan) or not finite is None."""
     if isinstance(value, float):

@@ -11,7 +11,18 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray
 from compgen.data.display import Displayed, Overview, ranges_of, shortened
-from compgen.data.records import APPROACH, COVARIATES, LABELS, POSITION, POSITION_COLUMNS, TOOL, Field, Schema, within
+from compgen.data.records import (
+    APPROACH,
+    ARCHIVE,
+    COVARIATES,
+    LABELS,
+    POSITION,
+    POSITION_COLUMNS,
+    TOOL,
+    Field,
+    Schema,
+    within,
+)
 
 __all__ = [
     "POSITION_COLUMNS",
@@ -95,7 +106,7 @@ _LENGTHS = Schema(
 
 
 def read_lengths(files: str | Path | Sequence[str | Path]) -> Lengths:
-    """Read one or more ``*.lengths.csv`` files into one :class:`Lengths`.
+    """Read one or more ``*.lengths.csv`` (or ``*.lengths.npz``) files into one :class:`Lengths`.
 
     Labels that only some of the files carry are 0 in the others; the same station in two files is one station.
 
@@ -105,8 +116,13 @@ def read_lengths(files: str | Path | Sequence[str | Path]) -> Lengths:
     >>> compgen.read_lengths("examples/zha-gantry.lengths.csv").metadata["instrument"]
     'laser-tracer'
     """
-    parts = []
-    for values in map(_LENGTHS.values, _LENGTHS.read_tables(files)):
+    from compgen.data.length_archive import read_archive  # imported here: it is built on what this file declares
+
+    sources = [files] if isinstance(files, str | Path) else list(files)
+    binary = [source for source in sources if str(source).lower().endswith(ARCHIVE)]
+    parts = [read_archive(source) for source in binary]
+    text = [source for source in sources if source not in binary]
+    for values in map(_LENGTHS.values, _LENGTHS.read_tables(text) if text or not binary else []):
         stations = tuple(dict.fromkeys(values["station"]))
         parts.append(Lengths(**values | {"stations": stations, "station": _numbered(values["station"], stations)}))
     return join_lengths(parts)

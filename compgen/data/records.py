@@ -34,6 +34,8 @@ DEVIATION_COLUMNS = ("dx_um", "dy_um", "dz_um")
 MEASURED_COLUMNS = ("mx_mm", "my_mm", "mz_mm")
 #: Temperatures, of which a file may have any number.
 TEMPERATURES = "temp_*_c"
+#: Ending of lengths in binary form, the one format that is told by its name.
+ARCHIVE = ".lengths.npz"
 #: A deviation beyond this is taken for a slip of unit, um.
 LARGEST_DEVIATION_UM = 1e5
 
@@ -323,4 +325,6 @@ def detect_format(source: str | Path) -> str | None:
 
     ``lengths``, ``deviations``, ``part``, ``axis``, ``diagonals``, ``sixdof``, ``errors``, or None.
     """
+    if str(source).lower().endswith(ARCHIVE):
+        return "lengths"
     return format_of_columns(names_in_header(read_text(source)))

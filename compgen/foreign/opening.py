@@ -11,7 +11,7 @@ from pathlib import Path
 
 from compgen.data.csv_files import names_in_header
 from compgen.data.error_table import ErrorTable, read_errors
-from compgen.data.records import format_of_columns
+from compgen.data.records import ARCHIVE, format_of_columns
 from compgen.errors import InputError
 from compgen.foreign.source import MOST_CAPTURE_BYTES, MOST_OWN_BYTES, check_size, decode_head, read_head
 from compgen.identify.any_measurement import Measurement, read_measurement
@@ -21,6 +21,8 @@ _NATIVE_SUFFIXES = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv
 
 def native_format(path: Path) -> str | None:
     """Return the kind of a native file, None for a foreign one; InputError for what is not data."""
+    if path.name.lower().endswith(ARCHIVE):
+        return "lengths"
     check_size(path, MOST_CAPTURE_BYTES)
     head = read_head(path)
     if head.startswith((b"PK\x03\x04", b"HEADER::", b"\xff\xfe", b"\xfe\xff")):

@@ -17,7 +17,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.records import detect_format
+from compgen.data.records import ARCHIVE, detect_format
 from compgen.errors import InputError
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.identification import Identification
@@ -27,6 +27,7 @@ from compgen.identify.tracer_lengths import identify
 if TYPE_CHECKING:
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import Deviations
+    from compgen.data.length_archive import LengthArchive
     from compgen.identify.six_dof import SixDofMeasurement
 
 #: Deviations that are all smaller than this are refused: 100 um in the wrong unit, mm for um.
@@ -41,11 +42,13 @@ class MixedMeasurement:
     sixdof: SixDofMeasurement
 
 
-Measurement: TypeAlias = "Lengths | Deviations | AxisRuns | SixDofMeasurement | MixedMeasurement"
+Measurement: TypeAlias = "Lengths | LengthArchive | Deviations | AxisRuns | SixDofMeasurement | MixedMeasurement"
 
 
 @overload
-def read_measurement(paths: Sequence[str | Path], instrument: None = None) -> Lengths | Deviations | AxisRuns: ...
+def read_measurement(
+    paths: Sequence[str | Path], instrument: None = None
+) -> Lengths | LengthArchive | Deviations | AxisRuns: ...
 @overload
 def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None) -> Measurement: ...
 def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement:
@@ -61,6 +64,12 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
     InputError
         for lengths together with deviations, six-DOF readings without an instrument file, or one without such readings.
     """
+    if len(paths) == 1 and instrument is None and str(paths[0]).lower().endswith(ARCHIVE):
+        from compgen.data.length_archive import MOST_WHOLE, open_archive
+
+        archive = open_archive(paths[0])
+        if len(archive) > MOST_WHOLE:
+            return archive
     posed = [path for path in paths if detect_format(path) == "sixdof"]
     others = [path for path in paths if path not in posed]
     if posed and instrument is None:
@@ -141,6 +150,12 @@ def identify_measurement(
         if chosen.u_deviation_um is not None:
             raise InputError("an uncertainty of deviations (--u-deviation-um) was given, but the files contain lengths")
         return identify(machine, measurement, chosen)
+    from compgen.data.length_archive import LengthArchive
+
+    if isinstance(measurement, LengthArchive):
+        from compgen.identify.streamed_lengths import identify_archive
+
+        return identify_archive(machine, measurement, chosen)
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import Deviations
     from compgen.identify.merging import merge
@@ -219,6 +234,8 @@ def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, re
     measurement about instrument and operator are kept.
     """
     columns: dict[str, Sequence[str] | FloatArray] = {}
+    if result.counted is not None and not isinstance(measurement, ErrorTable | Lengths):
+        measurement = measurement.taken(measurement.sample_rows)  # type: ignore[union-attr]
     if isinstance(measurement, Lengths) and len(measurement) == len(result.residual_mm):
         columns["station"] = [measurement.stations[k] for k in measurement.station.tolist()]
         columns |= {f"{axis}_mm": measurement.position_mm[:, k] for k, axis in enumerate("xyz")}

@@ -85,6 +85,7 @@ class Identification(Drawable):
     objections : why nothing that is made of these errors may be accepted; empty if there is no such reason.
     misfit : whether the residuals are larger than their uncertainty allows, and what explains them; None where no
         uncertainty of the readings is part of the method.
+    counted : number of readings and of those that were used, where ``residual_mm`` and ``accepted`` are those of a sample.
 
     Examples
     --------
@@ -131,6 +132,17 @@ class Identification(Drawable):
     details: Mapping[str, Any] = field(default_factory=dict)
     objections: tuple[str, ...] = ()
     misfit: Misfit | None = None
+    counted: tuple[int, int] | None = None
+
+    @property
+    def readings(self) -> int:
+        """Number of readings."""
+        return self.counted[0] if self.counted else len(self.accepted)
+
+    @property
+    def readings_used(self) -> int:
+        """Number of readings that were used."""
+        return self.counted[1] if self.counted else int(np.count_nonzero(self.accepted))
 
     @property
     def has_covariance(self) -> bool:
@@ -169,8 +181,8 @@ class Identification(Drawable):
             "degrees_of_freedom": self.degrees_of_freedom,
             "reduced_chi_square": None if np.isnan(self.reduced_chi_square) else self.reduced_chi_square,
             **self._u_of_the_readings(),
-            "readings": len(self.accepted),
-            "readings_used": int(np.count_nonzero(self.accepted)),
+            "readings": self.readings,
+            "readings_used": self.readings_used,
             "rank": self.rank,
             "unknowns": self.unknowns,
             "condition": self.condition,
@@ -207,7 +219,7 @@ class Identification(Drawable):
     def overview(self) -> Overview:
         """How well the model fits the readings, and the largest value of each error."""
         table = self.errors.overview()
-        used = f"{np.count_nonzero(self.accepted)} of {len(self.accepted)} readings"
+        used = f"{self.readings_used} of {self.readings} readings"
         quality = f"residual {self.rms_um:.3f} um rms, reduced chi-square {self.reduced_chi_square:.3f}"
         title = f"{len(self.errors.names)} errors from {used} ({self.method}), {quality}"
         notes = (f"rank {self.rank} of {self.unknowns} unknowns", *self.objections)

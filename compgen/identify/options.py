@@ -16,7 +16,6 @@ from compgen.data.machine import Machine
 from compgen.data.messages import nearest
 from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError
-from compgen.identify.adjust.grid_problem import GridProblem
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.adjust.starts import station_start
 from compgen.identify.adjust.unknowns import IntArray, KnownPositions, State
@@ -24,7 +23,6 @@ from compgen.kinematics.first_order import tool_of
 
 if TYPE_CHECKING:
     from compgen.data.deviations import Deviations
-    from compgen.identify.adjust.problem import LengthProblem
 
 # Stations whose machine coordinates are known beforehand: from a file, or located with the machine taken as perfect.
 #
@@ -138,12 +136,9 @@ def with_known_start(
     return State(start.errors, stations, dead)
 
 
-def with_known_positions(
-    problem: GridProblem | LengthProblem, known: KnownStations, stations: Sequence[str], sigma_mm: float
-) -> GridProblem | LengthProblem:
-    """Add known stations to a problem in which a reading of standard uncertainty ``sigma_mm`` has weight 1."""
-    observed = KnownPositions(known.indices(stations), known.position_mm, (sigma_mm / known.u_mm) ** 2)
-    return replace(problem, known=observed)
+def known_positions(known: KnownStations, stations: Sequence[str], sigma_mm: float) -> KnownPositions:
+    """Return known stations as observations in a problem in which a reading of standard uncertainty ``sigma_mm`` has weight 1."""
+    return KnownPositions(known.indices(stations), known.position_mm, (sigma_mm / known.u_mm) ** 2)
 
 
 # The uncertainty of the readings: stated by the user, by the file, or assumed.

@@ -53,21 +53,22 @@ from compgen.identify.options import (
     IdentifyOptions,
     KnownStations,
     ReadingNoise,
+    known_positions,
     locate_stations,
     reading_noise,
-    with_known_positions,
     with_known_start,
 )
 from compgen.identify.reference_conditions import identify_at_reference
-from compgen.kinematics.kernel_switch import one_thread
+from compgen.kinematics.kernel_switch import one_thread, use_compiled
 
 if TYPE_CHECKING:
+    from compgen.identify.adjust.path_problem import PathProblem
     from compgen.identify.adjust.problem import LengthProblem
 
 # The readings of an identification with the problem that they pose, and start values in closed form.
 
 
-AnyProblem: TypeAlias = "GridProblem | LengthProblem"
+AnyProblem: TypeAlias = "GridProblem | LengthProblem | PathProblem"
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class Task:
 
     def unknown_names(self) -> list[str]:
         """Names of all unknowns, for messages."""
-        return unknown_names(self.problem, self.lengths.stations, self.station, self.group)
+        return unknown_names(self.problem.parameters, self.lengths.stations, self.station, self.group)
 
 
 def check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
@@ -111,17 +112,23 @@ def task_of(machine: Machine, lengths: Lengths) -> Task:
     return Task(machine, lengths, problem, lengths.station, group)
 
 
-def problem_of(
-    machine: Machine, lengths: Lengths, layout: ErrorParameters, group: IntArray
-) -> GridProblem | LengthProblem:
-    """Return the least-squares problem of the readings: on a grid of levels where they form one, else point by point."""
-    tool_mm = common_tool(machine, lengths.tool_mm)
-    on_grid = grid_problem(layout, lengths.position_mm, tool_mm, lengths.station, group, lengths.length_mm)
-    if on_grid:
-        return on_grid
-    from compgen.identify.adjust.problem import length_problem
+#: Readings from which the compiled pass over scattered positions pays.
+ENOUGH = 20_000
 
-    return length_problem(machine, lengths, layout, group)
+
+def problem_of(machine: Machine, lengths: Lengths, layout: ErrorParameters, group: IntArray) -> AnyProblem:
+    """Return the least-squares problem of the readings: on a grid of levels where they form one, else point by point."""
+    readings = common_tool(machine, lengths.tool_mm), lengths.station, group, lengths.length_mm
+    found: AnyProblem | None = grid_problem(layout, lengths.position_mm, *readings)
+    if found is None and len(lengths) >= ENOUGH and use_compiled(len(lengths), ENOUGH):
+        from compgen.identify.adjust.path_problem import path_problem
+
+        found = path_problem(layout, lengths.position_mm, *readings)
+    if found is None:
+        from compgen.identify.adjust.problem import length_problem
+
+        found = length_problem(machine, lengths, layout, group)
+    return found
 
 
 def dead_lengths_of(lengths: Lengths) -> IntArray:
@@ -510,8 +517,9 @@ def _with_known_stations(
     if known is not stations:
         message = "the stations were located with the machine taken as perfect: its errors are part of their positions"
         warnings.warn(f"{message} (to {known.u_mm.max() * 1e3:.1f} um)", CompgenWarning, stacklevel=5)
+    observed = known_positions(known, task.lengths.stations, sigma_mm)
     start = with_known_start(start, known, task.lengths, task.target_mm, task.group)
-    return replace(task, problem=with_known_positions(task.problem, known, task.lengths.stations, sigma_mm)), start
+    return replace(task, problem=replace(task.problem, known=observed)), start
 
 
 def _two_step_result(

@@ -183,7 +183,9 @@ def planned_rank(found: Planned, matrix: FloatArray) -> Rank:
     """Return the rank with the combinations in words."""
     lengths = found.lengths
     _, group = np.unique(np.column_stack([lengths.station, lengths.labels["setup"]]), axis=0, return_inverse=True)
-    return describe_rank(matrix, unknown_names(found.problem, lengths.stations, lengths.station, group.ravel()))
+    return describe_rank(
+        matrix, unknown_names(found.problem.parameters, lengths.stations, lengths.station, group.ravel())
+    )
 
 
 # What a measurement will determine, and how well, before it is made.

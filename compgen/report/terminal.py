@@ -54,7 +54,7 @@ def identification_table(result: Identification) -> Group:
         text = f"{result.details['values']} values of errors given in {one_line(result.details['file'])}; not identified here"
         return Group(Text(text), _errors_table(result))
     lengths = result.method != "deviations"
-    used = f"{int(result.accepted.sum())} of {len(result.accepted)} "
+    used = f"{result.readings_used} of {result.readings} "
     used += (
         f"lengths used, {len({item.station for item in result.stations})} stations"
         if lengths

@@ -6,7 +6,8 @@ import numpy as np
 
 from compgen.data.csv_files import FloatArray
 from compgen.identify.adjust.unknowns import IntArray
-from compgen.kinematics.compiled_kernels import SERIES_BELOW, rotation_factors
+from compgen.kinematics.compiled_kernels import rotation_factors
+from compgen.kinematics.exact_chain import SERIES_BELOW
 from compgen.kinematics.kernel_switch import FAST, loop
 
 #: Powers of the three local coordinates in each monomial of degree 4 and less; those of degree 2 and less come first.
@@ -21,7 +22,7 @@ LOW = 10
 PRODUCT = np.array([[_PLACE[tuple((a + b).tolist())] for b in POWERS[:LOW]] for a in POWERS[:LOW]], dtype=np.int64)
 #: Two monomials of degree 2 and less whose product each one is.
 HIGH = len(POWERS)
-_FIRST, _SECOND = np.array([np.argwhere(PRODUCT == k)[0] for k in range(HIGH)], dtype=np.int64).T.copy()
+_FIRST, _SECOND = np.array([np.argwhere(k == PRODUCT)[0] for k in range(HIGH)], dtype=np.int64).T.copy()
 #: Room for the monomials of degree 4, and of degree 2: whole vector registers.
 _HIGH_ROOM, _LOW_ROOM = 36, 12
 
@@ -89,9 +90,7 @@ def pass_over(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     cell, count = 0, len(length)
     for i in range(count + 1):
         # stations that read at the same stop follow each other: chain and gradient are passed once for all of them
-        if i == count or (
-            position[0][i] != travel[0] or position[1][i] != travel[1] or position[2][i] != travel[2]
-        ):
+        if i == count or (position[0][i] != travel[0] or position[1][i] != travel[1] or position[2][i] != travel[2]):
             if i > 0:  # forces on the tip, back along the chain
                 for step in range(3):
                     body = 2 - step

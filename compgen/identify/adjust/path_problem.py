@@ -23,8 +23,6 @@ from compgen.identify.adjust.levels import MotionMap, motion_map
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State
 from compgen.kinematics.exact_chain import passing_order, travel_directions
 
-#: Readings from which this form pays against the plain one, which is slower but needs no compiled code.
-ENOUGH = 20_000
 #: Numbers that the sums of all cells may hold; with more nodes the plain form is used.
 MOST_SUMS = 40_000_000
 #: Cells whose blocks are made at a time.
@@ -102,7 +100,7 @@ class PathModel:
     @property
     def first(self) -> list[int]:
         """First node of X, Y and Z in one list of all, and the number of all."""
-        return np.cumsum([0, *(len(nodes) for nodes in self.nodes_mm)]).tolist()
+        return [0, *np.cumsum([len(nodes) for nodes in self.nodes_mm]).tolist()]
 
     @property
     def cells(self) -> int:
@@ -113,9 +111,7 @@ class PathModel:
         """Directions of travel and their derivatives, see ``travel_directions``."""
         names = self.parameters.squareness
         known = dict(zip(names, state.errors[self.parameters.size - len(names) :].tolist(), strict=True))
-        return travel_directions(
-            self.parameters.machine, np.array([known.get(name, 0.0) for name in SQUARENESS_NAMES])
-        )
+        return travel_directions(self.parameters.machine, np.array([known.get(name, 0.0) for name in SQUARENESS_NAMES]))
 
     def sums(
         self,
@@ -306,7 +302,10 @@ def path_problem(
 
 
 def chunk_of(
-    position_mm: FloatArray | tuple[FloatArray, ...], station: NDArray[np.integer], group: IntArray, length_mm: FloatArray
+    position_mm: FloatArray | tuple[FloatArray, ...],
+    station: NDArray[np.integer],
+    group: IntArray,
+    length_mm: FloatArray,
 ) -> Chunk:
     """Return readings as the compiled pass takes them: numbers of 8 bytes, in a row, positions by axis (3, n)."""
     x, y, z = (np.require(along, np.float64, ["C", "W"]) for along in position_mm)

@@ -166,6 +166,7 @@ class LengthProblem(Poses):
     length_mm : readings, (n,).
     weight : 1/variance of each reading in 1/mm^2, zero for a rejected one, (n,).
     known : stations whose coordinates were observed as well.
+    numbers : of stations and dead lengths, where these readings are some of all.
     """
 
     pose: IntArray
@@ -174,16 +175,17 @@ class LengthProblem(Poses):
     length_mm: FloatArray
     weight: FloatArray
     known: KnownPositions | None = None
+    numbers: tuple[int, int] | None = None
 
     @property
     def stations(self) -> int:
         """Number of stations."""
-        return int(self.station.max()) + 1
+        return self.numbers[0] if self.numbers else int(self.station.max()) + 1
 
     @property
     def groups(self) -> int:
         """Number of dead lengths: one for every station and set-up."""
-        return int(self.group.max()) + 1
+        return self.numbers[1] if self.numbers else int(self.group.max()) + 1
 
     @property
     def size(self) -> int:

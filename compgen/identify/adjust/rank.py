@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.errors import UndeterminedError
 from compgen.identify.adjust.solver import Factor, factorise
-from compgen.identify.adjust.unknowns import IntArray, LeastSquaresProblem
+from compgen.identify.adjust.unknowns import ErrorParameters, IntArray
 
 #: Eigenvalues of the normal matrix with unit diagonal below this count as zero. A determined problem stays above
 #: about 1e-7, an undetermined direction falls to 1e-14: there is a wide gap.
@@ -115,15 +115,15 @@ def _sparse_directions(vectors: FloatArray) -> FloatArray:
 
 
 def unknown_names(
-    problem: LeastSquaresProblem, stations: tuple[str, ...], station: IntArray, group: IntArray
+    parameters: ErrorParameters, stations: tuple[str, ...], station: IntArray, group: IntArray
 ) -> list[str]:
     """Names of all unknowns, e.g. ``EXX at -80 mm``, ``EC0Y``, ``LT1 x``, ``LT1 dead length``."""
     names: list[str] = []
-    for curve in problem.parameters.curves:
+    for curve in parameters.curves:
         for column in curve.free.T:
             strongest = int(np.argmax(np.abs(column)))
             names.append(f"{curve.error.name} at {curve.nodes_mm[strongest]:g} mm")
-    names += problem.parameters.squareness
+    names += parameters.squareness
     names += [f"{name} {letter}" for name in stations for letter in "xyz"]
     owner = dict(zip(group.tolist(), station.tolist(), strict=True))
     names += [f"{stations[owner[k]]} dead length" for k in sorted(owner)]

@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dpocon, dpotrf, dpotrs, dtrtri
 
 from compgen.data.csv_files import FloatArray
 from compgen.errors import ConvergenceError
-from compgen.identify.adjust.unknowns import LeastSquaresProblem, State
+from compgen.identify.adjust.unknowns import ErrorParameters, LeastSquaresProblem, State
 
 #: The remaining distance to the optimum, estimated from the last two steps, that ends the iteration (mm; angles count
 #: at a lever of one metre).
@@ -113,7 +113,7 @@ def solve(problem: LeastSquaresProblem, start: State, factor: Factor | None = No
     state = start
     cost, gradient = problem.evaluate(state)
     damping, previous, factorisations = 0.0, np.inf, 0
-    levers = step_levers(problem)
+    levers = step_levers(problem.parameters, problem.size)
     fresh = False
     for iteration in range(1, MAX_ITERATIONS + 1):
         if factor is None:
@@ -161,10 +161,9 @@ def _positive_factor(matrix: FloatArray, damping: float) -> tuple[Factor, float]
     raise ConvergenceError("the normal matrix is not positive definite; the data do not determine the unknowns")
 
 
-def step_levers(problem: LeastSquaresProblem) -> FloatArray:
-    """Lever of every unknown in a step size: 1 for lengths, 1000 mm for rotations, shape (size,)."""
-    parameters = problem.parameters
-    levers = np.ones(problem.size)
+def step_levers(parameters: ErrorParameters, size: int) -> FloatArray:
+    """Lever of each of ``size`` unknowns, errors first, in a step: 1 for lengths, 1000 mm for rotations, (size,)."""
+    levers = np.ones(size)
     for curve in parameters.curves:
         if curve.error.kind == "angular":
             levers[curve.columns] = 1000.0

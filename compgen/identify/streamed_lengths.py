@@ -1,0 +1,280 @@
+"""Errors from an archive of tracer lengths, however many: the normal equations are added up chunk by chunk.
+
+A sample of the readings is identified first, as a file of its own: with rank, gross errors, tests of the residuals and all
+warnings. From its optimum on all readings count: passes over the archive, chunk by chunk, add up cost, gradient and
+normal matrix until no unknown moves. So the memory that is needed does not depend on the number of readings.
+
+What the sample does for all, since nothing of the size of the readings is kept: the residuals that are kept, and the
+tests that look at the order of the readings (whiteness, misfit and its causes, weak errors). A gross error is a reading
+beyond the robust limit at the optimum; beam breaks get no dead length of their own, what lies behind one is rejected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.length_archive import CHUNK, MOST_WHOLE, LengthArchive
+from compgen.data.lengths import Lengths
+from compgen.data.machine import Machine
+from compgen.data.names import MM_PER_UM
+from compgen.data.records import POSITION_COLUMNS
+from compgen.errors import ConvergenceError, InputError
+from compgen.identify.adjust.path_problem import Chunk, Noise, PathModel, Sums, chunk_of, path_model
+from compgen.identify.adjust.problem import LengthProblem
+from compgen.identify.adjust.propagation import SystematicInputs
+from compgen.identify.adjust.rank import determined_factor, unknown_names
+from compgen.identify.adjust.residual_tests import misfit_of, residual_series
+from compgen.identify.adjust.robust import LIMIT, MOST_REJECTED, Rejected, standardised_spread
+from compgen.identify.adjust.solver import Factor, step_levers
+from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State, check_travel, common_tool
+from compgen.identify.identification import Identification, error_table, uncertainty_scale, worst_uncertainty
+from compgen.identify.options import IdentifyOptions
+from compgen.identify.reference_conditions import reading_conditions
+from compgen.identify.tracer_lengths import identify
+from compgen.kinematics.kernel_switch import one_thread, use_compiled
+
+#: The remaining distance to the optimum, estimated from the last two steps, that ends the passes, mm.
+TOLERANCE_MM = 1e-8
+MOST_PASSES = 12
+#: Rejected readings that are named; the others are counted.
+MOST_NAMED = 1000
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """The archive with its unknowns; ``setups`` (G, 2) are station and set-up of each dead length.
+
+    ``model`` is the compiled form; without it every chunk is a problem of its own.
+    """
+
+    archive: LengthArchive
+    layout: ErrorParameters
+    tool_mm: FloatArray
+    setups: IntArray
+    model: PathModel | None
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Readings that are in memory at a time."""
+        columns = self.archive.columns
+        most = int(self.setups[:, 1].max()) + 1
+        for rows in self.archive.chunks():
+            station = group = np.asarray(columns["station"][rows], dtype=np.int64)
+            if "setup" in columns:
+                group = np.searchsorted(self.setups @ (most, 1), station * most + columns["setup"][rows])
+            x, y, z = (columns[name][rows] for name in POSITION_COLUMNS)
+            yield chunk_of((x, y, z), station, group, columns["length_mm"][rows])
+
+    def sums(self, state: State, noise: Noise, rejected: list[tuple[int, float]], *, matrix: bool) -> Sums:
+        """Pass over all readings; ``rejected`` gets row and residual of those that are not used, some of them."""
+        rejected.clear()
+        first = 0
+
+        def look(chunk: Chunk, residual: FloatArray) -> None:
+            nonlocal first
+            if len(rejected) < MOST_NAMED and np.isnan(residual.sum()):
+                for row in np.flatnonzero(np.isnan(residual))[: MOST_NAMED - len(rejected)].tolist():
+                    position = np.array([[along[row] for along in chunk.position_mm]])
+                    sight = self.layout.tips(state.errors, position, self.tool_mm)[0]
+                    distance = float(np.linalg.norm(sight - state.stations_mm[chunk.station[row]]))
+                    reading = float(chunk.length_mm[row] + state.dead_length_mm[chunk.group[row]])
+                    rejected.append((first + row, distance - reading))
+            first += len(residual)
+
+        if self.model is not None:
+            weight, room = np.ones(CHUNK), np.empty(CHUNK)
+            sized = ((chunk, weight[: len(chunk.group)], room[: len(chunk.group)]) for chunk in self.chunks())
+            return self.model.sums(state, sized, noise, matrix=matrix, look=look)
+        size = self.layout.size + 3 * len(self.archive.stations) + len(self.setups)
+        total = Sums(np.zeros(size), np.zeros((len(self.setups), 3)), np.zeros((size, size)) if matrix else None)
+        for chunk in self.chunks():
+            self._add_plain(total, chunk, state, noise, look)
+        return total
+
+    def _add_plain(
+        self, total: Sums, chunk: Chunk, state: State, noise: Noise, look: Callable[[Chunk, FloatArray], None]
+    ) -> None:
+        """Add a chunk without compiled code: its normal equations are those of a problem of its own."""
+        count, stations = len(chunk.group), len(self.archive.stations)
+        position = np.column_stack(chunk.position_mm)
+        poses, pose = np.unique(position, axis=0, return_inverse=True)
+        tools = np.broadcast_to(self.tool_mm, poses.shape)
+        bases = self.layout.bases(poses)
+        at = pose.ravel(), chunk.station, chunk.group, chunk.length_mm, np.ones(count)
+        problem = LengthProblem(self.layout, bases, poses, tools, *at, numbers=(stations, len(self.setups)))
+        residual = problem.residuals(state)
+        sigma = noise.constant_mm + noise.proportional * (
+            residual + chunk.length_mm + state.dead_length_mm[chunk.group]
+        )
+        used = np.abs(residual) <= noise.limit * sigma
+        weight = np.where(used, (noise.scale_mm / sigma) ** 2, 0.0)
+        cost, gradient = problem.weighted(weight).evaluate(state)
+        total.cost += cost
+        total.gradient += gradient
+        if total.matrix is not None:
+            total.matrix += problem.weighted(weight).normal_matrix(state)
+        for k, values in enumerate((used.astype(np.float64), np.where(used, residual**2, 0.0), weight)):
+            total.by_group[:, k] += np.bincount(chunk.group, values, len(self.setups))
+        look(chunk, np.where(used, residual, np.nan))
+
+
+def identify_archive(
+    machine: Machine, archive: LengthArchive, options: IdentifyOptions | None = None
+) -> Identification:
+    """Identify the errors of a machine, the stations and the dead lengths from an archive of tracer lengths.
+
+    The result is that of :func:`compgen.identify.identify`, but ``residual_mm`` and ``accepted`` are those of the sample.
+
+    Raises
+    ------
+    InputError
+        for options and corrections that need all readings at once, and whatever :func:`compgen.identify.identify` refuses.
+    UndeterminedError
+        if the readings do not determine the unknowns; it names the combinations.
+    ConvergenceError
+        if no optimum is reached, or so many readings do not fit that the model must be wrong.
+    """
+    chosen = options or IdentifyOptions()
+    if chosen.method != "joint" or chosen.stations is not None or chosen.systematic != SystematicInputs():
+        raise InputError(
+            "--method, --stations and the systematic inputs need all readings in memory; an archive of more than "
+            f"{MOST_WHOLE} readings takes none of them: write some of its readings to another one",
+            file=archive.path,
+        )
+    low, high = (np.array(ends) for ends in (machine.lower_mm, machine.upper_mm))
+
+    def within(first: int, position_mm: FloatArray) -> None:
+        if (position_mm.min(axis=1) < low).any() or (position_mm.max(axis=1) > high).any():
+            origin = [(str(archive.path), first + k + 1) for k in range(position_mm.shape[1])]
+            check_travel(machine, position_mm.T, origin)
+
+    archive.check(within)
+    sample = archive.taken(archive.sample_rows)
+    if "u_length_um" in sample.covariates:
+        message = (
+            f"is a column; an archive of more than {MOST_WHOLE} readings takes one u_length_um and u_length_um_per_m"
+        )
+        raise InputError(message, file=archive.path, field="u_length_um")
+    _, conditions = reading_conditions(machine, sample, temperature=chosen.temperature)
+    if conditions.needs_geometry or conditions.notes:
+        raise InputError(
+            "needs a correction for temperature, air or effects of the machine file, which an archive of more than "
+            f"{MOST_WHOLE} readings does not get; correct the readings before, or write some of them to another archive",
+            file=archive.path,
+        )
+    found = identify(machine, sample, chosen)
+    with one_thread():
+        return _with_all(machine, archive, sample, found, reject=chosen.reject)
+
+
+def _with_all(
+    machine: Machine, archive: LengthArchive, sample: Lengths, found: Identification, *, reject: bool
+) -> Identification:
+    """Bring the identification of the sample to the optimum of all readings: Gauss-Newton with one normal matrix."""
+    assert found.adjustment is not None
+    layout, state, tool_mm = found.layout, found.adjustment.state, common_tool(machine, None)
+    setups = np.array([(archive.stations.index(item.station), item.setup) for item in found.stations], dtype=np.int64)
+    if any(item.segment for item in found.stations):
+        raise ConvergenceError(
+            "the sample of the readings shows beam breaks, behind which the dead length of a station is another one; give "
+            "the readings behind each a setup of their own"
+        )
+    model = path_model(layout, tool_mm, setups[:, 0]) if use_compiled(len(archive), 0) else None
+    stream = _Stream(archive, layout, tool_mm, setups, model)
+    scale_mm = found.adjustment.sigma_mm / found.u_scale
+    constant_mm, proportional = found.u_length_um * MM_PER_UM, found.u_length_um_per_m * MM_PER_UM / 1000.0
+    distance = sample.length_mm + found.residual_mm + state.dead_length_mm[found.adjustment.group]
+    standardised = found.residual_mm / (constant_mm + proportional * distance)
+    limit = LIMIT * standardised_spread(standardised) if reject else np.inf
+    noise = Noise(constant_mm, proportional, scale_mm, limit)
+    size = layout.size + 3 * len(archive.stations) + len(setups)
+    levers = step_levers(layout, size)
+
+    def names() -> list[str]:
+        return unknown_names(layout, archive.stations, setups[:, 0], np.arange(len(setups)))
+
+    rejected: list[tuple[int, float]] = []
+    factor: Factor | None = None
+    rank, previous, used, passes = None, np.inf, -1.0, 0
+    while True:
+        sums, before, passes = stream.sums(state, noise, rejected, matrix=factor is None), used, passes + 1
+        used = float(sums.by_group[:, 0].sum())
+        if len(archive) - used > MOST_REJECTED * len(archive) or passes > MOST_PASSES:
+            raise ConvergenceError(
+                f"{len(archive) - used:.0f} of {len(archive)} readings do not fit the model of a sample of them; look for "
+                "beam breaks (readings behind one need a setup of their own), and check station labels and units"
+            )
+        if sums.matrix is not None:
+            factor, rank = determined_factor(sums.matrix, names, "the readings")
+        assert factor is not None
+        step = -factor.solve(sums.gradient)
+        length = float(np.max(np.abs(step) * levers))
+        state = state.moved(step)
+        if length * min(length / previous, 1.0) < TOLERANCE_MM and used == before:
+            break
+        previous = length
+    freedom = int(used) - size
+    chi_square = 2.0 * sums.cost / scale_mm**2 / freedom
+    u_scale = uncertainty_scale(chi_square, found.u_source)
+    adjustment = replace(found.adjustment, state=state, factor=factor, sigma_mm=scale_mm * u_scale)
+    u = np.sqrt(np.einsum("ij,ij->i", adjustment.covariance_factor(), adjustment.covariance_factor()))
+    errors = error_table(layout, state.errors, adjustment.covariance_factor()[: layout.size])
+    errors = errors.replace(metadata=found.errors.metadata)
+    stations = []
+    for k, item in enumerate(found.stations):
+        at = layout.size + 3 * int(setups[k, 0])
+        (x, y, z), (u_x, u_y, u_z) = state.stations_mm[setups[k, 0]].tolist(), u[at : at + 3].tolist()
+        count, squares = sums.by_group[k, 0], sums.by_group[k, 1]
+        stations.append(
+            replace(
+                item,
+                position_mm=(x, y, z),
+                u_position_mm=(u_x, u_y, u_z),
+                dead_length_mm=float(state.dead_length_mm[k]),
+                u_dead_length_mm=float(u[layout.size + 3 * len(archive.stations) + k]),
+                readings=int(count),
+                rms_um=float(np.sqrt(squares / max(count, 1.0))) / MM_PER_UM,
+            )
+        )
+    kept, group = found.accepted, found.adjustment.group
+    return replace(
+        found,
+        errors=errors,
+        stations=tuple(stations),
+        counted=(len(archive), int(used)),
+        rms_um=float(np.sqrt(sums.by_group[:, 1].sum() / used)) / MM_PER_UM,
+        degrees_of_freedom=freedom,
+        reduced_chi_square=chi_square,
+        u_scale=u_scale,
+        rejected=tuple(_rejected(archive, row, off_mm) for row, off_mm in rejected),
+        rank=size if rank is None else rank.rank,
+        condition=1.0 / factor.rcond,
+        iterations=passes,
+        worst_u=worst_uncertainty(errors),
+        adjustment=adjustment,
+        misfit=misfit_of(
+            chi_square,
+            freedom,
+            u_scale,
+            found.u_source,
+            lambda: residual_series(
+                sample, np.flatnonzero(kept), found.residual_mm[kept], scale_mm * np.ones(int(kept.sum())), group[kept]
+            ),
+        ),
+        details={
+            "sample_readings": len(sample),
+            "passes": passes,
+            "robust_limit": limit if np.isfinite(limit) else None,
+            "from_the_sample": "residuals, whiteness, causes of a misfit, beam breaks",
+        },
+    )
+
+
+def _rejected(archive: LengthArchive, row: int, off_mm: float) -> Rejected:
+    station = archive.stations[int(archive.columns["station"][row : row + 1][0])]
+    off_um = -off_mm / MM_PER_UM
+    reason = f"differs from the model by {off_um:+.1f} um; beam break or disturbed reading?"
+    return Rejected(row, station, str(row + 1), off_um, reason, str(archive.path), row + 1)
