@@ -47,12 +47,15 @@ from compgen.report.terminal import plan_table, suggestion_table, trajectory_tab
 from compgen.simulate import (
     AxisLaser,
     DiagonalLaser,
+    LaserTracer,
+    MovingSimulation,
     SimulatedReadings,
     SimulatedSixDof,
     Simulation,
     read_scenario,
     simulate,
     simulate_axis_runs,
+    simulate_moving,
     simulate_sixdof,
     write_simulation,
 )
@@ -211,7 +214,8 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
     """Simulate a machine and its measurement: writes *.lengths.csv (mm) and truth.errors.csv (um, urad) to DIR.
 
     A scenario whose instrument has type = "sixdof" writes *.sixdof.csv in place of lengths, one with "axis-laser"
-    *.axis.csv, with "diagonal-laser" *.diagonals.csv (um).
+    *.axis.csv, with "diagonal-laser" *.diagonals.csv (um). A laser-tracer with rate_hz reads while the machine moves and
+    writes *.lengths.npz, the binary form of lengths.
 
     \b
     Example:
@@ -220,17 +224,21 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
     with progress(quiet=as_json) as show:
         show("simulating")
         planned = read_scenario(scenario)
-        simulation: Simulation | SimulatedReadings
-        if isinstance(planned.instrument, AxisLaser | DiagonalLaser):
+        simulation: Simulation | SimulatedReadings | MovingSimulation
+        if isinstance(planned.instrument, LaserTracer) and planned.instrument.rate_hz is not None:
+            simulation = simulate_moving(machine, planned, seed)
+        elif isinstance(planned.instrument, AxisLaser | DiagonalLaser):
             simulation = simulate_axis_runs(machine, planned, seed)
         elif isinstance(planned.instrument, SimulatedSixDof):
             simulation = simulate_sixdof(machine, planned, seed)
         else:
             simulation = simulate(machine, planned, seed)
-    paths = write_simulation(simulation, out)
+        paths = write_simulation(simulation, out)
     if as_json:
         if isinstance(simulation, SimulatedReadings):
             summary = {"readings": len(simulation.readings), "stations": []}
+        elif isinstance(simulation, MovingSimulation):
+            summary = {"readings": simulation.readings, "stations": [item.name for item in simulation.stations]}
         else:
             summary = {"readings": len(simulation.lengths), "stations": list(simulation.lengths.stations)}
         print_json({**summary, "files": {name: str(path) for name, path in paths.items()}})

@@ -5,6 +5,7 @@ from compgen.simulate.lasers import AxisLaser, DiagonalLaser, LaserTracer, Stati
 from compgen.simulate.run import (
     INSTRUMENTS,
     Instrument,
+    MovingSimulation,
     Scenario,
     SimulatedReadings,
     Simulation,
@@ -12,6 +13,7 @@ from compgen.simulate.run import (
     read_scenario,
     simulate,
     simulate_axis_runs,
+    simulate_moving,
     simulate_sixdof,
     write_simulation,
 )
@@ -28,6 +30,7 @@ __all__ = [
     "Instrument",
     "LaserTracer",
     "Line",
+    "MovingSimulation",
     "RandomErrors",
     "Scenario",
     "Simulation",
@@ -43,6 +46,7 @@ __all__ = [
     "read_scenario",
     "simulate",
     "simulate_axis_runs",
+    "simulate_moving",
     "simulate_sixdof",
     "trajectory_points",
     "write_simulation",

@@ -54,12 +54,14 @@ class LaserTracer:
     noise_um, noise_um_per_m : a and b of the standard deviation a + b L of a reading, L the distance in m.
     in_turn : False: all stations read at every stop; True: one tracer goes from station to station, and the machine
         repeats its whole trajectory for each.
+    rate_hz : readings a second of each station while the machine moves, without stops; None reads at stops.
     """
 
     stations: tuple[Station, ...]
     noise_um: float = setting(toml_files.not_negative, 0.1)
     noise_um_per_m: float = setting(toml_files.not_negative, 0.15)
     in_turn: bool = setting(toml_files.word_for({"at-once": False, "in-turn": True}), False, key="reading")
+    rate_hz: float | None = setting(toml_files.positive, None)
 
     @property
     def passes(self) -> int:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import re
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,8 +23,11 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import ErrorTable, format_errors
 from compgen.data.files import OutputFolder
+from compgen.data.length_archive import write_archive
 from compgen.data.lengths import Lengths, format_lengths
 from compgen.data.machine import Machine
+from compgen.data.names import SECONDS_PER_MIN
+from compgen.data.records import ARCHIVE
 from compgen.data.registry import call_problem
 from compgen.errors import InputError
 from compgen.instruments.sixdof_readings import SixDof, format_sixdof
@@ -45,6 +48,8 @@ from compgen.simulate.trajectory import (
     Stops,
     Temperature,
     Trajectory,
+    check_stops,
+    passes_of,
     plan_session,
     plan_stops,
     read_session,
@@ -294,6 +299,8 @@ def simulate(
         raise InputError("is a six-DOF instrument, which has no lengths; call simulate_sixdof", file=scenario.source)
     if isinstance(instrument, LineLaser):
         raise InputError("runs along lines and has no lengths; call simulate_axis_runs", file=scenario.source)
+    if isinstance(instrument, LaserTracer) and instrument.rate_hz is not None:
+        raise InputError("reads while the machine moves; call simulate_moving", file=scenario.source)
     for effect in scenario.effects:
         if isinstance(effect, RunEffect):
             message = f"{effect.name} acts on axis runs only; their instrument has type = 'axis-laser'"
@@ -341,6 +348,74 @@ def _changed(
     sights = Sights(stops, stop, names, station, places[station], tip_mm[stop])
     change = np.sum([effect.change(sights) for effect in effects], axis=0)
     return replace(lengths, length_mm=lengths.length_mm + change)
+
+
+@dataclass(frozen=True)
+class MovingSimulation:
+    """Readings of tracers while a virtual machine moves, made part by part as they are written, and its true errors.
+
+    ``name`` begins the file names, ``readings`` is their number, ``parts`` makes their columns.
+    """
+
+    name: str
+    readings: int
+    stations: tuple[Station, ...]
+    truth: ErrorTable
+    metadata: Mapping[str, str]
+    parts: Callable[[], Iterator[dict[str, Any]]]
+
+
+#: Positions whose readings are made at a time.
+_PART = 50_000
+
+
+def simulate_moving(machine: Machine, scenario: Scenario, seed: int | None = None) -> MovingSimulation:
+    """Measure a virtual machine while it moves along the trajectory: ``rate_hz`` readings a second at constant feed.
+
+    Raises
+    ------
+    InputError
+        if the trajectory leaves the travel, or for what belongs to stops: effects, temperatures, sessions, other tools.
+    """
+    used_seed = scenario.seed if seed is None else seed
+    seeds = np.random.SeedSequence(used_seed)
+    tracer, path = scenario.instrument, scenario.trajectory
+    if not isinstance(tracer, LaserTracer) or tracer.rate_hz is None or tracer.in_turn:
+        message = "needs a laser-tracer with rate_hz whose stations read at once"
+        raise InputError(message, file=scenario.source, field="[instrument]")
+    if scenario.effects or scenario.temperatures or scenario.session or path.tools_mm:
+        message = "readings on the fly (rate_hz) have no effects, temperatures, sessions or tools of their own"
+        raise InputError(message, file=scenario.source)
+    truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
+    corners = np.concatenate(passes_of(path, machine))
+    check_stops(corners, machine)
+    way_mm = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    rate_hz = tracer.rate_hz
+    step_mm = path.feed_mm_min / SECONDS_PER_MIN / rate_hz
+    count, stations = int(way_mm[-1] / step_mm) + 1, len(tracer.stations)
+    centre_mm = np.array([item.position_mm for item in tracer.stations])
+    dead_mm = np.array([item.dead_length_mm for item in tracer.stations])
+
+    def parts() -> Iterator[dict[str, Any]]:
+        rng = random_stream(seeds, NOISE_STREAM)
+        for first in range(0, count, _PART):
+            at_mm = np.arange(first, min(first + _PART, count)) * step_mm
+            position_mm = np.stack([np.interp(at_mm, way_mm, along) for along in corners.T], axis=1)
+            tip_mm = tip_position(machine, truth.at(position_mm), position_mm)
+            distance_mm = np.linalg.norm(tip_mm[:, None] - centre_mm, axis=2)
+            noise_mm = tracer.sigma_mm(distance_mm) * rng.standard_normal(distance_mm.shape)
+            columns = {f"{axis}_mm": position_mm[:, k].repeat(stations) for k, axis in enumerate("xyz")}
+            yield {
+                "station": np.tile(np.arange(stations, dtype=np.int16), len(at_mm)),
+                **columns,
+                "length_mm": (distance_mm - dead_mm + noise_mm).ravel(),
+                "time_s": (at_mm / step_mm / rate_hz).repeat(stations),
+            }
+
+    noise = {"u_length_um": f"{tracer.noise_um:g}", "u_length_um_per_m": f"{tracer.noise_um_per_m:g}"}
+    metadata = {**_common(machine, used_seed), "instrument": "laser-tracer", **noise}
+    described = _described(machine, truth, used_seed)
+    return MovingSimulation(scenario.name, count * stations, tracer.stations, described, metadata, parts)
 
 
 def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = None) -> SimulatedReadings:
@@ -402,7 +477,9 @@ _FORMATS: dict[type, tuple[str, Callable[[Any], str]]] = {
 }
 
 
-def write_simulation(simulation: Simulation | SimulatedReadings, folder: str | Path) -> dict[str, Path]:
+def write_simulation(
+    simulation: Simulation | SimulatedReadings | MovingSimulation, folder: str | Path
+) -> dict[str, Path]:
     """Write the readings, e.g. ``<name>.lengths.csv``, and ``truth.errors.csv``; return paths by file name.
 
     Examples
@@ -417,6 +494,13 @@ def write_simulation(simulation: Simulation | SimulatedReadings, folder: str | P
     ['truth.errors.csv', 'zha-gantry.lengths.csv']
     """
     output = OutputFolder(folder)
+    if isinstance(simulation, MovingSimulation):
+        output.add("truth.errors.csv", format_errors(simulation.truth))
+        paths = output.commit()
+        target = output.folder / f"{simulation.name}{ARCHIVE}"
+        names = [item.name for item in simulation.stations]
+        write_archive(target, names, simulation.parts(), simulation.metadata)
+        return {**paths, target.name: target}
     readings = simulation.lengths if isinstance(simulation, Simulation) else simulation.readings
     suffix, text_of = _FORMATS[type(readings)]
     output.add(f"{simulation.name}{suffix}", text_of(readings))
