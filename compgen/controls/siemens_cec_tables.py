@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lstsq
 
-from compgen.controls.shared.base import SourceFile, Term
+from compgen.controls.shared.base import SourceFile, Term, parameter_row
 from compgen.controls.shared.grids import equidistant_grid
 from compgen.controls.shared.terms import one_dimensional_name, product_name
 from compgen.controls.siemens_text import LinearTable, exact_grid, exact_values
@@ -341,36 +341,9 @@ def reversal_statement(tables: CecMap, names: tuple[str, ...]) -> str:
 
 def backlash_rows(tables: CecMap, names: tuple[str, ...]) -> list[dict[str, str]]:
     """Return the machine data that must be zero because tables of one direction hold the same effect."""
+    meaning = "the tables with DIRECTION 1 and -1 hold the reversal; with both it would be corrected twice"
     axes = sorted({entry.input_axis for entry in tables.values() if entry.direction})
-    return [
-        {
-            "name": f"MD32450 $MA_BACKLASH[{names[axis]}]",
-            "value": "0",
-            "meaning": "the tables with DIRECTION 1 and -1 hold the reversal; with both it would be corrected twice",
-        }
-        for axis in axes
-    ]
-
-
-def plain_backlash_rows(
-    reversal: ReversalCurves, names: tuple[str, ...], encoders: Sequence[Sequence[int]]
-) -> list[dict[str, str]]:
-    """Return MD32450 for the mean reversal of each axis along itself: positive where the tool stops short.
-
-    Source: MD32450 is positive if the encoder leads the machine part (SINUMERIK parameter manuals), the usual case;
-    then the position reached in positive direction is the smaller one, and the reversal value B is negative.
-    """
-    return [
-        {
-            "name": f"MD32450 $MA_BACKLASH[{encoder},{names[axis]}]",
-            "value": f"{-reversal.mean_mm(axis):.4f} mm",
-            "meaning": f"minus the mean reversal value of {AXES[axis]}; these tables act in both directions alike. If a "
-            "value was active while the machine was measured, add this one to it",
-        }
-        for axis in range(3)
-        for encoder in encoders[axis]
-        if abs(reversal.mean_mm(axis)) >= WORTH_MM
-    ]
+    return [parameter_row(f"MD32450 $MA_BACKLASH[{names[axis]}]", "0", meaning) for axis in axes]
 
 
 # Which CEC tables to keep where a control has too few: those that leave the least error over the volume.
@@ -400,7 +373,7 @@ class Choice:
     ----------
     kept : terms in their order.
     dropped : (name, mm): for each term that has no room what it would take out (rms over the volume) in addition.
-    tables, allowed : tables that the kept terms take, and that there are (None: not limited).
+    allowed : tables that there are (None: not limited).
     needed : tables that all terms would take.
     left_mm : rms over the volume that all terms would take out and the kept ones do not.
     given : terms of tables of another kind, which are there in any case.
@@ -408,7 +381,6 @@ class Choice:
 
     kept: list[Term]
     dropped: tuple[tuple[str, float], ...]
-    tables: int
     allowed: int | None
     needed: int
     left_mm: float
@@ -461,7 +433,7 @@ def chosen_terms(
     """
     needed = table_count(terms, mode)
     if allowed is None or needed <= allowed:
-        return Choice(list(terms), (), needed, allowed, needed, 0.0)
+        return Choice(list(terms), (), allowed, needed, 0.0)
     gains = [_Gains.of(machine, errors, terms, given, output) for output in range(3)]
     # the best set of each axis such that all together take no more tables than there are, by dynamic programming
     best: dict[int, tuple[float, list[tuple[Term, ...]]]] = {0: (0.0, [])}
@@ -477,11 +449,8 @@ def chosen_terms(
     picked = max(best.values(), key=lambda item: item[0])[1]
     names = {term.name for part in picked for term in part} or {terms[0].name}
     kept = [term for term in terms if term.name in names]
-    left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, picked, strict=True))
-    dropped = [item for gain, part in zip(gains, picked, strict=True) for item in gain.missed(part)]
-    return Choice(
-        kept, tuple(dropped), table_count(kept, mode), allowed, needed, float(np.sqrt(max(left, 0.0))), tuple(given)
-    )
+    dropped, left_mm = _left_out(gains, picked)
+    return Choice(kept, tuple(dropped), allowed, needed, left_mm, tuple(given))
 
 
 def without_products(
@@ -494,15 +463,21 @@ def without_products(
     ordinary = [term for term in terms if term.carrier[0].lever is None]
     gains = [_Gains.of(machine, errors, terms, given, output) for output in range(3)]
     own = [[term for term in gain.terms if term in ordinary] for gain in gains]
-    left = sum(gain.of_all - gain.taken(part) for gain, part in zip(gains, own, strict=True))
-    missed = [item for gain, part in zip(gains, own, strict=True) for item in gain.missed(part)]
+    missed, left_mm = _left_out(gains, own)
     named = _named(missed)
     if not named:
         return []
     return [
         f"no products of tables are written: not corrected are {named}; together they leave "
-        f"{np.sqrt(max(left, 0.0)) / MM_PER_UM:.2f} um rms over the volume (first order)"
+        f"{left_mm / MM_PER_UM:.2f} um rms over the volume (first order)"
     ]
+
+
+def _left_out(gains: Sequence[_Gains], kept: Sequence[Sequence[Term]]) -> tuple[list[tuple[str, float]], float]:
+    """Return (name, rms mm) of the terms that are not kept, and the rms over the volume (mm) that they leave together."""
+    pairs = list(zip(gains, kept, strict=True))
+    left = sum(gain.taken(gain.terms) - gain.taken(part) for gain, part in pairs)
+    return [item for gain, part in pairs for item in gain.missed(part)], float(np.sqrt(max(left, 0.0)))
 
 
 def _named(missed: Sequence[tuple[str, float]]) -> str:
@@ -581,11 +556,6 @@ class _Gains:
         design = design * scale
         normal, right = design.T @ (weight[:, None] * design), design.T @ (weight * target)
         return cls(tuple(own), tuple(others), normal, right, float(weight @ target**2), columns)
-
-    @property
-    def of_all(self) -> float:
-        """What all terms take out, mm^2."""
-        return self.taken(self.terms)
 
     def taken(self, terms: Sequence[Term]) -> float:
         """Squares that a set of terms takes out, mm^2."""

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis, parameter_row
 from compgen.controls.shared.grids import equidistant_grid
 from compgen.controls.shared.terms import one_dimensional_terms
-from compgen.controls.siemens_cec_tables import plain_backlash_rows
 from compgen.controls.siemens_machine_data import PROFILES, EecSettings, checked_encoder_settings
 from compgen.controls.siemens_text import (
     SWITCHES,
@@ -33,7 +32,7 @@ from compgen.controls.siemens_text import (
     table_violations,
 )
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
@@ -134,21 +133,11 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         rows = []
         for (axis, encoder), table in sorted(tables.tables.items()):
             name, count = self.settings.axis_names[axis], len(table.values)
-            rows.append(
-                {
-                    "name": f"MD38000 $MA_MM_ENC_COMP_MAX_POINTS[{encoder},{name}]",
-                    "value": f">= {count}",
-                    "meaning": f"reserved nodes; {count * BYTES_PER_VALUE} bytes of static memory, which the change "
-                    "re-formats: save all data first",
-                }
-            )
-            rows.append(
-                {
-                    "name": f"MD32700 $MA_ENC_COMP_ENABLE[{encoder}] of {name}",
-                    "value": "0, then 1",
-                    "meaning": "0 while the file is loaded; 1 makes the table act and write-protects it",
-                }
-            )
+            points = f"MD38000 $MA_MM_ENC_COMP_MAX_POINTS[{encoder},{name}]"
+            memory = f"reserved nodes; {count * BYTES_PER_VALUE} bytes of static memory, which the change re-formats"
+            rows.append(parameter_row(points, f">= {count}", f"{memory}: save all data first"))
+            meaning = "0 while the file is loaded; 1 makes the table act and write-protects it"
+            rows.append(parameter_row(f"MD32700 $MA_ENC_COMP_ENABLE[{encoder}] of {name}", "0, then 1", meaning))
         return rows
 
     def _warnings(self, tables: EecTables) -> list[str]:
@@ -216,8 +205,19 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         return nodes_by_axis((axis, table.nodes_mm) for (axis, _), table in tables.tables.items())
 
     def backlash_parameters(self, reversal: ReversalCurves) -> list[dict[str, str]]:
-        """Return MD32450 of each axis with a reversal along itself."""
-        return plain_backlash_rows(reversal, self.settings.axis_names, self.settings.encoders)
+        """Return MD32450 for the mean reversal of each axis along itself: positive where the tool stops short.
+
+        Source: MD32450 is positive if the encoder leads the machine part (SINUMERIK parameter manuals), the usual case;
+        then the position reached in positive direction is the smaller one, and the reversal value B is negative.
+        """
+        rows = []
+        for axis, name in enumerate(self.settings.axis_names):
+            meaning = f"minus the mean reversal value of {AXES[axis]}; these tables act in both directions alike. If a "
+            meaning += "value was active while the machine was measured, add this one to it"
+            mean_mm = reversal.mean_mm(axis)
+            for encoder in self.settings.encoders[axis] if abs(mean_mm) >= WORTH_MM else ():
+                rows.append(parameter_row(f"MD32450 $MA_BACKLASH[{encoder},{name}]", f"{-mean_mm:.4f} mm", meaning))
+        return rows
 
     def usage(self, tables: EecTables) -> list[Usage]:
         """Return the nodes of each axis against what the control can hold."""

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from compgen.controls.shared.base import Usage
+from compgen.controls.shared.base import Usage, parameter_row
 from compgen.controls.shared.grids import loss_setting
 from compgen.controls.siemens_cec_tables import MULT_MODES, CecMap, sum_into_axes
 from compgen.controls.siemens_text import POSITION_QUANTUM_MM, table_violations
@@ -511,26 +511,30 @@ def cec_parameters(
 ) -> list[dict[str, str]]:
     """Return the machine and setting data with the values that these tables need."""
     rows = [
-        _row(f"MD18342 $MN_MM_CEC_MAX_POINTS[{index}]", str(len(entry.table.values)), "nodes of the table, exactly")
+        parameter_row(
+            f"MD18342 $MN_MM_CEC_MAX_POINTS[{index}]", str(len(entry.table.values)), "nodes of the table, exactly"
+        )
         for index, entry in sorted(tables.items())
     ]
     rows += [
-        _row(f"SD41300 $SN_CEC_TABLE_ENABLE[{_indices_in_words(tables)}]", "1", "every table is evaluated"),
-        _row(f"SD41310 $SN_CEC_TABLE_WEIGHT[{_indices_in_words(tables)}]", "1.0", "weights stay 1"),
-        _row("MD10240, MD10260, MD32711", "metric", "the tables are in mm"),
+        parameter_row(f"SD41300 $SN_CEC_TABLE_ENABLE[{_indices_in_words(tables)}]", "1", "every table is evaluated"),
+        parameter_row(f"SD41310 $SN_CEC_TABLE_WEIGHT[{_indices_in_words(tables)}]", "1.0", "weights stay 1"),
+        parameter_row("MD10240, MD10260, MD32711", "metric", "the tables are in mm"),
     ]
     slopes = largest_slopes(machine, tables, mode)
     for output in sorted({entry.output_axis for entry in tables.values()}):
         name, needed_mm = names[output], abs(sums[output][0])
         by_base = ", ".join(f"{names[base]} {slope:.3g}" for base, slope in enumerate(slopes[output].tolist()))
         rows += [
-            _row(f"MD32710 $MA_CEC_ENABLE[{name}]", "0, then 1", "0 while the file is loaded; 1 enables the sum"),
-            _row(
+            parameter_row(
+                f"MD32710 $MA_CEC_ENABLE[{name}]", "0, then 1", "0 while the file is loaded; 1 enables the sum"
+            ),
+            parameter_row(
                 f"MD32720 $MA_CEC_MAX_SUM[{name}]",
                 f">= {np.ceil(needed_mm * 1e4) / 1e4:.4f} mm",
                 f"the sum reaches {needed_mm:.6f} mm; what is above this limit is cut off (alarm 20124)",
             ),
-            _row(
+            parameter_row(
                 f"MD32730 $MA_CEC_MAX_VELO[{name}]",
                 f">= {100.0 * sum(slopes[output].tolist()):.4f} %",
                 f"largest change of the sum, mm per mm of travel of the base axes: {by_base}; the percentage holds if all "
@@ -564,10 +568,6 @@ def cec_overwrites(tables: CecMap, kept: Sequence[int]) -> list[str]:
             "the archive of the control with --active, or state kept_tables in the machine file."
         )
     return [first, f"Tables {_indices_in_words(tables)}, whatever they hold now."]
-
-
-def _row(name: str, value: str, meaning: str) -> dict[str, str]:
-    return {"name": name, "value": value, "meaning": meaning}
 
 
 def cec_warnings(

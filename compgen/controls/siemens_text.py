@@ -605,26 +605,23 @@ def _item(
             if unusual:
                 findings.count(unusual)
             return item
-        findings.count("switches of other tables")
-        return None
-    if variable in HARMLESS:
+        what = "switches of other tables"
+    elif variable in HARMLESS:
         allowed = HARMLESS[variable]
         if allowed is not None and item.value not in allowed and value not in allowed:
             raise item.fail(f"{one_line(value)[:30]!r} is not understood; {' or '.join(allowed[:1])} is")
-        findings.count("machine data beside the tables")
-        return None
-    if _OTHER_CEC.fullmatch(variable) and item.value in ("0", "0.0", "FALSE"):
-        findings.count("machine data beside the tables")
-        return None
-    if variable in _TABLE_VARIABLES:
-        findings.count("values of tables of the other kind (CEC, EEC)")
-        return None
-    if "CEC" in variable or "ENC_COMP" in variable:
+        what = "machine data other than the tables"
+    elif _OTHER_CEC.fullmatch(variable) and item.value in ("0", "0.0", "FALSE"):
+        what = "machine data other than the tables"
+    elif variable in _TABLE_VARIABLES:
+        what = "values of tables of the other kind (CEC, EEC)"
+    elif "CEC" in variable or "ENC_COMP" in variable:
         raise item.fail("is not known here, and it could change a table")
-    if variable.startswith("MA_BACKLASH"):
-        findings.count("lines of $MA_BACKLASH, which is no table and is not taken out")
-        return None
-    findings.count("other machine data")
+    elif variable.startswith("MA_BACKLASH"):
+        what = "lines of $MA_BACKLASH, which is not a table and is not taken out"
+    else:
+        what = "other machine data"
+    findings.count(what)
     return None
 
 

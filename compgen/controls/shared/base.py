@@ -309,6 +309,11 @@ def by_travel(travel: FloatArray, positive: FloatArray, negative: FloatArray) ->
     return np.select([travel > 0, travel < 0], [positive, negative], 0.5 * (positive + negative))
 
 
+def parameter_row(name: str, value: str, meaning: str) -> dict[str, str]:
+    """Return a parameter of the control with the value that the tables need, as the templates and reports show it."""
+    return {"name": name, "value": value, "meaning": meaning}
+
+
 def coverage_violations(machine: Machine, axis: int, first_mm: float, last_mm: float, what: str) -> list[str]:
     """Return a message if a table from ``first_mm`` to ``last_mm`` leaves a part of the axis' travel uncovered."""
     low, high = machine.axes[axis].range_mm
