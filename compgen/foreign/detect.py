@@ -105,13 +105,14 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     elif axis is None:
         named = f" ('{found.keys['axis']}')" if found.keys.get("axis") else ""
         doubts.append(f"the file does not say X, Y or Z{named}; give --axis")
-    return _imported(path, "renishaw", runs, error, understood, doubts, notes)
+    return _imported(path, "renishaw", runs, axis, error, understood, doubts, notes)
 
 
 def _imported(
     path: Path,
     form: str,
     runs: OneAxis,
+    axis: str | None,
     error: str | None,
     understood: dict[str, object],
     doubts: list[str],
@@ -123,7 +124,7 @@ def _imported(
         metadata |= {"measured_at": str(at), "date": str(at)}
     said = (understood, tuple(doubts), tuple(notes))
     if error is None:
-        return Imported(path, form, "axis", runs_of({str(understood["axis"] or ""): runs}, str(path), metadata), *said)
+        return Imported(path, form, "axis", runs_of({axis or "": runs}, str(path), metadata), *said)
     data, reversal = errors_of(runs, error, metadata)
     return Imported(path, form, "errors", data, *said, reversal)
 
@@ -221,7 +222,7 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
         "instrument": found.keys.get("REF_PV"),
     }
     error = None if options.error is None else _error_named(path, axis, options, doubts, angular=False)
-    return _imported(path, "ecmc-iso230", runs, error, understood, doubts, notes)
+    return _imported(path, "ecmc-iso230", runs, axis, error, understood, doubts, notes)
 
 
 def import_exchange(path: Path, options: ImportOptions) -> Imported:

@@ -114,6 +114,13 @@ def test_direction_follows_the_order_of_the_targets_not_the_number_of_the_run(tm
     assert runs.axes == (1,)
 
 
+def test_the_axis_that_the_user_says_counts_whatever_the_text_of_a_laser_file_calls_it(tmp_path):
+    for text in ("Y", "X axis", "spindle"):
+        item = import_file(written(tmp_path, rtl(ROWS, axis=text)), ImportOptions(axis="Z"))
+        assert item.data.axes == (2,)
+    assert import_file(written(tmp_path, rtl(ROWS, axis="X axis"))).data.axes == (0,)
+
+
 def test_runs_of_one_direction_all_ascend(tmp_path):
     rows = [f"{run} {k} {run + k}" for run in (1, 2, 3) for k in range(1, 6)]
     item = import_file(written(tmp_path, rtl(rows, runs=3).replace("0 0 2 0", "0 1 2 0")))
