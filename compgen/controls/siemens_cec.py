@@ -17,6 +17,7 @@ import numpy as np
 
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
 from compgen.controls.shared.grids import equidistant_grid
+from compgen.controls.shared.scanner import Findings
 from compgen.controls.shared.terms import one_dimensional_terms, product_terms
 from compgen.controls.siemens_cec_tables import (
     MM_DECIMALS,
@@ -55,12 +56,12 @@ from compgen.controls.siemens_text import (
     PROTECTING,
     SWITCHES,
     ArchiveAssignments,
-    ArchiveFindings,
     Assignment,
     LinearTable,
     TableParts,
     axis_of,
     foreign_assignments,
+    noted_table,
     read_assignments,
 )
 from compgen.data.csv_files import FloatArray
@@ -241,7 +242,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CecTables, list[str]]:
         """Read an archive or a program of a real control: the tables that act, and what was passed over."""
-        findings = ArchiveFindings()
+        findings = Findings()
         given = foreign_assignments(files, VARIABLES, findings)
         return foreign_cec_tables(given, self.machine, self.settings, findings), findings.statements()
 
@@ -350,7 +351,7 @@ def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], se
 
 
 def foreign_cec_tables(
-    given: ArchiveAssignments, machine: Machine, settings: CecSettings, findings: ArchiveFindings
+    given: ArchiveAssignments, machine: Machine, settings: CecSettings, findings: Findings
 ) -> CecTables:
     """Return the tables that act, from the files of a real control.
 
@@ -371,7 +372,7 @@ def foreign_cec_tables(
         axes = [_axis_name_of(part.scalar(f"$AN_CEC_{side}_AXIS")) for side in ("INPUT", "OUTPUT")]
         if set(axes) <= set(settings.axis_names):
             travel_mm = machine.axes[settings.axis_names.index(axes[0])].range_mm
-            table = findings.table(part, "$AN_CEC", travel_mm)
+            table = noted_table(part, "$AN_CEC", travel_mm, findings)
             if "$AN_CEC_MULT_BY_TABLE" not in part.scalars:
                 findings.count("tables without MULT_BY_TABLE (0 taken)")
             found[index] = _cec_table(part, table, settings.axis_names, 1)
@@ -405,7 +406,7 @@ def foreign_cec_tables(
 
 
 def _switched(
-    found: Mapping[int, CecTable], given: ArchiveAssignments, settings: CecSettings, findings: ArchiveFindings
+    found: Mapping[int, CecTable], given: ArchiveAssignments, settings: CecSettings, findings: Findings
 ) -> dict[int, CecTable]:
     """Return the tables with SD41300 and SD41310; those into an axis whose MD32710 is 0 in an archive are off."""
     result = dict(found)

@@ -16,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage
+from compgen.controls.shared.scanner import Findings
 from compgen.controls.siemens_cec import VARIABLES as CEC_VARIABLES
 from compgen.controls.siemens_cec import (
     CecTables,
@@ -27,7 +28,7 @@ from compgen.controls.siemens_cec_tables import MULT_MODES, Choice, chosen_terms
 from compgen.controls.siemens_eec import VARIABLES as EEC_VARIABLES
 from compgen.controls.siemens_eec import EecTables, SiemensEec, eec_tables_from, eec_terms, foreign_eec_tables
 from compgen.controls.siemens_machine_data import CecEecSettings, checked_cec_settings, checked_encoder_settings
-from compgen.controls.siemens_text import ArchiveAssignments, ArchiveFindings, foreign_assignments, read_assignments
+from compgen.controls.siemens_text import ArchiveAssignments, foreign_assignments, read_assignments
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
@@ -145,7 +146,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CecEecTables, list[str]]:
         """Read an archive or programs of a real control: the tables of both kinds that act, and what was passed over."""
-        findings = ArchiveFindings()
+        findings = Findings()
         given = foreign_assignments(files, {**EEC_VARIABLES, **CEC_VARIABLES}, findings)
         cec_part, eec_part = (
             ArchiveAssignments([item for item in given.items if item.variable in kind], given.machine_data)

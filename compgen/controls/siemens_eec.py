@@ -15,12 +15,12 @@ import numpy as np
 
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis, parameter_row
 from compgen.controls.shared.grids import equidistant_grid
+from compgen.controls.shared.scanner import Findings
 from compgen.controls.shared.terms import one_dimensional_terms
 from compgen.controls.siemens_machine_data import PROFILES, EecSettings, checked_encoder_settings
 from compgen.controls.siemens_text import (
     SWITCHES,
     ArchiveAssignments,
-    ArchiveFindings,
     Assignment,
     LinearTable,
     TableParts,
@@ -28,6 +28,7 @@ from compgen.controls.siemens_text import (
     exact_grid,
     exact_values,
     foreign_assignments,
+    noted_table,
     read_assignments,
     table_violations,
 )
@@ -172,7 +173,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[EecTables, list[str]]:
         """Read an archive or a program of a real control: the tables that act, and what was passed over."""
-        findings = ArchiveFindings()
+        findings = Findings()
         given = foreign_assignments(files, VARIABLES, findings)
         return foreign_eec_tables(given, self.machine, self.settings, findings), findings.statements()
 
@@ -257,7 +258,7 @@ def eec_terms(
 
 
 def foreign_eec_tables(
-    given: ArchiveAssignments, machine: Machine, settings: EecSettings, findings: ArchiveFindings
+    given: ArchiveAssignments, machine: Machine, settings: EecSettings, findings: Findings
 ) -> EecTables:
     """Return the tables that act, from the files of a real control.
 
@@ -287,7 +288,7 @@ def foreign_eec_tables(
                 f"{{ {AXES[axis]} = {encoder} }}"
             )
         else:
-            tables[axis, encoder] = findings.table(part, "$AA_ENC_COMP", machine.axes[axis].range_mm)
+            tables[axis, encoder] = noted_table(part, "$AA_ENC_COMP", machine.axes[axis].range_mm, findings)
     if not tables:
         said = [*findings.apart, *findings.notes]
         raise next(iter(parts.values())).source.fail(

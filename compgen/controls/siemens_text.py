@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.controls.shared.base import SourceFile, coverage_violations
-from compgen.controls.shared.scanner import fixed_point, number_pattern, plain_lines
+from compgen.controls.shared.scanner import Findings, fixed_point, number_pattern, plain_lines
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest, one_line
@@ -403,55 +403,28 @@ _KEYS = ("", "_STEP", "_MIN", "_MAX", "_IS_MODULO", "_INPUT_AXIS", "_OUTPUT_AXIS
 _TABLE_VARIABLES = {head + key for head in ("AN_CEC", "AA_ENC_COMP") for key in _KEYS}
 
 
-@dataclass
-class ArchiveFindings:
-    """What was read in addition to the tables, for one line of summary.
-
-    ``counts`` are by what was passed over, ``apart`` the tables of axes that the machine file lacks, ``notes`` what the
-    user should know in words of their own.
-    """
-
-    counts: dict[str, int] = field(default_factory=dict)
-    apart: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-    def count(self, what: str, number: int = 1) -> None:
-        """Count something that was passed over or filled in."""
-        self.counts[what] = self.counts.get(what, 0) + number
-
-    def table(self, part: TableParts, prefix: str, travel_mm: tuple[float, float]) -> LinearTable:
-        """Return the table of a real control, and note what is unusual about it; ``travel_mm`` of its input axis."""
-        table, surplus, doubt_um = part.foreign_table(prefix)
-        modulo = part.scalars.get(f"{prefix}_IS_MODULO")
-        if modulo is None:
-            self.count("tables without IS_MODULO (0 taken)")
-        elif modulo.number() == -1:
-            inside = float(table.start_mm) <= travel_mm[0] and travel_mm[1] <= float(table.last_mm)
-            if not (inside or part.is_zero):
-                raise modulo.fail(
-                    f"-1 is neither 0 nor 1, and the travel {travel_mm[0]:g} ... {travel_mm[1]:g} mm leaves the table, so "
-                    "that it matters: write what the control has"
-                )
-            self.count("times IS_MODULO = -1 (taken as 0)")
-        if surplus:
-            self.count("reserved nodes beyond MAX", surplus)
-        if doubt_um >= WORTH_SAYING_UM:
-            self.notes.append(
-                f"{part.what}: MIN + k STEP does not meet MAX; between the last node before MAX and MAX the control may do "
-                f"up to {doubt_um:.1f} um else than the straight line taken here"
+def noted_table(part: TableParts, prefix: str, travel_mm: tuple[float, float], findings: Findings) -> LinearTable:
+    """Return the table of a real control, and note what is unusual about it; ``travel_mm`` of its input axis."""
+    table, surplus, doubt_um = part.foreign_table(prefix)
+    modulo = part.scalars.get(f"{prefix}_IS_MODULO")
+    if modulo is None:
+        findings.count("tables without IS_MODULO (0 taken)")
+    elif modulo.number() == -1:
+        inside = float(table.start_mm) <= travel_mm[0] and travel_mm[1] <= float(table.last_mm)
+        if not (inside or part.is_zero):
+            raise modulo.fail(
+                f"-1 is neither 0 nor 1, and the travel {travel_mm[0]:g} ... {travel_mm[1]:g} mm leaves the table, so "
+                "that it matters: write what the control has"
             )
-        return table
-
-    def statements(self) -> list[str]:
-        """Return the summary in at most one line of each kind."""
-        found = []
-        if self.counts:
-            found.append(
-                "passed over or filled in: " + ", ".join(f"{what} ({number})" for what, number in self.counts.items())
-            )
-        if self.apart:
-            found.append("tables of axes that the machine file does not have, kept apart: " + "; ".join(self.apart))
-        return found + list(dict.fromkeys(self.notes))
+        findings.count("times IS_MODULO = -1 (taken as 0)")
+    if surplus:
+        findings.count("reserved nodes beyond MAX", surplus)
+    if doubt_um >= WORTH_SAYING_UM:
+        findings.notes.append(
+            f"{part.what}: MIN + k STEP does not meet MAX; between the last node before MAX and MAX the control may differ "
+            f"by up to {doubt_um:.1f} um from the straight line taken here"
+        )
+    return table
 
 
 @dataclass(frozen=True)
@@ -482,7 +455,7 @@ class ArchiveAssignments:
 
 
 def foreign_assignments(
-    files: Sequence[SourceFile], tables: Mapping[str, int], findings: ArchiveFindings
+    files: Sequence[SourceFile], tables: Mapping[str, int], findings: Findings
 ) -> ArchiveAssignments:
     """Return the assignments of tables and switches of real files; InputError with the line for what is not understood.
 
@@ -514,7 +487,7 @@ def foreign_assignments(
     return ArchiveAssignments(list(items.values()), machine_data)
 
 
-def _parts(source: SourceFile, findings: ArchiveFindings) -> tuple[list[_ArchivePart], bool]:
+def _parts(source: SourceFile, findings: Findings) -> tuple[list[_ArchivePart], bool]:
     """Return the parts of a text that are to be read, and whether it is an archive of several files.
 
     They are the only part, or the initialisation files of an archive; the others are counted.
@@ -555,7 +528,7 @@ def _parts(source: SourceFile, findings: ArchiveFindings) -> tuple[list[_Archive
 
 
 def _assignments_of_part(
-    source: SourceFile, part: _ArchivePart, tables: Mapping[str, int], findings: ArchiveFindings, *, archive: bool
+    source: SourceFile, part: _ArchivePart, tables: Mapping[str, int], findings: Findings, *, archive: bool
 ) -> Iterator[Assignment]:
     """Assignments of one part that matter; the others are counted, what is not understood is refused."""
     ended, any_table, number = False, False, 0
@@ -590,7 +563,7 @@ def _assignments_of_part(
 
 
 def _item(
-    source: SourceFile, number: int, match: re.Match[str], tables: Mapping[str, int], findings: ArchiveFindings
+    source: SourceFile, number: int, match: re.Match[str], tables: Mapping[str, int], findings: Findings
 ) -> Assignment | None:
     """One assignment if it belongs to the tables; None for what is passed over."""
     variable, index_text, value = match.group(1), match.group(2) or "", match.group(3).strip()

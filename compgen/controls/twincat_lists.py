@@ -13,13 +13,13 @@ import numpy as np
 
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
 from compgen.controls.shared.grids import equidistant_grid, loss_setting, uneven_nodes_mm
+from compgen.controls.shared.scanner import Findings
 from compgen.controls.shared.terms import continued, one_dimensional_terms, product_terms
 from compgen.controls.twincat_tables import (
     MM_PER_UNIT,
     AxisList,
     CrossTable,
     LeadscrewTable,
-    ListFindings,
     PlaneTable,
     PointLimits,
     TwincatTables,
@@ -215,13 +215,13 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[TwincatTables, list[str]]:
         """Read lists of a real control: reserved entries and other structures are passed over, other axes kept apart."""
-        foreign = ListFindings()
+        foreign = Findings()
         tables = self._parsed(files, foreign)
         if not any(item != AxisList() for item in tables.lists.values()):
-            raise files[0].fail("; ".join(["holds no table of an axis of the machine file", *foreign.remarks()]))
-        return tables, foreign.remarks()
+            raise files[0].fail("; ".join(["holds no table of an axis of the machine file", *foreign.statements()]))
+        return tables, foreign.statements()
 
-    def _parsed(self, files: Sequence[SourceFile], foreign: ListFindings | None) -> TwincatTables:
+    def _parsed(self, files: Sequence[SourceFile], foreign: Findings | None) -> TwincatTables:
         lists: dict[int, AxisList] = {}
         seen: dict[int, SourceFile] = {}
         for source in files:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from compgen.controls.shared.base import SourceFile, Usage
-from compgen.controls.shared.scanner import check_complete, content_lines, fixed_point
+from compgen.controls.shared.scanner import Findings, check_complete, content_lines, fixed_point
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest
@@ -226,22 +226,6 @@ class _Entry:
 
 
 @dataclass
-class ListFindings:
-    """What is passed over in a list that this program did not write: numbers of lines, and tables kept apart."""
-
-    counts: dict[str, int] = field(default_factory=dict)
-    apart: list[str] = field(default_factory=list)
-
-    def remarks(self) -> list[str]:
-        """Return at most one line for each of both."""
-        passed = ", ".join(f"{what} ({number})" for what, number in self.counts.items())
-        found = [f"passed over: {passed}"] if passed else []
-        return found + (
-            [f"of axes that the machine file does not have, kept apart: {'; '.join(self.apart)}"] if self.apart else []
-        )
-
-
-@dataclass
 class _Body:
     """The entries of one file: parameters by structure and name, table entries by structure, name and index."""
 
@@ -249,7 +233,7 @@ class _Body:
     axis_names: tuple[str, ...]
     logical_axes: tuple[int, ...]
     increment_mm: tuple[float | None, ...] = (None, None, None)
-    foreign: ListFindings | None = None
+    foreign: Findings | None = None
     scalars: dict[tuple[str, str], _Entry] = field(default_factory=dict)
     tables: dict[tuple[str, str], dict[tuple[int, ...], _Entry]] = field(default_factory=dict)
 
@@ -313,7 +297,7 @@ def parse_axis_list(
     axis_names: tuple[str, ...],
     logical_axes: tuple[int, ...],
     increment_mm: tuple[float | None, ...],
-    foreign: ListFindings | None = None,
+    foreign: Findings | None = None,
 ) -> tuple[int | None, AxisList]:
     """Return the axis (0..2) of a list and its tables; InputError with file and line for anything malformed.
 
@@ -376,7 +360,7 @@ def _take(body: _Body, line: int, code: str) -> None:
     entry = _Entry(words[1].strip(), line)
     head, _, name = f"{match.group(1)}.{match.group(2)}".rpartition(".")
     if body.foreign is not None and (what := _idle(head, name)):
-        body.foreign.counts[what] = body.foreign.counts.get(what, 0) + 1
+        body.foreign.count(what)
         return
     if match.group(3):
         index = tuple(int(part) for part in match.group(3)[1:-1].split("]["))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from decimal import Decimal
 
 from compgen.controls.shared.base import SourceFile
@@ -17,6 +18,31 @@ from compgen.data.messages import one_line
 MOST_LINES = 200_000
 #: What is quoted of a wrong word.
 SHOWN = 40
+
+
+@dataclass
+class Findings:
+    """What was read in files of another program in addition to the tables, for a few lines of summary.
+
+    ``counts`` are by what was passed over, ``apart`` the tables of axes that the machine file lacks, ``notes`` what else the
+    user should know.
+    """
+
+    counts: dict[str, int] = field(default_factory=dict)
+    apart: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def count(self, what: str, number: int = 1) -> None:
+        """Count something that was passed over or filled in."""
+        self.counts[what] = self.counts.get(what, 0) + number
+
+    def statements(self) -> list[str]:
+        """Return the summary in at most one line of each kind."""
+        passed = ", ".join(f"{what} ({number})" for what, number in self.counts.items())
+        found = [f"passed over or filled in: {passed}"] if passed else []
+        if self.apart:
+            found.append("tables of axes that the machine file does not have, kept apart: " + "; ".join(self.apart))
+        return found + list(dict.fromkeys(self.notes))
 
 
 def number_pattern(before: int = 40, behind: int = 40, exponent: int = 0) -> re.Pattern[str]:
