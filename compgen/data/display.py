@@ -6,6 +6,7 @@ how it looks is decided here, once for all of them. Figures are in the units of 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -55,7 +56,7 @@ class PlottedLine:
 
 @dataclass(frozen=True)
 class Bars:
-    """One value for each name; several ``Bars`` in a panel stand side by side."""
+    """One value for each name; several ``Bars`` in a panel are drawn side by side."""
 
     label: str
     names: tuple[str, ...]
@@ -74,12 +75,12 @@ class Panel:
     x_scale: Literal["linear", "log"] = "linear"
 
 
-class Displayed:
+class Displayed(ABC):
     """Something that people look at in a session or a notebook."""
 
+    @abstractmethod
     def overview(self) -> Overview:
         """Return what there is to say; its title is the line of ``repr``."""
-        raise NotImplementedError
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.overview().title}>"
@@ -92,9 +93,9 @@ class Displayed:
 class Drawable(Displayed):
     """A result that has a picture as well."""
 
+    @abstractmethod
     def panels(self) -> Sequence[Panel]:
         """Return what there is to draw."""
-        raise NotImplementedError
 
     def plot(self, figure: Figure | None = None) -> Figure:
         """Draw this result, into ``figure`` or a new one, and return the figure.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -41,9 +42,9 @@ class DisplayedDiagnosis(Drawable):
 
     machine: Machine
 
+    @abstractmethod
     def to_dict(self) -> dict[str, Any]:
         """The content of ``diagnosis.json``."""
-        raise NotImplementedError
 
     def overview(self) -> Overview:
         """The verdict, and each name with its grade and parameters."""

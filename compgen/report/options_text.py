@@ -22,8 +22,8 @@ LISTED_FROM_UM = 0.1
 LEAST_GAIN, LEAST_GAIN_UM = 0.005, 0.05
 LEGEND = (
     "left: what the best table of that level leaves, largest / rms / 95 % in um; left*: the best-fit rigid motion of the "
-    "workpiece taken out; buys: by how much the rms* shrinks against the level above, with the machine's own tool: full "
-    "volumetric compensation shows its worth with others. A level may hold a constant shift of "
+    "workpiece removed; buys: by how much the rms* shrinks against the level above, with the machine's own tool: full "
+    "volumetric compensation shows its worth with others. A level may contain a constant shift of "
     "an axis, which a workpiece offset does as well; controls whose tables are zero at the reference point do not."
 )
 
@@ -86,7 +86,7 @@ def error_rows(result: Capability, tool: int) -> list[list[str]]:
 
 
 def tool_rows(result: Capability) -> list[list[str]]:
-    """Rows tool offset and, by level, largest / rms of all errors together as it stands."""
+    """Rows tool offset and, by level, largest / rms of all errors together, with the reference point fixed."""
     return [
         [tool_name(tool), *(um_text(result.level(key).by_tool[k][0].after.max_um) for key in _shown_levels(result))]
         for k, tool in enumerate(result.tools_mm)
@@ -107,9 +107,9 @@ def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -
 
 
 def options_tables(result: Capability) -> Group:
-    """Return what the terminal shows: levels, controls, errors that stay with the machine's own tool, tools."""
+    """Return what the terminal shows: levels, controls, errors that remain with the machine's own tool, tools."""
     own = tool_name(result.tools_mm[0])
-    levels = ["tables hold", "left", "left*", "buys"]
+    levels = ["tables contain", "left", "left*", "buys"]
     controls = ["control", "level", "left", "left*", "remark"]
     return Group(
         _table(f"{result.machine}: what each level of option leaves (max / rms / p95, um)", levels, level_rows(result)),
@@ -142,7 +142,7 @@ def options_markdown(result: Capability) -> str:
     parts = [
         f"# Options for {result.machine}\n\nJudged at {result.points} points over {zone or 'the whole travel'}.\n",
         "## What each level of option leaves\n\n"
-        + markdown_table(["tables hold", "left, um (max / rms / p95)", "left*, um", "buys"], level_rows(result)),
+        + markdown_table(["tables contain", "left, um (max / rms / p95)", "left*, um", "buys"], level_rows(result)),
         LEGEND + "\n",
         "## What the file of each control leaves\n\n"
         + markdown_table(
@@ -150,7 +150,7 @@ def options_markdown(result: Capability) -> str:
         ),
         "## Largest error with tools of other offset, um\n\n"
         + markdown_table(["tool offset, mm", *_level_headings(result)], tool_rows(result)),
-        "## Which errors stay\n\nLargest displacement in um that each error leaves by itself, to first order.\n",
+        "## Which errors remain\n\nLargest displacement in um that each error leaves by itself, to first order.\n",
     ]
     for k, tool in enumerate(result.tools_mm):
         heading = f"### Tool offset {tool_name(tool)}{' mm' if any(tool) else ''}{' (of the machine file)' if not k else ''}\n\n"
@@ -160,10 +160,10 @@ def options_markdown(result: Capability) -> str:
     return "\n".join(parts)
 
 
-# ``explain.md``: what a control's table corrects, what stays and why, what the next option buys, what it uses.
+# ``explain.md``: what a control's table corrects, what remains and why, what the next option buys, what it uses.
 
 
-#: An error counts as corrected, in part at least, if less than this share of it stays.
+#: An error counts as corrected, in part at least, if less than this share of it remains.
 LEAST_HELP = 0.9
 #: What a control of each level holds, in words.
 HOLDS = {
@@ -181,7 +181,7 @@ def explanation_markdown(item: Explanation) -> str:
         before, after = item.options.level("nothing").left.rigid_removed, item.own.left.rigid_removed
         text += (
             f" The error over the volume goes from {um_text(before.max_um)} to {um_text(after.max_um)} um (largest) and from "
-            f"{um_text(before.rms_um)} to {um_text(after.rms_um)} um (rms), the best-fit rigid motion taken out, "
+            f"{um_text(before.rms_um)} to {um_text(after.rms_um)} um (rms), the best-fit rigid motion removed, "
             "by the file as it is written."
         )
     parts = [text + "\n"]
@@ -208,7 +208,7 @@ def _stays(item: Explanation) -> str:
             "\nThe tables were made for the tool offset of the machine file. With others an angular error acts at another "
             f"lever; the largest error that the best table of this level leaves is {', '.join(tools)}.\n"
         )
-    return "## What stays, and why\n\n" + table + other + notes
+    return "## What remains, and why\n\n" + table + other + notes
 
 
 def _next(item: Explanation) -> str:
@@ -225,7 +225,7 @@ def _next(item: Explanation) -> str:
         for level in (current, *following)
     ]
     return "## What the next option would buy\n\n" + markdown_table(
-        ["tables hold", "largest left, um", "rms left, um"], rows
+        ["tables contain", "largest left, um", "rms left, um"], rows
     )
 
 

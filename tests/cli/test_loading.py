@@ -122,3 +122,13 @@ def test_a_run_loads_the_control_in_use_and_no_room_that_it_does_not_need(tmp_pa
         "identify.six_dof",
         "tables.active",
     }
+
+
+def test_pages_are_drawn_without_a_plotting_library(tmp_path):
+    lengths = ROOT / "examples" / "zha-gantry.lengths.csv"
+    words = ["run", "zha-gantry", str(lengths), "--controller", "isg-csv", "--out", "o"]
+    libraries, _, _ = loaded(tmp_path, PROGRAM.format(words))
+    assert (tmp_path / "o" / "report.html").is_file()
+    assert "matplotlib" not in libraries
+    users = [path.name for path in (ROOT / "compgen").rglob("*.py") if "import matplotlib" in path.read_text("utf-8")]
+    assert users == ["display.py"]  # .plot() in notebooks

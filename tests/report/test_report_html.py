@@ -218,7 +218,7 @@ def test_a_table_that_was_changed_afterwards_is_pointed_out(copy):
     with pytest.warns(CompgenWarning, match="is not the file that was verified"):
         report = build_report(copy)
     assert "not the verified file" in report.files["report.html"]
-    assert any("its verdict does not hold" in text for text in report.data["limitations"])
+    assert any("its verdict does not apply" in text for text in report.data["limitations"])
 
 
 def test_rejected_tables_come_with_the_reasons_first(copy):

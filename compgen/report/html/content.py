@@ -136,7 +136,7 @@ ALWAYS = (
     "Quasi-static geometric errors of three linear axes only: no thermal drift, load, dynamics, spindle or rotary axes.",
     "The figures follow published formulas of ISO 230-1 and ISO 230-2; the program is not certified against the "
     "standards.",
-    "Uncertainties are expanded with k = 2. They hold the noise of the readings, and those systematic inputs that were "
+    "Uncertainties are expanded with k = 2. They include the noise of the readings, and those systematic inputs that were "
     "stated.",
 )
 
@@ -158,7 +158,7 @@ def limitations(source: ResultFolder) -> list[str]:
         if not item.manifest:
             found.append(f"{item.name}: manifest.json is not in the folder, so settings and signs are not stated here.")
         found += [
-            f"{item.name}: {f.name} is not the file that was verified (its SHA-256 differs); its verdict does not hold for it."
+            f"{item.name}: {f.name} is not the file that was verified (its SHA-256 differs); its verdict does not apply to it."
             for f in item.files
             if f.intact is False
         ]
@@ -282,7 +282,7 @@ def _state(result: Mapping[str, Any]) -> str:
 
 
 def why_uncorrected(name: str) -> str:
-    """Say why an error stays, by its name: what the control would need to take it out."""
+    """Say why an error remains, by its name: what the control would need to take it out."""
     if name not in _KNOWN:
         return "acts differently in the two directions of travel; these tables act in both alike"
     error = error_named(name)
@@ -376,13 +376,16 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
     bounds = f"± {known} µm (uncertainty of the measurement, k = 2)" if known else "(its uncertainty is not known)"
     if not best["volumetric"]:
         return (
-            f"{name} effect of the measured errors alone {change} {bounds}, as the files that were read back say. The error "
+            f"{name} effect of the measured errors alone {change} {bounds}, by the files read back. The error "
             "over the volume is not known: the other errors were not measured."
         )
-    text = f"{name} error of the tool tip over the volume {change} {bounds}, as it stands, as the files that were read back say."
+    text = (
+        f"{name} error of the tool tip over the volume {change} {bounds}, with the reference point fixed, by the files "
+    )
+    text += "read back."
     if best["state"] == "better_after_new_setup":
         rigid = f"{um(best['before_rigid'].get('rms_um'))} to {um(best['after_rigid'].get('rms_um'))} µm rms"
-        text += f" With the best-fit rigid motion of the workpiece taken out it goes from {rigid}."
+        text += f" With the best-fit rigid motion of the workpiece removed it goes from {rigid}."
     return text
 
 

@@ -108,7 +108,7 @@ class ReadingResiduals:
 
 @dataclass(frozen=True)
 class ResultFolder:
-    """Everything that the report is made of; what the folder does not hold is empty or None."""
+    """Everything that the report is made of; what the folder does not contain is empty or None."""
 
     folder: Path
     kind: Kind
@@ -287,8 +287,8 @@ def _files(folder: Path, result: Mapping[str, Any]) -> list[ListedFile]:
 class TableCurve:
     """Values of one table of a control over its axis, ``unit`` um or urad.
 
-    ``error`` is True where the table holds one of the 21 errors by its name, else it holds a correction. A constant has
-    no axis and one value.
+    ``error`` is True where the table contains one of the 21 errors by its name, otherwise it contains a correction.
+    A constant has no axis and one value.
     """
 
     name: str
@@ -303,7 +303,7 @@ def table_curves(errors: ErrorTable | None, control: ControlFolder) -> tuple[Tab
     """Return the tables of a control as they act: its emulation, written in the basis of its tables.
 
     The values are those that reproduce the emulated correction over the volume best, which is all there is to tell
-    where a control lets one table stand for another. Empty where errors are missing or the files cannot be read.
+    where one table of a control can replace another. Empty where errors are missing or the files cannot be read.
     """
     machine, tables = control.machine, control.tables
     if machine is None or tables is None or errors is None:

@@ -71,7 +71,7 @@ def draw_curves(
 def _draw_curve(
     name: str, identified: ErrorTable, fitted: ErrorTable | None, tables: Mapping[str, Sequence[TableCurve]]
 ) -> Picture:
-    """One error in its file's unit: identified with its band, smoothed, and in each control that holds it by name."""
+    """One error in its file's unit: identified with its band, smoothed, and in each control that has a table of it."""
     error, curve = error_named(name), identified.curves[name]
     unit, axis, scale = LABEL[error.unit], AXES[error.axis], 1.0 / error.si_per_unit
     x, y, u = curve.position_mm, curve.value * scale, curve.u * scale
@@ -108,7 +108,7 @@ def _draw_curve(
 
 
 def draw_tables(control: str, number: int, curves: Sequence[TableCurve]) -> list[Picture]:
-    """Return pictures of the tables of one control that hold corrections, those of one axis and unit together."""
+    """Return pictures of the tables of one control that contain corrections, those of one axis and unit together."""
     groups: dict[tuple[str, str], list[TableCurve]] = {}
     for curve in curves:
         if curve.axis is not None and not curve.error:

@@ -195,7 +195,7 @@ def dossier_text(dossier: Mapping[str, Any]) -> str:
         verified += _table(headings, figures)
         verified += [f"- {plain_markdown(text)}" for text in (item["headline"], *item["objections"]) if text]
         verified += [f"- Cannot be expressed by this control: {um(item['unrepresentable_um'])} um"]
-        verified += [f"- Stays: {row['error']} {um(row['um'])} um; {row['why']}" for row in item["uncorrected"]]
+        verified += [f"- Remains: {row['error']} {um(row['um'])} um; {row['why']}" for row in item["uncorrected"]]
         verified += [*(f"- {plain_markdown(text)}" for text in (*item["reasons"], *item["notes"])), ""]
     lines += _section("5. Verification", verified)
     lines += _section(
@@ -378,7 +378,7 @@ def build_report(folder: str | Path) -> Report:
     Raises
     ------
     InputError
-        where the folder holds no results, or one of its files cannot be read.
+        where the folder contains no results, or one of its files cannot be read.
     """
     source = read_folder(folder)
     data = json_values(content(source))
@@ -440,7 +440,7 @@ STYLES = {"accepted": "bold green", "rejected": "bold red", "neutral": "bold"}
 
 
 def short_text(data: Mapping[str, Any]) -> Group:
-    """Return verdict, one line per control, the largest error that stays, and where to read on."""
+    """Return verdict, one line per control, the largest error that remains, and where to read on."""
     verdict = data["verdict"]
     lines = [Text(f"{data['title']}: {verdict['headline']}", STYLES.get(verdict["state"], "bold yellow"))]
     if verdict["text"]:
@@ -454,6 +454,6 @@ def short_text(data: Mapping[str, Any]) -> Group:
         lines += [Text(f"    {text}", "yellow") for text in item["objections"] if text not in item["reasons"]]
         if item["uncorrected"]:
             largest = item["uncorrected"][0]
-            lines.append(Text(f"    stays: {largest['error']} {um(largest['um'])} um; {largest['why']}"))
+            lines.append(Text(f"    remains: {largest['error']} {um(largest['um'])} um; {largest['why']}"))
         lines += [Text(f"    {reason}", "red") for reason in item["reasons"][:3]]
     return Group(*lines)
