@@ -32,15 +32,29 @@ def check_control(name: str, thing: Any) -> tuple[Any, list[str]]:
             thing = code() if thing is code else thing
         except Exception as error:  # code of a third party
             return code, [f"{code.__name__}() fails: {type(error).__name__}: {error}"]
-    problems += _attribute_problems(name, code, interface)
+    own = getattr(code, "name", None)
+    if own != name:
+        problems.append(f"{code.__name__}.name has to be {name!r}, it is {'missing' if own is None else repr(own)}")
+    for item in ("anchored", "bidirectional"):
+        if not isinstance(getattr(code, item), bool):
+            problems.append(f"{code.__name__}.{item} has to be True or False")
+    if code.bidirectional is True and code.with_reversal is interface.with_reversal:
+        arguments = ", ".join(_arguments(interface, "with_reversal"))
+        problems.append(f"{code.__name__} is bidirectional, so it needs with_reversal({arguments})")
     if problems:
         return code, problems
     control = thing.bound_form() if former else code
     if control.templates is None:
         file = inspect.getsourcefile(code)
         control.templates = Path(file).resolve().parent / "templates" if file else None
-    problems = _template_problems(name, control.templates)
-    return code if problems else control, problems
+    if not isinstance(control.templates, Path) or not (control.templates / name / "format.toml").is_file():
+        place = f"{control.templates}/{name}" if control.templates else f"templates/{name}"
+        return code, [f"its folder {place} with format.toml and the templates is missing"]
+    try:
+        check_templates(name, control.templates)
+    except InputError as error:
+        return code, [str(error)]
+    return control, []
 
 
 def _method_problems(code: type, interface: type) -> list[str]:
@@ -70,31 +84,6 @@ _BINDING = ("machine", "settings")
 
 def _arguments(interface: type, method: str) -> list[str]:
     return [key for key in inspect.signature(getattr(interface, method)).parameters if key != "self"]
-
-
-def _attribute_problems(name: str, code: Any, interface: Any) -> list[str]:
-    problems = []
-    own = getattr(code, "name", None)
-    if own != name:
-        problems.append(f"{code.__name__}.name has to be {name!r}, it is {'missing' if own is None else repr(own)}")
-    for item in ("anchored", "bidirectional"):
-        if not isinstance(getattr(code, item), bool):
-            problems.append(f"{code.__name__}.{item} has to be True or False")
-    if code.bidirectional is True and code.with_reversal is interface.with_reversal:
-        arguments = ", ".join(_arguments(interface, "with_reversal"))
-        problems.append(f"{code.__name__} is bidirectional, so it needs with_reversal({arguments})")
-    return problems
-
-
-def _template_problems(name: str, folder: Any) -> list[str]:
-    if not isinstance(folder, Path) or not (folder / name / "format.toml").is_file():
-        place = f"{folder}/{name}" if folder else f"templates/{name}"
-        return [f"its folder {place} with format.toml and the templates is missing"]
-    try:
-        check_templates(name, folder)
-    except InputError as error:
-        return [str(error)]
-    return []
 
 
 #: What plug-ins may add: word, name of the dict in a file, group of entry points, registry, check.

@@ -13,7 +13,7 @@ from typing import Any
 import click
 from rich.console import Console, RenderableType
 
-from compgen.accuracy.compare import CompareOptions, Comparison
+from compgen.accuracy.compare import CompareOptions
 from compgen.accuracy.diagonals import accuracy_of_diagonals
 from compgen.accuracy.evaluate import accuracy_of_errors
 from compgen.accuracy.positioning import SetupBudget, accuracy_of_runs
@@ -197,21 +197,18 @@ def compare_command(
         found = compare_prediction(first, second, options) if predicted else compare_sides(first, second, options)
         if controller is not None:
             found = with_prediction(found, first, second, read_tables(machine, tables, controller), options)
-    accepted = _accepted(found, expect)
+    verdict = None if found.prediction is None else found.prediction.verdict
+    if found.kind == "prediction":
+        accepted = verdict == "agrees"
+    else:
+        better = found.improved or (expect == "not-worse" and found.verdict not in ("worse", "larger"))
+        accepted = better and verdict != "disagrees"
     inputs = _inputs(machine, first.path, second.path, *tables)
     data = {"accepted": accepted, **found.summary(), "machine": machine.name, "inputs": inputs}
     text = comparison_table(found)
     write_all(out, {"compare.json": json_text(data), "compare.txt": _plain(text)})
     answer(as_json, data, text)
     return 0 if accepted else 1
-
-
-def _accepted(found: Comparison, expect: str) -> bool:
-    if found.kind == "prediction":
-        return found.prediction is not None and found.prediction.verdict == "agrees"
-    if found.prediction is not None and found.prediction.verdict == "disagrees":
-        return False
-    return found.improved or (expect == "not-worse" and found.verdict not in ("worse", "larger"))
 
 
 def _inputs(machine: Machine, *paths: Path) -> list[dict[str, str]]:

@@ -56,11 +56,6 @@ def print_json(data: Any) -> None:
     click.echo(json_text(data), nl=False)
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-    if issubclass(category, CompgenWarning):
-        _complain(f"warning: {message}", "yellow")
-
-
 def _complain(text: str, style: str) -> None:
     from compgen.cli.terminal import complain
 
@@ -73,7 +68,9 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
-        warnings.showwarning = _show_warning
+        warnings.showwarning = lambda message, category, *_, **__: (
+            _complain(f"warning: {message}", "yellow") if issubclass(category, CompgenWarning) else None
+        )
         try:
             called = Path(sys.argv[0]).name
             name = called if called in PROGRAM_NAMES else PROGRAM_NAMES[0]
@@ -82,7 +79,13 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
         except click.exceptions.Exit as error:
             return error.exit_code
         except click.ClickException as error:
-            return _usage(error, words)
+            context = getattr(error, "ctx", None)
+            if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):  # click 8.2 and later
+                error.show()
+                return 2
+            # as click does, with the place where help is to be had
+            hint = f"; see '{context.command_path} --help'" if context is not None else ""
+            return _fail(error.format_message().rstrip(".") + hint, 2, words)
         except (click.Abort, KeyboardInterrupt):
             click.echo("stopped", err=True)
             return STOPPED
@@ -98,16 +101,6 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
             place = traceback.extract_tb(error.__traceback__)[-1]
             text = f"internal error: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
             return _fail(f"{text}; COMPGEN_TRACEBACK=1 shows more", 3, words)
-
-
-def _usage(error: click.ClickException, words: Sequence[str]) -> int:
-    """Report wrong usage as click does, with the place where help is to be had."""
-    context = getattr(error, "ctx", None)
-    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):  # click 8.2 and later
-        error.show()
-        return 2
-    hint = f"; see '{context.command_path} --help'" if context is not None else ""
-    return _fail(error.format_message().rstrip(".") + hint, 2, words)
 
 
 def _fail(message: str, code: int, words: Sequence[str]) -> int:

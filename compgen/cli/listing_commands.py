@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -95,7 +95,12 @@ def effects_command(name: str | None, as_json: bool) -> int:
       volcomp effects backlash_X
     """
     if name is not None:
-        _show_effect(name, as_json)
+        stations = [match.group(1)] if (match := STATION_NAME.fullmatch(name)) else [ANY_STATION]
+        effects, origin = catalogue(stations), _effect_origins().get(name)
+        if name not in effects:
+            raise InputError(f"{name!r} is not an effect; {nearest(name, [*listed(), *SIMULATED_EFFECTS.registry])}")
+        card = effects[name].card
+        answer(as_json, {"name": name, **card_summary(card), "plugin": origin}, effect_card_text(card, origin))
         return 0
     origins = _effect_origins()
     readers = _readers(SIMULATED_EFFECTS)
@@ -122,18 +127,6 @@ def _effect_origins() -> dict[str, str]:
     for family, origin in EFFECT_FAMILIES.origins.items():
         found |= {effect.card.name: origin for effect in FAMILIES[family].members((ANY_STATION,))}
     return found
-
-
-def _show_effect(name: str, as_json: bool) -> None:
-    stations = [match.group(1)] if (match := STATION_NAME.fullmatch(name)) else [ANY_STATION]
-    known, origin = catalogue(stations), _effect_origins().get(name)
-    if name not in known:
-        raise InputError(f"{name!r} is not an effect; {nearest(name, [*listed(), *SIMULATED_EFFECTS.registry])}")
-    answer(
-        as_json,
-        {"name": name, **card_summary(known[name].card), "plugin": origin},
-        effect_card_text(known[name].card, origin),
-    )
 
 
 @click.command("instruments")
@@ -240,7 +233,8 @@ def import_command(
         item = import_file(file, given)
         summary, data = item.summary(), item.data
     against = [] if known is None else outside_travel(known, data)
-    summary = {**summary, "machine": _machine_summary(known, against), "files": []}
+    named = None if known is None else {"name": known.name, "outside": list(against)}
+    summary = {**summary, "machine": named, "files": []}
     if target is not None and not summary["doubts"] and not against:
         for name, text in {file.name: read_text(file)}.items() if kind is not None else item.files().items():
             target.add(name, text)
@@ -248,12 +242,20 @@ def import_command(
     if as_json:
         print_json(summary)
     else:
-        _show(summary)
+        say(f"{summary['file']}: {summary['format']}, {summary['kind']}")
+        for line in _lines(summary["understood"]):
+            say(f"  {line}")
+        for text in summary["notes"]:
+            say(f"note: {_printable(text)}")
+        for text in against:
+            say(f"outside: {text}", style="red")
+        for text in summary["doubts"]:
+            say(f"open: {_printable(text)}", style="yellow")
+        for path in summary["files"]:
+            say(f"  {path}")
+        if summary["doubts"]:
+            say("nothing is written while questions are open; answer them by options")
     return 2 if against or (target is not None and summary["doubts"]) else 0
-
-
-def _machine_summary(machine: Machine | None, against: Sequence[str]) -> dict[str, Any] | None:
-    return None if machine is None else {"name": machine.name, "outside": list(against)}
 
 
 def outside_travel(machine: Machine, data: object) -> list[str]:
@@ -278,22 +280,6 @@ def _positions(data: object) -> dict[int, np.ndarray]:
         ends = [(error_named(name).axis, curve.position_mm) for name, curve in data.curves.items()]
         return {axis: np.concatenate([values for k, values in ends if k == axis]) for axis in {k for k, _ in ends}}
     return {}
-
-
-def _show(summary: Mapping[str, Any]) -> None:
-    say(f"{summary['file']}: {summary['format']}, {summary['kind']}")
-    for line in _lines(summary["understood"]):
-        say(f"  {line}")
-    for text in summary["notes"]:
-        say(f"note: {_printable(text)}")
-    for text in (summary["machine"] or {}).get("outside", []):
-        say(f"outside: {text}", style="red")
-    for text in summary["doubts"]:
-        say(f"open: {_printable(text)}", style="yellow")
-    for path in summary["files"]:
-        say(f"  {path}")
-    if summary["doubts"]:
-        say("nothing is written while questions are open; answer them by options")
 
 
 def _lines(facts: Mapping[str, Any], depth: int = 0) -> list[str]:

@@ -15,17 +15,16 @@ from compgen.cli.common import NUMBER, PATH, json_option, out_option, print_json
 from compgen.cli.shared_options import machine_argument, options_of
 from compgen.cli.terminal import answer, progress, say, say_paths, stdout
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable, format_errors
+from compgen.data.error_table import format_errors
 from compgen.data.files import OutputFolder, write_file
 from compgen.data.lengths import Points, format_points, read_points
 from compgen.data.machine import Machine
 from compgen.effects import active_effects, displacement_of, readings_of_points
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_errors
-from compgen.identify import Covariance, IdentifyOptions, predict_uncertainty, read_covariance
+from compgen.identify import IdentifyOptions, predict_uncertainty, read_covariance
 from compgen.kinematics import predict
 from compgen.plan import (
-    Box,
     Plan,
     PlanVisibility,
     Suggestion,
@@ -124,7 +123,14 @@ def plan_command(
     OutputFolder(out)
     noise = planned_noise(readings)
     given, where = read_stations(stations), _points(machine, points, grid=grid)
-    allowed = _boxes(box, boxes, search=search)
+    if (box or boxes) and not search:
+        raise InputError("--box and --boxes need --suggest: they say where it may place a station")
+    allowed = read_boxes(boxes) if boxes else {}
+    for text in box:
+        label, place = box_from_text(text)
+        if label in allowed:
+            raise InputError(f"the box of station {label!r} is given twice", field="--box")
+        allowed[label] = place
     regions = regions_of(machine, given, allowed)
     with progress(quiet=as_json) as show:
         show("predicting")
@@ -158,18 +164,6 @@ def _points(machine: Machine, points: Path | None, *, grid: bool) -> Points:
         return read_points(points)
     nodes = np.meshgrid(*[axis.nodes_mm for axis in machine.axes], indexing="ij")
     return Points(np.stack(nodes, axis=-1).reshape(-1, 3))
-
-
-def _boxes(box: tuple[str, ...], boxes: Path | None, *, search: bool) -> dict[str, Box]:
-    if (box or boxes) and not search:
-        raise InputError("--box and --boxes need --suggest: they say where it may place a station")
-    found = read_boxes(boxes) if boxes else {}
-    for text in box:
-        label, where = box_from_text(text)
-        if label in found:
-            raise InputError(f"the box of station {label!r} is given twice", field="--box")
-        found[label] = where
-    return found
 
 
 def _write(
@@ -277,7 +271,16 @@ def predict_command(
     """
     where = read_points(points)
     table = open_errors(errors)
-    covariance = None if uncertainty is None else _covariance(errors, table, uncertainty)
+    covariance = None
+    if uncertainty is not None:  # empty: the file that the errors file names
+        name = table.metadata.get("covariance")
+        if not uncertainty and name is None:
+            raise InputError(
+                "names no covariance file (# covariance = ...), so --uncertainty knows none; only the files of compgen "
+                "identify and run have one: give it by --uncertainty FILE",
+                file=errors,
+            )
+        covariance = read_covariance(uncertainty or errors.parent / str(name), errors)
     error_mm = predict(machine, table, where, exact=exact)
     if exact:
         error_mm = error_mm + _effects_mm(machine, where)
@@ -307,17 +310,3 @@ def _effects_mm(machine: Machine, points: Points) -> FloatArray:
         message = f"the points lack the columns of {', '.join(missing)}: left out (volcomp effects NAME lists them)"
         warnings.warn(message, CompgenWarning, stacklevel=2)
     return moved_mm
-
-
-def _covariance(errors: Path, table: ErrorTable, file: str) -> Covariance:
-    """Return the covariance of an errors file: the one given, else the one that the errors file names."""
-    if file:
-        return read_covariance(file, errors)
-    name = table.metadata.get("covariance")
-    if name is None:
-        raise InputError(
-            "names no covariance file (# covariance = ...), so --uncertainty knows none; only the files of compgen "
-            "identify and run have one: give it by --uncertainty FILE",
-            file=errors,
-        )
-    return read_covariance(errors.parent / name, errors)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -75,7 +76,21 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
     from compgen.report.html.write import short_text
 
     OutputFolder(out or folder)
-    also, remark = _certificate(folder, certificate, schema)
+    beside = folder / "certificate.toml"
+    source = certificate or (beside if beside.is_file() else None)
+    also: Further | None = None  # what makes dcc.xml
+    remark = ""
+    if source is None and schema is not None:
+        raise InputError("--dcc-schema needs a certificate; give its data with --dcc certificate.toml")
+    if source is not None:
+        from compgen.report.dcc import NEWEST, certificate_files, read_certificate, read_schema
+
+        stated = read_certificate(source)
+        rules = None if schema is None else read_schema(schema)
+        also = partial(certificate_files, options=stated, schema=rules)
+        remark = f"dcc.xml: DCC {NEWEST}, not checked against the schema; --dcc-schema dcc.xsd does that"
+        if rules is not None:
+            remark = f"dcc.xml: DCC {rules.version}, valid by {rules.path}"
     with progress(quiet=as_json) as show:
         show("drawing the report")
         report, paths = write_report(folder, out, also)
@@ -87,24 +102,6 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
     if remark:
         say(remark)
     return 0
-
-
-def _certificate(folder: Path, certificate: Path | None, schema: Path | None) -> tuple[Further | None, str]:
-    """What makes dcc.xml, and a line about it; None where no certificate is requested."""
-    beside = folder / "certificate.toml"
-    source = certificate or (beside if beside.is_file() else None)
-    if source is None:
-        if schema is not None:
-            raise InputError("--dcc-schema needs a certificate; give its data with --dcc certificate.toml")
-        return None, ""
-    from compgen.report.dcc import NEWEST, certificate_files, read_certificate, read_schema
-
-    options = read_certificate(source)
-    rules = None if schema is None else read_schema(schema)
-    remark = f"dcc.xml: DCC {NEWEST}, not checked against the schema; --dcc-schema dcc.xsd does that"
-    if rules is not None:
-        remark = f"dcc.xml: DCC {rules.version}, valid by {rules.path}"
-    return (lambda data: certificate_files(data, options, rules)), remark
 
 
 def report_beside(folder: Path) -> Path | None:

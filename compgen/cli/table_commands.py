@@ -49,7 +49,7 @@ from compgen.report.options_text import explanation_markdown, options_markdown, 
 from compgen.report.terminal import crash_table, difference_table, merge_text, verification_table
 from compgen.tables import REJECTED_PREFIX, Provenance, export, read_tables, residuals, verify
 from compgen.tables.active import ActiveTables, bare_errors, keeping_others, merge_report, merged_errors, read_active
-from compgen.tables.diff import TableDifference, difference
+from compgen.tables.diff import difference
 from compgen.tables.options import capability
 from compgen.tables.options import explain as explained
 from compgen.tables.safety import SafetyLimits
@@ -357,17 +357,14 @@ def diff_command(
         warnings.warn(remark, CompgenWarning, stacklevel=1)
     result = difference(machine, first, second, read_points(points) if points else None)
     data = {**result.summary(), "remarks_a": list(first.remarks), "remarks_b": list(second.remarks)}
-    files = {"diff.json": json.dumps(data, indent=2) + "\n", "difference.csv": _difference_csv(machine, result)}
-    write_all(out, files)
-    answer(as_json, data, difference_table(result))
-    return 1 if fail_above is not None and result.max_um > fail_above else 0
-
-
-def _difference_csv(machine: Machine, result: TableDifference) -> str:
     columns: dict[str, FloatArray] = {}
     for prefix, values in (("a", result.first_mm), ("b", result.second_mm), ("d", result.difference_mm)):
         columns |= {f"{prefix}{axis}_um": values[:, k] * 1e3 for k, axis in enumerate("xyz")}
-    return format_points(Points(result.position_mm), columns, {"machine": machine.name})
+    text = format_points(Points(result.position_mm), columns, {"machine": machine.name})
+    files = {"diff.json": json.dumps(data, indent=2) + "\n", "difference.csv": text}
+    write_all(out, files)
+    answer(as_json, data, difference_table(result))
+    return 1 if fail_above is not None and result.max_um > fail_above else 0
 
 
 @click.command("merge")

@@ -66,21 +66,19 @@ def parse_plain(content: str) -> CsvFile | None:
     names, body = [name.strip() for name in header.split(",")], unix[start:]
     if any(mark in unix[:start] for mark in "\r\0") or '"' in header or any(mark in body for mark in _NOT_PLAIN):
         return None
-    count = _even_rows(body, len(names)) if body.isascii() and body.endswith("\n") else None
-    if count is None or len(names) < 2:
+    width = len(names)
+    if width < 2 or not body.isascii() or not body.endswith("\n"):
         return None
-    flat = body[:-1].replace("\n", ",").split(",")
-    return CsvFile(number, names, range(number + 1, number + 1 + count), metadata, flat=flat)
-
-
-def _even_rows(body: str, width: int) -> int | None:
-    """Number of rows if every row of ``body`` has ``width`` fields of a reasonable length, else None."""
-    text = np.frombuffer(body.encode("ascii"), dtype=np.uint8)
-    ends = np.flatnonzero((text == ord(",")) | (text == ord("\n")))
+    marks = np.frombuffer(body.encode("ascii"), dtype=np.uint8)
+    ends = np.flatnonzero((marks == ord(",")) | (marks == ord("\n")))
     if len(ends) % width or np.diff(ends, prepend=-1).max() > csv.field_size_limit():
         return None
-    is_line_end = text[ends].reshape(-1, width) == ord("\n")
-    return len(is_line_end) if is_line_end[:, -1].all() and not is_line_end[:, :-1].any() else None
+    is_line_end = marks[ends].reshape(-1, width) == ord("\n")
+    if not is_line_end[:, -1].all() or is_line_end[:, :-1].any():  # rows of different lengths
+        return None
+    count = len(is_line_end)
+    flat = body[:-1].replace("\n", ",").split(",")
+    return CsvFile(number, names, range(number + 1, number + 1 + count), metadata, flat=flat)
 
 
 def _note_metadata(line: str, metadata: dict[str, str]) -> bool:
@@ -270,19 +268,15 @@ def csv_table(
                 message = f"has {len(row)} fields, the header has {len(file.header)}{last}"
                 raise InputError(message, file=source, line=line)
     _check_complete(source, content, file)
-    _warn_left_out(
-        f"{source}:{file.header_line}", [name for name in file.header if not _is_allowed(name, known, prefixes)], known
-    )
+    place = f"{source}:{file.header_line}"
+    strange = [name for name in file.header if not _is_allowed(name, known, prefixes)]
+    for name in strange[:_NAMED]:
+        message = f"column {_shown(name)!r} is unknown and ignored; {nearest(name[:_SHOWN], known)}"
+        warnings.warn(f"{place}: {message}", CompgenWarning, stacklevel=4)
+    if len(strange) > _NAMED:
+        warnings.warn(f"{place}: {len(strange) - _NAMED} more columns are ignored", CompgenWarning, stacklevel=4)
     kept = {k: name for k, name in enumerate(file.header) if _is_allowed(name, known, prefixes)}
     return CsvTable(source, {name: file.column(k) for k, name in kept.items()}, file.lines, file.metadata)
-
-
-def _warn_left_out(place: str, names: list[str], known: set[str]) -> None:
-    for name in names[:_NAMED]:
-        message = f"column {_shown(name)!r} is unknown and ignored; {nearest(name[:_SHOWN], known)}"
-        warnings.warn(f"{place}: {message}", CompgenWarning, stacklevel=5)
-    if len(names) > _NAMED:
-        warnings.warn(f"{place}: {len(names) - _NAMED} more columns are ignored", CompgenWarning, stacklevel=5)
 
 
 def _shown(text: str) -> str:
@@ -357,7 +351,15 @@ def format_csv(
 def _template(values: Sequence[str] | FloatArray, digits: int) -> tuple[str, Sequence[str] | Sequence[float]]:
     """Conversion of a column for the ``%`` operator, and what it converts."""
     if not isinstance(values, np.ndarray):
-        return "%s", [_quoted(str(value)) for value in values]
+        texts = [str(value) for value in values]
+        cells = {}
+        for text in set(texts):  # a column has few different labels
+            # one line, in quotes where it needs them, and never a formula for a spreadsheet
+            flat = " ".join(text.split())
+            if _FORMULA.match(flat) and flat not in ("+", "-") and not _is_number(flat):
+                flat = f"'{flat}"
+            cells[text] = '"' + flat.replace('"', '""') + '"' if any(char in flat for char in ',"#') else flat
+        return "%s", [cells[text] for text in texts]
     numbers = np.array(values, dtype=np.float64)
     if not np.isfinite(numbers).all():
         return "%s", [fixed(value, digits) for value in numbers.tolist()]
@@ -365,14 +367,6 @@ def _template(values: Sequence[str] | FloatArray, digits: int) -> tuple[str, Seq
         if float(fixed(float(numbers[k]), digits)) == 0.0:
             numbers[k] = 0.0  # no negative zero
     return f"%.{digits}f", numbers.tolist()
-
-
-def _quoted(cell: str) -> str:
-    """Return a label as a cell: one line, in quotes where it needs them, and never a formula for a spreadsheet."""
-    flat = " ".join(cell.split())
-    if _FORMULA.match(flat) and flat not in ("+", "-") and not _is_number(flat):
-        flat = f"'{flat}"
-    return '"' + flat.replace('"', '""') + '"' if any(char in flat for char in ',"#') else flat
 
 
 def fixed(value: float, digits: int) -> str:

@@ -193,7 +193,9 @@ def _write_temporary(target: Path, content: bytes) -> Path:
             stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
-        path.chmod(0o666 & ~_umask())
+        mask = os.umask(0)
+        os.umask(mask)
+        path.chmod(0o666 & ~mask)
     except BaseException:
         path.unlink(missing_ok=True)
         _unlock(path)
@@ -268,12 +270,6 @@ def remove_abandoned_folders() -> None:
                 mine = not hasattr(os, "geteuid") or path.lstat().st_uid == os.geteuid()
                 if mine and path.is_dir() and not path.is_symlink() and _abandoned(path / LOCK):
                     shutil.rmtree(path, ignore_errors=True)
-
-
-def _umask() -> int:
-    current = os.umask(0)
-    os.umask(current)
-    return current
 
 
 def write_file(path: str | Path, content: str | bytes) -> Path:

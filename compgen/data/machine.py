@@ -354,7 +354,14 @@ def _machine_of(root: toml_files.Section, source: Path) -> Machine:
                 f"{axis_name} = {reference_mm:g} mm lies outside the travel {low:g} ... {high:g} mm; the "
                 f"position-dependent errors are zero there, so it must lie within the travel; set reference_point_mm",
             )
-    tool_range_mm = _take_tool_range(root, tool_offset_mm)
+    tool_range_mm: ToolRange | None = None
+    if "tool_range_mm" in root:  # an axis that is not named has the machine's own offset
+        section = root.section("tool_range_mm")
+        x, y, z = (
+            section.take(axis, toml_files.interval, (at, at)) for axis, at in zip(AXES, tool_offset_mm, strict=True)
+        )
+        section.finish()
+        tool_range_mm = x, y, z
     emphasis = take_emphasis(root, [axis.range_mm for axis in axes])
     root.finish()
     return Machine(
@@ -387,16 +394,6 @@ def _offset(value: object) -> Vector3:
     x, y, z = toml_files.vector3(value)
     if max(abs(x), abs(y), abs(z)) > MOST_MM:
         raise ValueError("components of less than a kilometre are expected; is the unit mm?")
-    return x, y, z
-
-
-def _take_tool_range(root: toml_files.Section, own_mm: Vector3) -> ToolRange | None:
-    """Take ``tool_range_mm``: ranges of the tool offset; an axis that is not named has the machine's own offset."""
-    if "tool_range_mm" not in root:
-        return None
-    section = root.section("tool_range_mm")
-    x, y, z = (section.take(axis, toml_files.interval, (own, own)) for axis, own in zip(AXES, own_mm, strict=True))
-    section.finish()
     return x, y, z
 
 

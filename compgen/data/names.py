@@ -47,24 +47,19 @@ class ErrorName:
         return self.kind == "linear" and self.direction != self.axis
 
 
-def _all_errors() -> tuple[ErrorName, ...]:
-    kinds: tuple[tuple[Kind, str], ...] = (("linear", "XYZ"), ("angular", "ABC"))
-    curves = [
+_LETTERS: tuple[tuple[Kind, str], ...] = (("linear", "XYZ"), ("angular", "ABC"))
+#: All 21, in the order of the columns of C: six of X, six of Y, six of Z, then EC0Y, EB0Z, EA0Z.
+ERRORS: tuple[ErrorName, ...] = (
+    *(
         ErrorName(f"E{letter}{AXES[axis]}", kind, direction, axis)
         for axis in range(3)
-        for kind, letters in kinds
+        for kind, letters in _LETTERS
         for direction, letter in enumerate(letters)
-    ]
-    squareness = [
-        ErrorName("EC0Y", "squareness", 2, 1),
-        ErrorName("EB0Z", "squareness", 1, 2),
-        ErrorName("EA0Z", "squareness", 0, 2),
-    ]
-    return (*curves, *squareness)
-
-
-#: All 21, in the order of the columns of C: six of X, six of Y, six of Z, then EC0Y, EB0Z, EA0Z.
-ERRORS: tuple[ErrorName, ...] = _all_errors()
+    ),
+    ErrorName("EC0Y", "squareness", 2, 1),
+    ErrorName("EB0Z", "squareness", 1, 2),
+    ErrorName("EA0Z", "squareness", 0, 2),
+)
 ERROR_NAMES: tuple[str, ...] = tuple(error.name for error in ERRORS)
 ERROR_INDEX: dict[str, int] = {name: k for k, name in enumerate(ERROR_NAMES)}
 CURVE_NAMES: tuple[str, ...] = ERROR_NAMES[:18]

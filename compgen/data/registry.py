@@ -114,7 +114,19 @@ def load_file(path: str | Path, kinds: Sequence[Kind]) -> None:
     if any(origin in kind.origins.values() for kind in kinds):
         return
     name = f"compgen_plugin_{hashlib.sha256(str(file).encode()).hexdigest()[:12]}"
-    _register_all(_import(name, file, source.is_dir(), origin), file, origin, kinds)
+    module = _import(name, file, source.is_dir(), origin)
+    found: list[tuple[Kind, str, Any]] = []
+    for kind in kinds:
+        things = getattr(module, kind.attribute, None)
+        if things is not None and not isinstance(things, Mapping):
+            raise InputError(f"{origin}: {kind.attribute} has to be a dict from names to {kind.word}s", file=file)
+        found += [(kind, name, thing) for name, thing in (things or {}).items()]
+    if not found:
+        dicts = ", ".join(f"{kind.attribute} ({kind.word}s by name)" for kind in kinds)
+        raise InputError(f"{origin} holds nothing to register; expected at least one dict: {dicts}", file=file)
+    with restored(kinds, only_after_errors=True):
+        for kind, name, thing in found:
+            kind.register(name, thing, origin)
 
 
 def _import(name: str, file: Path, package: bool, origin: str) -> ModuleType:
@@ -150,21 +162,6 @@ def _import_error(error: BaseException, origin: str, file: Path | None) -> Input
         if path.is_file() and (folder is None or path.resolve().is_relative_to(folder)):
             return InputError(message, file=path, line=frame.lineno)
     return InputError(message, file=file)
-
-
-def _register_all(module: ModuleType, file: Path, origin: str, kinds: Sequence[Kind]) -> None:
-    found: list[tuple[Kind, str, Any]] = []
-    for kind in kinds:
-        things = getattr(module, kind.attribute, None)
-        if things is not None and not isinstance(things, Mapping):
-            raise InputError(f"{origin}: {kind.attribute} has to be a dict from names to {kind.word}s", file=file)
-        found += [(kind, name, thing) for name, thing in (things or {}).items()]
-    if not found:
-        dicts = ", ".join(f"{kind.attribute} ({kind.word}s by name)" for kind in kinds)
-        raise InputError(f"{origin} holds nothing to register; expected at least one dict: {dicts}", file=file)
-    with restored(kinds, only_after_errors=True):
-        for kind, name, thing in found:
-            kind.register(name, thing, origin)
 
 
 def load_entry_points(kinds: Sequence[Kind]) -> None:

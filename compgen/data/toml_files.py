@@ -83,20 +83,17 @@ class Section:
         """Return the checked value of ``key``; ``check`` raises ValueError with what is expected."""
         if key not in self:
             if default is _REQUIRED:
-                raise self.fail(key, f"is missing{self._misspelt(key)}")
+                # a key of the file that was probably meant: another case, the unit left out, a slip
+                present = [name for name in self.data if name not in self._known]
+                alike = [name for name in present if f"{key}_".lower().startswith(f"{name}_".lower())]
+                alike = alike or difflib.get_close_matches(key, present, n=1, cutoff=0.6)
+                hint = f"; {visible_line(alike[0])!r} is not a key here, did you mean {key!r}?" if alike else ""
+                raise self.fail(key, f"is missing{hint}")
             return default
         try:
             return check(self.data[key])
         except ValueError as error:
             raise self.fail(key, f"{error}; got {visible_line(repr(self.data[key]))[:80]}") from None
-
-    def _misspelt(self, key: str) -> str:
-        """The end of a message about a missing ``key``: a key of the file that was probably meant for it."""
-        present = [name for name in self.data if name not in self._known]
-        # another case, or the unit was left out
-        alike = [name for name in present if f"{key}_".lower().startswith(f"{name}_".lower())]
-        alike = alike or difflib.get_close_matches(key, present, n=1, cutoff=0.6)
-        return f"; {visible_line(alike[0])!r} is not a key here, did you mean {key!r}?" if alike else ""
 
     def section(self, key: str, *, required: bool = True) -> Section:
         """Return the sub-section ``key`` (an empty one if it is absent and not required)."""

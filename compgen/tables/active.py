@@ -180,18 +180,11 @@ def bare_errors(
         change = solver.project_all(-rest[None])[0]
         values = values + change
         if np.max(np.abs(solver.field(change))) < CONVERGED_MM:
-            grid = volume_grid(machine, (both[0], both[1], both[2]))
-            return found, _lost_um(machine, errors, found, active, grid.position_mm)
+            position_mm = volume_grid(machine, (both[0], both[1], both[2])).position_mm
+            added = active.correction(machine, _upwards(position_mm))
+            rest = exact_error(machine, errors, position_mm) - added - exact_error(machine, found, position_mm + added)
+            return found, float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM
     raise ConvergenceError("the effect of the active tables cannot be taken out: the iteration does not settle")
-
-
-def _lost_um(
-    machine: Machine, measured: ErrorTable, found: ErrorTable, active: ActiveTables, position_mm: FloatArray
-) -> float:
-    """Largest displacement at points (n, 3) by which bare errors and active tables miss the measured errors, um."""
-    added = active.correction(machine, _upwards(position_mm))
-    rest = exact_error(machine, measured, position_mm) - added - exact_error(machine, found, position_mm + added)
-    return float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM
 
 
 def _upwards(position_mm: FloatArray) -> Points:

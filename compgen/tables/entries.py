@@ -127,7 +127,13 @@ def _changed_by_list(one: object, other: object) -> dict[str, int]:
                 np.concatenate([part[place] for place in places if place in part] or [np.zeros(0)])
                 for part in (first, second)
             )
-            count = 1 if _moved_by_one(values, others) else count
+            if values.shape == others.shape:
+                # One wrong position moves a run of numbers by one place, up or down, with any number at its end, in tables
+                # that are read in the order of their positions.
+                differ = np.flatnonzero(~_same(values, others))
+                run, right = (part[differ[0] : differ[-1] + 1] for part in (values, others))
+                if _same(run[1:], right[:-1]).all() or _same(run[:-1], right[1:]).all():
+                    count = 1
         found[name] = count
     return found
 
@@ -135,18 +141,6 @@ def _changed_by_list(one: object, other: object) -> dict[str, int]:
 def _list_of(place: str) -> str:
     """The list that holds the number at a place such as ``.tables[0].values[7]``, without its number in the list."""
     return re.sub(r"\[\d+\]$", "", place)
-
-
-def _moved_by_one(values: FloatArray, others: FloatArray) -> bool:
-    """Whether a run of numbers is that of ``others`` moved by one place, up or down, with any number at its end.
-
-    One wrong position does that to tables that are read in the order of their positions.
-    """
-    if values.shape != others.shape:
-        return False
-    changed = np.flatnonzero(~_same(values, others))
-    run, right = (part[changed[0] : changed[-1] + 1] for part in (values, others))
-    return bool(_same(run[1:], right[:-1]).all() or _same(run[:-1], right[1:]).all())
 
 
 def _same(values: FloatArray, others: FloatArray) -> BoolArray:
@@ -272,24 +266,13 @@ class EntryCheck:
     @property
     def _numbers_differ(self) -> bool:
         """Whether the given tables are those made anew, with some numbers changed."""
-        return self._few_differ or (self.made is not None and 0 < self.changed <= CHANGED_SHARE * self._depend)
+        depend = sum(int(part.sum()) for part in self.depends.values())
+        return self._few_differ or (self.made is not None and 0 < self.changed <= CHANGED_SHARE * depend)
 
     @property
     def changed(self) -> int:
         """How many numbers differ."""
         return sum(self.changed_in.values())
-
-    @property
-    def _depend(self) -> int:
-        return sum(int(part.sum()) for part in self.depends.values())
-
-    @property
-    def _whole_lists_differ(self) -> bool:
-        """Whether the tables may be of another measurement: not where single numbers in a list differ from the others."""
-        depend: dict[str, int] = {}
-        for place, part in self.depends.items():
-            depend[_list_of(place)] = depend.get(_list_of(place), 0) + int(part.sum())
-        return all(count >= WHOLE_SHARE * depend.get(name, 0) for name, count in self.changed_in.items() if count)
 
     @property
     def _few_differ(self) -> bool:
@@ -363,7 +346,13 @@ class EntryCheck:
             return []
         coarse = COARSE_SHARE * self.judge.bent_mm if self.judge.resolution_mm > goal else 0.0
         explained = CHANGED_UNCERTAINTIES * self._u_mm(sample)
-        if not self._whole_lists_differ:  # errors that hardly show in these steps explain one rounding more
+        depend: dict[str, int] = {}
+        for place, part in self.depends.items():
+            depend[_list_of(place)] = depend.get(_list_of(place), 0) + int(part.sum())
+        whole = all(count >= WHOLE_SHARE * depend.get(name, 0) for name, count in self.changed_in.items() if count)
+        # Where whole lists differ the tables may be of another measurement; where single numbers in a list do, errors that
+        # hardly show in these steps explain one rounding more.
+        if not whole:
             explained = np.minimum(explained, self.judge.resolution_mm)
         return sample.worst(np.abs(sample.miss_mm) - max(GOAL_SHARE * goal, coarse) - explained)
 
@@ -382,7 +371,11 @@ class EntryCheck:
         found: dict[int, str] = {}
         for axis in range(3):
             difference, position = np.moveaxis(miss, axis, 2), np.moveaxis(sample.position_mm, axis, 2)
-            steps = _bent_steps(difference, np.diff(position[0, 0, :, axis]))
+            # steps over the intervals of the axis, less the usual slope of each line
+            width = np.diff(position[0, 0, :, axis])[None, None, :, None]
+            slope = np.diff(difference, axis=2) / width
+            usual = np.median(slope, axis=2, keepdims=True) if width.size else 0.0
+            steps = np.abs(slope - usual) * width
             for output in range(3):
                 profile = steps[..., output].max(axis=(0, 1), initial=0.0)
                 worst = int(np.argmax(profile)) if len(profile) else 0
@@ -442,14 +435,6 @@ class EntryCheck:
         slack = sample.slack_mm + own_tool.slack_mm + POINT_UNCERTAINTIES * self._u_mm(sample)
         limit = np.maximum(self.judge.goal_mm, share) + slack
         return sample.worst(np.maximum(own - np.maximum(best, 0.0), np.minimum(best, 0.0) - own) - limit)
-
-
-def _bent_steps(difference_mm: FloatArray, width_mm: FloatArray) -> FloatArray:
-    """Steps of a difference (a, b, n, 3) over the intervals of the third axis, less its usual slope: (a, b, n - 1, 3)."""
-    width = width_mm[None, None, :, None]
-    slope = np.diff(difference_mm, axis=2) / width
-    usual = np.median(slope, axis=2, keepdims=True) if len(width_mm) else 0.0
-    return np.asarray(np.abs(slope - usual) * width)
 
 
 def _ends(machine: Machine) -> list[FloatArray]:

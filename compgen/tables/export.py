@@ -64,7 +64,12 @@ def set_aside_superseded(output: OutputFolder, targets: Sequence[str] = ("",)) -
         return []
     names = {spec.name for control in CONTROLLERS for spec in load_format(control).files}
     new = {PurePosixPath(name): content for name, content in output.contents.items()}
-    for target in dict.fromkeys(["", *targets, *_other_targets(output, targets)]):
+    others: list[str] = []  # sub-folders with tables that an earlier run wrote for controls that this run leaves out
+    if "identify.json" in output.contents:
+        found = (path.parent for path in sorted(output.folder.glob(f"*/{MANIFEST}")))
+        # a sub-folder with an identification of its own is not part of a run in the folder above
+        others = [path.name for path in found if path.name not in targets and not (path / "identify.json").exists()]
+    for target in dict.fromkeys(["", *targets, *others]):
         base = PurePosixPath(target)
         beside = {str(path.relative_to(base)): text for path, text in new.items() if path.is_relative_to(base)}
         if (output.folder / base).is_dir():
@@ -75,21 +80,17 @@ def set_aside_superseded(output: OutputFolder, targets: Sequence[str] = ("",)) -
     return [output.set_aside(name) for name in report]
 
 
-def _other_targets(output: OutputFolder, targets: Sequence[str]) -> list[str]:
-    """Sub-folders with tables that an earlier run wrote for controls that this run leaves out.
-
-    A sub-folder with an identification of its own is not part of a run in the folder above.
-    """
-    if "identify.json" not in output.contents:
-        return []
-    found = (path.parent for path in sorted(output.folder.glob(f"*/{MANIFEST}")))
-    return [path.name for path in found if path.name not in targets and not (path / "identify.json").exists()]
-
-
 def _set_aside_in(output: OutputFolder, base: PurePosixPath, new: Mapping[str, bytes], names: Set[str]) -> None:
     """Sort the tables in one folder, where ``new`` are the files that it gets; ``names`` are those of all controls' tables."""
     folder = output.folder / base
-    known = _known_hashes(folder)
+    try:  # SHA-256 of every table by name, as the manifest in the folder has it
+        manifest = json.loads((folder / MANIFEST).read_bytes())
+        prefix = str(manifest.get("file_prefix", ""))
+        items = [*manifest["files"], *manifest.get("companions", ())]
+        hashes = {prefix + str(item["name"]): str(item["sha256"]) for item in items}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        hashes = {}
+    known = {name: digest for name, digest in hashes.items() if PurePosixPath(name).name == name}
     tables = {*known, *names, *(REJECTED_PREFIX + name for name in names)}
     kept, strangers = [], []
     for path in sorted(path for path in folder.iterdir() if path.name in tables and path.is_file()):
@@ -117,18 +118,6 @@ def _set_aside_in(output: OutputFolder, base: PurePosixPath, new: Mapping[str, b
 def _twin(name: str) -> str:
     """The name of the same table with the other verdict."""
     return name.removeprefix(REJECTED_PREFIX) if name.startswith(REJECTED_PREFIX) else REJECTED_PREFIX + name
-
-
-def _known_hashes(folder: Path) -> dict[str, str]:
-    """SHA-256 of every table by name as the manifest in ``folder`` has it; empty if there is none that can be read."""
-    try:
-        manifest = json.loads((folder / MANIFEST).read_bytes())
-        prefix = str(manifest.get("file_prefix", ""))
-        items = [*manifest["files"], *manifest.get("companions", ())]
-        hashes = {prefix + str(item["name"]): str(item["sha256"]) for item in items}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return {}
-    return {name: digest for name, digest in hashes.items() if PurePosixPath(name).name == name}
 
 
 # Errors to controller files: settings, basis, best table values, text, manifest and preflight list.
@@ -276,11 +265,40 @@ def export(
     files = render_files(card, {**common, **own}, templates)
     with_errors = {**common, **own, "errors21": errors_context(machine, errors)}
     companions = companion_files(card, with_errors, files, templates)
-    own = {**own, "warnings": [*own["warnings"], *_not_read_back(companions)]}
+    unread = [
+        f"{name} comes from a template of yours: it is not read back, and nothing in it is verified"
+        for name in companions
+    ]
+    own = {**own, "warnings": [*own["warnings"], *unread]}
     described = _described(files)
     violations = control.violations(tables)
     preflight = render(card, "preflight.md.j2", {**common, **own, "files": described}, templates)
-    manifest = {**_manifest(common, card, own, described, machine), "violations": violations}
+    source = machine.source if machine.source and machine.source.is_file() else None
+    manifest = {
+        "program": f"compgen {common['version']}",
+        "controller": controller,
+        "format": card.title,
+        "evidence": card.evidence,
+        "unverified": list(card.unverified),
+        "machine": {
+            "name": machine.name,
+            "chain": machine.chain.name,
+            "squareness_reference": machine.squareness_reference,
+            "tool_offset_mm": list(machine.tool_offset_mm),
+            "reference_point_mm": list(machine.reference_point_mm),
+            **machine.emphasis.summary(),
+            "file": str(machine.source) if machine.source else None,
+            "sha256": sha256_of(source.read_bytes()) if source else None,
+        },
+        "inputs": [{"name": name, "sha256": digest} for name, digest in common["input_hashes"].items()],
+        "errors_sha256": common["errors_sha256"],
+        "settings": dict(machine.controller_settings(controller).data),
+        "sign_statement": own["sign_statement"],
+        "parameters": own["parameters"],
+        "warnings": own["warnings"],
+        "files": described,
+        "violations": violations,
+    }
     if companions:
         manifest["companions"] = _described(companions)
     return Export(controller, files, manifest, preflight, violations, own["warnings"], companions)
@@ -309,13 +327,6 @@ def table_values(
 
 def _described(files: Mapping[str, str]) -> list[dict[str, str]]:
     return [{"name": name, "sha256": sha256_of(text.encode("ascii", "replace"))} for name, text in files.items()]
-
-
-def _not_read_back(companions: Mapping[str, str]) -> list[str]:
-    return [
-        f"{name} comes from a template of yours: it is not read back, and nothing in it is verified"
-        for name in companions
-    ]
 
 
 def rerender(
@@ -376,33 +387,4 @@ def export_context(
         "input_sha256": sha256_of(both.encode()),
         "errors_sha256": sha256_of(text.encode()),
         "input_hashes": dict(inputs),
-    }
-
-
-def _manifest(
-    common: dict[str, Any], card: Format, own: dict[str, Any], files: list[dict[str, str]], machine: Machine
-) -> dict[str, Any]:
-    return {
-        "program": f"compgen {common['version']}",
-        "controller": common["controller"],
-        "format": card.title,
-        "evidence": card.evidence,
-        "unverified": list(card.unverified),
-        "machine": {
-            "name": machine.name,
-            "chain": machine.chain.name,
-            "squareness_reference": machine.squareness_reference,
-            "tool_offset_mm": list(machine.tool_offset_mm),
-            "reference_point_mm": list(machine.reference_point_mm),
-            **machine.emphasis.summary(),
-            "file": str(machine.source) if machine.source else None,
-            "sha256": sha256_of(machine.source.read_bytes()) if machine.source and machine.source.is_file() else None,
-        },
-        "inputs": [{"name": name, "sha256": digest} for name, digest in common["input_hashes"].items()],
-        "errors_sha256": common["errors_sha256"],
-        "settings": dict(machine.controller_settings(common["controller"]).data),
-        "sign_statement": own["sign_statement"],
-        "parameters": own["parameters"],
-        "warnings": own["warnings"],
-        "files": files,
     }

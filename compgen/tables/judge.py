@@ -274,7 +274,9 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, table
     grid = volume_grid(machine, nodes)
     line_mm = scan_lines(machine, nodes)
     best_mm = solver.field(values, grid.position_mm)
-    bent_mm = _without_linear_part(grid.position_mm, best_mm)
+    # what is bent: the field without its best-fit constant and slopes (squareness, pitch)
+    columns = np.column_stack([np.ones(len(best_mm)), grid.position_mm - grid.position_mm.mean(axis=0)])
+    bent_mm = best_mm - columns @ np.linalg.lstsq(columns, best_mm, rcond=None)[0]
     resolution_mm = control.resolution_mm()
     grid_u_mm = COMPONENT_UNCERTAINTIES * displacement_uncertainty(machine, errors, grid.position_mm)
     return Judge(
@@ -292,13 +294,6 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, table
         u_mm=displacement_uncertainty(machine, errors, line_mm),
         resolution_mm=resolution_mm,
     )
-
-
-def _without_linear_part(position_mm: FloatArray, field_mm: FloatArray) -> FloatArray:
-    """Take the best-fit constant and slopes (squareness, pitch) out of a field (n, 3) at points (n, 3)."""
-    columns = np.column_stack([np.ones(len(position_mm)), position_mm - position_mm.mean(axis=0)])
-    linear, *_ = np.linalg.lstsq(columns, field_mm, rcond=None)
-    return np.asarray(field_mm - columns @ linear)
 
 
 def _nodes(machine: Machine, errors: ErrorTable, solver: Projector) -> tuple[FloatArray, ...]:

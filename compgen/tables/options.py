@@ -94,8 +94,11 @@ class Level:
         """
         if self.key in ("volumetric", "directional"):  # the control evaluates E = C P with the tool in use
             return [dict.fromkeys(errors.names, 0.0) for _ in tools_mm]
-        position_mm = _level_points(machine, errors) if self.solver is None else self.solver.position_mm
-        weight = None if self.solver is None else self.solver.weight
+        if self.solver is None:
+            levels = [curve_nodes_mm(machine, errors, axis, most=25) for axis in range(3)]
+            position_mm, weight = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3), None
+        else:
+            position_mm, weight = self.solver.position_mm, self.solver.weight
         found: list[dict[str, float]] = [{} for _ in tools_mm]
         for name in errors.names:
             part = errors.only(name)
@@ -140,20 +143,6 @@ def _refined(nodes_mm: FloatArray) -> FloatArray:
     return np.asarray(np.interp(where, np.arange(len(nodes_mm)), nodes_mm))
 
 
-def _level_points(machine: Machine, errors: ErrorTable) -> FloatArray:
-    levels = [curve_nodes_mm(machine, errors, axis, most=25) for axis in range(3)]
-    return np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _basis(key: str, machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatArray]) -> list[Term]:
-    if key == "volumetric":
-        return error_terms(machine, errors, nodes_mm)
-    pairs = [(output, axis) for output in range(3) for axis in range(3) if output == axis or key != "pitch"]
-    origin_mm = (0.5 * (machine.lower_mm + machine.upper_mm)).tolist()
-    terms = one_dimensional_terms(machine, errors, nodes_mm, pairs, lever_origin_mm=origin_mm)
-    return terms + product_terms(machine, errors, nodes_mm, origin_mm) if key == "products" else terms
-
-
 def _best(solver: Projector, pitch: Projector | None, wanted_mm: FloatArray) -> FloatArray:
     """Table values (parameters,) closest to a wanted field (n, 3); with ``pitch`` those without squareness.
 
@@ -179,10 +168,18 @@ def levels_of(machine: Machine, errors: ErrorTable, reversal: ReversalCurves | N
     Straightness without squareness has the straightness of the level that follows, zero at both ends of the travel.
     """
     nodes_mm = level_nodes_mm(machine, errors)
-    solvers = {
-        key: projector(machine, _basis(key, machine, errors, nodes_mm), anchored=False)
-        for key in ("pitch", "squareness", "products", "volumetric")
+    origin_mm = (0.5 * (machine.lower_mm + machine.upper_mm)).tolist()
+    pitch, squareness = (
+        one_dimensional_terms(machine, errors, nodes_mm, pairs, lever_origin_mm=origin_mm)
+        for pairs in ([(k, k) for k in range(3)], [(output, axis) for output in range(3) for axis in range(3)])
+    )
+    bases = {
+        "pitch": pitch,
+        "squareness": squareness,
+        "products": squareness + product_terms(machine, errors, nodes_mm, origin_mm),
+        "volumetric": error_terms(machine, errors, nodes_mm),
     }
+    solvers = {key: projector(machine, basis, anchored=False) for key, basis in bases.items()}
     found = [Level("nothing")]
     for key, solver in solvers.items():
         wanted = wanted_correction(machine, errors, solver.position_mm)
@@ -308,32 +305,34 @@ class Capability:
             "tools_mm": [list(tool) for tool in self.tools_mm],
             "zone_mm": None if self.zone_mm is None else [part and list(part) for part in self.zone_mm],
             "points": self.points,
-            "levels": [self._level_dict(item) for item in self.levels],
-            "controls": [_control_dict(item) for item in self.controls],
+            "levels": [
+                {
+                    "level": item.key,
+                    "holds": item.label,
+                    **item.left.as_dict(),
+                    "tools": [
+                        {"tool_mm": list(tool), **left.as_dict(), "uncorrected_um": dict(alone)}
+                        for tool, (left, alone) in zip(self.tools_mm, item.by_tool, strict=True)
+                    ],
+                }
+                for item in self.levels
+            ],
+            "controls": [
+                {
+                    "controller": item.name,
+                    "variant": item.variant,
+                    "as_in_machine_file": item.own,
+                    "level": item.level,
+                    "direction_dependent": item.directional,
+                    **({} if item.left is None else item.left.as_dict()),
+                    "limits_broken": list(item.broken),
+                    "notes": list(item.notes),
+                    "problem": item.problem or None,
+                }
+                for item in self.controls
+            ],
             "notes": list(self.notes),
         }
-
-    def _level_dict(self, item: LevelResult) -> dict[str, Any]:
-        tools = [
-            {"tool_mm": list(tool), **left.as_dict(), "uncorrected_um": dict(alone)}
-            for tool, (left, alone) in zip(self.tools_mm, item.by_tool, strict=True)
-        ]
-        return {"level": item.key, "holds": item.label, **item.left.as_dict(), "tools": tools}
-
-
-def _control_dict(item: ControlResult) -> dict[str, Any]:
-    figures = {} if item.left is None else item.left.as_dict()
-    return {
-        "controller": item.name,
-        "variant": item.variant,
-        "as_in_machine_file": item.own,
-        "level": item.level,
-        "direction_dependent": item.directional,
-        **figures,
-        "limits_broken": list(item.broken),
-        "notes": list(item.notes),
-        "problem": item.problem or None,
-    }
 
 
 def default_tools_mm(machine: Machine) -> tuple[tuple[float, float, float], ...]:
@@ -370,9 +369,18 @@ def capability(
     nodes = tuple(curve_nodes_mm(zone, errors, axis) for axis in range(3))
     points = Points(volume_grid(zone, nodes).position_mm)
     points = points if reversal is None else in_both_directions(points)
-    levels = tuple(
-        _level_result(zone, errors, item, points, reversal, tools) for item in levels_of(zone, errors, reversal)
-    )
+    approach = np.zeros_like(points.position_mm) if points.approach is None else points.approach
+    offsets = [np.array(item, dtype=np.float64) for item in tools]
+    reversed_um = left_by_reversal(reversal, corrected=False)
+    levels = []
+    for level in levels_of(zone, errors, reversal):
+        left_um = left_by_reversal(reversal, corrected=level.reversal is not None)
+        by_tool = []
+        for tool, alone in zip(offsets, level.left_alone_um(zone, errors, offsets), strict=True):
+            correction = level.correction(points.position_mm, approach, tool)
+            left = _left(zone, errors, points, correction, reversal, tool)
+            by_tool.append((left, {**alone, **dict.fromkeys(reversed_um, 0.0), **left_um}))
+        levels.append(LevelResult(level.key, by_tool[0][0], tuple(by_tool)))
     controls = [
         _control_result(variant, changed, errors, points, reversal, templates)
         for name in (CONTROLLERS if controllers is None else controllers)
@@ -384,7 +392,7 @@ def capability(
         tools_mm=tools,
         zone_mm=zone_mm,
         points=len(points),
-        levels=levels,
+        levels=tuple(levels),
         controls=tuple(controls),
         notes=tuple(_notes(errors, reversal)),
     )
@@ -404,26 +412,6 @@ def _left(
         error = error + reversal.displacement(points.position_mm, points.approach)
     nominal = points.position_mm + tool_mm
     return Left(residuals(error), residuals(without_rigid_motion(nominal, error)))
-
-
-def _level_result(
-    machine: Machine,
-    errors: ErrorTable,
-    level: Level,
-    points: Points,
-    reversal: ReversalCurves | None,
-    tools_mm: Sequence[tuple[float, float, float]],
-) -> LevelResult:
-    approach = np.zeros_like(points.position_mm) if points.approach is None else points.approach
-    by_tool = []
-    reversed_um = left_by_reversal(reversal, corrected=False)
-    left_um = left_by_reversal(reversal, corrected=level.reversal is not None)
-    tools = [np.array(item, dtype=np.float64) for item in tools_mm]
-    for tool, alone in zip(tools, level.left_alone_um(machine, errors, tools), strict=True):
-        correction = level.correction(points.position_mm, approach, tool)
-        left = _left(machine, errors, points, correction, reversal, tool)
-        by_tool.append((left, {**alone, **dict.fromkeys(reversed_um, 0.0), **left_um}))
-    return LevelResult(level.key, by_tool[0][0], tuple(by_tool))
 
 
 def _settings(machine: Machine, name: str) -> Any:
@@ -578,12 +566,24 @@ def explain(
     known = rest if rest is not None and rest.curves else None
     options = capability(machine, errors, reversal=known, templates=templates, controllers=(control.name,))
     usage = sorted(control.usage(tables), key=lambda item: -item.share)
+    before, after = (
+        item.left_alone_um(machine, errors, [tool_of(machine, None)], anchored=control.anchored)[0]
+        for item in (Level("nothing"), Level("own", solver))
+    )
+    fates = [
+        Fate(name, before[name], after[name], _why(name, level) if after[name] > CORRECTED_UM else "")
+        for name in sorted(before, key=lambda name: -after[name])
+    ]
+    turned_um, kept_um = (left_by_reversal(part, corrected=False) for part in (reversal, rest))
+    why = "the tables act in both directions alike: the control's backlash parameter takes the part along the axis"
+    fates += [
+        Fate(name, value, kept_um.get(name, 0.0), why if name in kept_um else "") for name, value in turned_um.items()
+    ]
     return Explanation(
         controller=control.name,
         machine=machine.name,
         level=level,
-        fates=tuple(_fates(machine, errors, Level("own", solver), level, anchored=control.anchored))
-        + tuple(_reversal_fates(reversal, rest)),
+        fates=tuple(fates),
         nodes=_nodes(control, tables),
         rounding_um=control.resolution_mm() / MM_PER_UM,
         steps=safety.steps,
@@ -593,16 +593,6 @@ def explain(
         own=next((item for item in options.controls if item.own), None),
         notes=tuple(missing_notes(errors)),
     )
-
-
-def _fates(machine: Machine, errors: ErrorTable, own: Level, level: str, *, anchored: bool) -> list[Fate]:
-    tool_mm = tool_of(machine, None)
-    (before,) = Level("nothing").left_alone_um(machine, errors, [tool_mm], anchored=anchored)
-    (after,) = own.left_alone_um(machine, errors, [tool_mm], anchored=anchored)
-    return [
-        Fate(name, before[name], after[name], _why(name, level) if after[name] > CORRECTED_UM else "")
-        for name in sorted(before, key=lambda name: -after[name])
-    ]
 
 
 def _why(name: str, level: str) -> str:
@@ -618,12 +608,6 @@ def _why(name: str, level: str) -> str:
         across = "squareness" if error.kind == "squareness" else "straightness"
         return f"{across} moves the tool across the axis: tables of one axis over another hold it"
     return "the nodes of the tables do not follow it closely"
-
-
-def _reversal_fates(reversal: ReversalCurves | None, rest: ReversalCurves | None) -> list[Fate]:
-    before, after = (left_by_reversal(part, corrected=False) for part in (reversal, rest))
-    why = "the tables act in both directions alike: the control's backlash parameter takes the part along the axis"
-    return [Fate(name, value, after.get(name, 0.0), why if name in after else "") for name, value in before.items()]
 
 
 def _nodes(control: AnyController, tables: Any) -> dict[str, dict[str, float]]:

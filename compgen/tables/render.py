@@ -8,7 +8,6 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from decimal import Decimal
 from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any
@@ -136,10 +135,6 @@ def load_format(name: str, folder: Path | None = None) -> Format:
     raise InputError(f"no format.toml for {name!r} in {folder or data_folder('templates')}")
 
 
-def _meanings(section: toml_files.Section) -> dict[str, str]:
-    return {key: section.take(key, _prose) for key in section.data}
-
-
 def _named(expected: str) -> Callable[[Any], str]:
     def check(value: Any) -> str:
         if value != expected:
@@ -175,6 +170,7 @@ def _read_format(path: Path, name: str) -> Format:
         )
         section.finish()
         files.append(spec)
+    meanings = root.section("settings", required=False)
     card = Format(
         name=root.take("name", _named(name)),
         title=root.take("title", toml_files.text),
@@ -185,7 +181,7 @@ def _read_format(path: Path, name: str) -> Format:
         limits=root.take("limits", _texts),
         unverified=root.take("unverified", _texts, ()),
         sources=root.take("sources", _texts),
-        settings=_meanings(root.section("settings", required=False)),
+        settings={key: meanings.take(key, _prose) for key in meanings.data},
     )
     root.finish()
     if not files or len({spec.name.lower() for spec in files}) != len(files):
@@ -222,13 +218,9 @@ def _environment(folders: tuple[Path, ...]) -> ImmutableSandboxedEnvironment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["fixed"] = _fixed_filter
+    environment.filters["fixed"] = lambda value, digits: fixed(float(value), digits)
     environment.filters["plain"] = lambda value: one_line(value)
     return environment
-
-
-def _fixed_filter(value: float | Decimal, digits: int) -> str:
-    return fixed(float(value), digits)
 
 
 def _inert(value: Any) -> Any:

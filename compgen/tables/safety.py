@@ -170,7 +170,13 @@ def safety_of(
     reference = correction(np.array([machine.reference_point_mm], dtype=np.float64))[0] / MM_PER_UM
     ends = _ends(machine, nodes, correction)
     x, y, z = (float(value) + 0.0 for value in reference)
-    warnings = _reference_warnings((x, y, z), slack_um)
+    moved = [
+        f"{axis} {value:+.1f} um"
+        for axis, value in zip(AXES, (x, y, z), strict=True)
+        if abs(value) > REFERENCE_UM + slack_um
+    ]
+    jolt = f"at the reference point the correction is {', '.join(moved)}: the axes move when it is switched on there"
+    warnings = [jolt] if moved else []
     warnings += [
         f"the tables over {end.along} end at {end.end_mm:g} mm and the control drops them there: a jump of "
         f"{end.jump_um:.1f} um"
@@ -269,14 +275,3 @@ def _outside(values_mm: FloatArray) -> str:
     if jump > max(0.5 * MM_PER_UM, 10.0 * inside):
         return "dropped"
     return "held" if travelled < 1e-9 else "continued"
-
-
-def _reference_warnings(reference_um: tuple[float, float, float], slack_um: float) -> list[str]:
-    moved = [
-        f"{axis} {value:+.1f} um"
-        for axis, value in zip(AXES, reference_um, strict=True)
-        if abs(value) > REFERENCE_UM + slack_um
-    ]
-    if not moved:
-        return []
-    return [f"at the reference point the correction is {', '.join(moved)}: the axes move when it is switched on there"]

@@ -150,8 +150,26 @@ def crash_test(machine: Machine, errors: ErrorTable, controller: str, entries: i
         *control.violations(right.tables),
         *judge.reasons(court.right_mm, correction(judge.line_mm)),
     ]
-    trials = [court.trial(kind, name, wrong) for kind, name, wrong in _wrong_corrections(machine, correction)]
-    trials += [court.exported(name, wrong, controller) for name, wrong in _wrong_errors(errors)]
+    trials = []
+    for matrix in signed_permutations()[1:]:
+        name = permutation_name(matrix)
+        flipped = " flipped sign" if np.array_equal(matrix, -np.eye(3)) else ""
+        trials.append(court.trial("output", name + flipped, lambda part, m=matrix: correction(part) @ m.T))  # type: ignore[misc]
+        trials.append(court.trial("frame", name, lambda part, m=matrix: correction(part @ m) @ m.T))  # type: ignore[misc]
+    name = "um written for mm (1000 times too large)"
+    trials.append(court.trial("unit", name, lambda part: 1000.0 * correction(part)))
+    name = "mm written for um (1000 times too small)"
+    trials.append(court.trial("unit", name, lambda part: 0.001 * correction(part)))
+    trials += [
+        court.exported(name, _scaled(errors, linear, angular), controller)
+        for name, linear, angular in (
+            ("deg for rad (angles 57 times too large)", 1.0, math.degrees(1.0)),
+            ("rad for deg (angles 57 times too small)", 1.0, math.radians(1.0)),
+            ("correction taken for the error", -1.0, -1.0),
+            ("um for mm in the lengths only", 1000.0, 1.0),
+            ("urad for mrad in the angles only", 1.0, 1000.0),
+        )
+    ]
     trials += _entry_trials(machine, judge, right, entries)
     return CrashTest(controller, tuple(trials), tuple(baseline), visible_mm / MM_PER_UM)
 
@@ -221,25 +239,6 @@ def _entry_trials(machine: Machine, judge: Judge, right: ReadTables, most: int) 
         outcome = REJECTED if reasons else SAME if moved <= judge.goal_mm else ACCEPTED
         name = f"{place.lstrip('.')}, number {k + 1}"
         yield Trial("entry", name, outcome, moved / MM_PER_UM, reasons[0] if reasons else "")
-
-
-def _wrong_corrections(machine: Machine, right: Correction) -> Iterator[tuple[str, str, Correction]]:
-    """Every wrong correction as (kind, name, function of positions)."""
-    for matrix in signed_permutations()[1:]:
-        name = permutation_name(matrix)
-        flipped = " flipped sign" if np.array_equal(matrix, -np.eye(3)) else ""
-        yield "output", name + flipped, lambda part, m=matrix: right(part) @ m.T  # type: ignore[misc]
-        yield "frame", name, lambda part, m=matrix: right(part @ m) @ m.T  # type: ignore[misc]
-    yield "unit", "um written for mm (1000 times too large)", lambda part: 1000.0 * right(part)
-    yield "unit", "mm written for um (1000 times too small)", lambda part: 0.001 * right(part)
-
-
-def _wrong_errors(errors: ErrorTable) -> Iterator[tuple[str, ErrorTable]]:
-    yield "deg for rad (angles 57 times too large)", _scaled(errors, 1.0, math.degrees(1.0))
-    yield "rad for deg (angles 57 times too small)", _scaled(errors, 1.0, math.radians(1.0))
-    yield "correction taken for the error", _scaled(errors, -1.0, -1.0)
-    yield "um for mm in the lengths only", _scaled(errors, 1000.0, 1.0)
-    yield "urad for mrad in the angles only", _scaled(errors, 1.0, 1000.0)
 
 
 def _scaled(errors: ErrorTable, length: float, angle: float) -> ErrorTable:

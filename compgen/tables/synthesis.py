@@ -197,7 +197,14 @@ def _factorised(problem: _Problem) -> Projector:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
     regular = RIDGE * np.eye(size)
     regular[transform.shape[1] :] = 0.0
-    rows = np.asarray(_keep_rows(basis) @ transform)
+    # rows whose product with the values gives them at the positions keep_mm of every term
+    blocks = []
+    for term, place in placed_terms(basis):
+        kept = np.zeros((len(term.keep_mm) if term.axis is not None else 0, transform.shape[0]))
+        if len(kept):
+            kept[:, place] = hat_matrix(term.nodes_mm, np.array(term.keep_mm))
+        blocks.append(kept)
+    rows = np.asarray(np.vstack(blocks) @ transform)
     rows *= scale[: transform.shape[1]]
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
     regular[: transform.shape[1], : transform.shape[1]] += KEEP * rows.T @ rows
@@ -235,17 +242,6 @@ def _beyond_travel(nodes_mm: FloatArray, low_mm: float, high_mm: float) -> list[
             row[node], row[next_node], row[third] = 1.0, -(1.0 + ratio), ratio
             rows.append(row)
     return rows
-
-
-def _keep_rows(basis: Sequence[Term]) -> FloatArray:
-    """Rows (k, parameters) whose product with the values gives them at the positions ``keep_mm`` of every term."""
-    blocks, total = [], sum(len(term.nodes_mm) for term in basis)
-    for term, place in placed_terms(basis):
-        rows = np.zeros((len(term.keep_mm) if term.axis is not None else 0, total))
-        if len(rows):
-            rows[:, place] = hat_matrix(term.nodes_mm, np.array(term.keep_mm))
-        blocks.append(rows)
-    return np.vstack(blocks)
 
 
 def synthesize(

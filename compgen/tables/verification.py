@@ -364,7 +364,17 @@ def read_tables(
     files = table_files([paths] if isinstance(paths, str | Path) else paths, controller)
     if not files:
         raise InputError("no table file was given")
-    contents = [(path, _read_limited(path, any_text=foreign)) for path in files]
+    contents = []
+    for path in files:
+        content = read_bytes(path, MOST_BYTES + 1)
+        lines = content.count(b"\n")
+        if len(content) > MOST_BYTES or lines > MOST_LINES:  # nobody looks for numbers in it
+            if not foreign:
+                _decode(path, content)
+            what = f"{MOST_LINES} lines" if lines > MOST_LINES else f"{MOST_BYTES // 1_000_000} MB"
+            message = f"is longer than {what}; no controller table is"
+            raise InputError(message, file=path, line=min(lines, MOST_LINES) + 1)
+        contents.append((path, content))
     return _parsed(control, contents, foreign=foreign)
 
 
@@ -380,9 +390,23 @@ def _parsed(control: AnyController, contents: Sequence[tuple[Path, bytes]], *, f
         sources = [SourceFile(path, _decode(path, content)) for path, content in contents]
         tables = control.parse(sources)
     except InputError:
-        other = _foreign_tables(control, contents) if foreign else None
-        if other is None:
+        # Files of our own stay strict. In others the comments may hold any character, in whatever encoding.
+        if not foreign or any(_OWN_FILE.search(content[:4000]) for _, content in contents):
             raise
+        sources = []
+        for path, content in contents:
+            try:
+                utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+                text = content.decode("utf-16", "replace") if utf16 else content.decode("utf-8-sig")
+            except UnicodeDecodeError:
+                text = content.decode("latin-1")
+            sources.append(SourceFile(path, text))
+        other = control.parse_foreign(sources)
+        if other is None and all(source.text.isascii() for source in sources):
+            raise
+        if other is None:  # a control without a reader of other files: all but the comments stays strict
+            plain = [SourceFile(source.path, source.text.encode("ascii", "replace").decode()) for source in sources]
+            other = control.parse(plain), ["comments hold characters that are not ASCII: passed over"]
         return ReadTables(control, other[0], hashes, (), tuple(other[1]))
     others = tuple(control.contradictions(tables, sources))
     remarks = tuple(control.remarks(tables, sources))
@@ -426,42 +450,6 @@ def _files_of_export(folder: Path, controller: str) -> list[Path]:
 
 #: Every file that this program writes says so in one of its first lines.
 _OWN_FILE = re.compile(rb"\b(?:compgen|volcomp) (?:\d+\.\d|unknown)")
-
-
-def _foreign_tables(control: AnyController, contents: Sequence[tuple[Path, bytes]]) -> tuple[Any, list[str]] | None:
-    """What the control's reader of other files makes of them; None for files of our own, which stay strict."""
-    if any(_OWN_FILE.search(content[:4000]) for _, content in contents):
-        return None
-    sources = [SourceFile(path, _any_text(content)) for path, content in contents]
-    other = control.parse_foreign(sources)
-    if other is not None or all(source.text.isascii() for source in sources):
-        return other
-    # A control without a reader of other files: the comments may hold any character, the rest stays strict.
-    plain = [SourceFile(source.path, source.text.encode("ascii", "replace").decode()) for source in sources]
-    return control.parse(plain), ["comments hold characters that are not ASCII: passed over"]
-
-
-def _any_text(content: bytes) -> str:
-    """Text in whatever encoding: comments of real files hold umlauts and more."""
-    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return content.decode("utf-16", "replace")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
-
-
-def _read_limited(path: Path, *, any_text: bool = False) -> bytes:
-    """Contents of a file; one that is far larger than any table is refused before anybody looks for numbers in it."""
-    content = read_bytes(path, MOST_BYTES + 1)
-    lines = content.count(b"\n")
-    if len(content) <= MOST_BYTES and lines <= MOST_LINES:
-        return content
-    if not any_text:
-        _decode(path, content)
-    what = f"{MOST_LINES} lines" if lines > MOST_LINES else f"{MOST_BYTES // 1_000_000} MB"
-    message = f"is longer than {what}; no controller table is"
-    raise InputError(message, file=path, line=min(lines, MOST_LINES) + 1)
 
 
 def _decode(path: Path, content: bytes) -> str:
@@ -563,10 +551,23 @@ class Verification(Drawable):
         if not self.accepted:
             more = f" (and {len(self.reasons) - 1} more)" if len(self.reasons) > 1 else ""
             return f"not accepted: {self.reasons[0]}{more}"
+        said = []
+        if self.worse_as_it_stands:
+            before, after = self.before_rigid_removed, self.after_rigid_removed
+            said.append(
+                f"better only after the workpiece is set up anew: as it stands the error grows from "
+                f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms; with the best-fit rigid motion of the "
+                f"workpiece taken out it goes from {um_text(before.rms_um)} to {um_text(after.rms_um)} um rms"
+            )
         parts = [*(item.text for item in self.objections if not item.blocking), *self.reservations]
-        reserved = f"accepted with reservations: {'; '.join(parts)}" if parts else ""
-        whole = [self._setup_text, reserved, self._partial_text]
-        return "; ".join(text for text in whole if text) or f"accepted: {self.figure}"
+        if parts:
+            said.append(f"accepted with reservations: {'; '.join(parts)}")
+        parts = [] if self.volumetric else [self.measured.text]
+        parts += [self._beyond_text] if self.partial else []
+        if parts:
+            figure = "" if self.worse_as_it_stands else f"; {self.figure}"
+            said.append(f"partial: {'; '.join(parts)}{figure}")
+        return "; ".join(said) or f"accepted: {self.figure}"
 
     @property
     def figure(self) -> str:
@@ -577,28 +578,6 @@ class Verification(Drawable):
         if self.volumetric:
             return f"the error over the volume goes from {change} as it stands ({bounds})"
         return f"the effect of the measured errors alone goes from {change} ({bounds}); the error over the volume is not known"
-
-    @property
-    def _setup_text(self) -> str:
-        if not self.worse_as_it_stands:
-            return ""
-        before, after = self.before_rigid_removed, self.after_rigid_removed
-        return (
-            f"better only after the workpiece is set up anew: as it stands the error grows from {um_text(self.before.rms_um)} to "
-            f"{um_text(self.after.rms_um)} um rms; with the best-fit rigid motion of the workpiece taken out it goes from "
-            f"{um_text(before.rms_um)} to {um_text(after.rms_um)} um rms"
-        )
-
-    @property
-    def _partial_text(self) -> str:
-        parts = []
-        if not self.volumetric:
-            parts.append(self.measured.text)
-        if self.partial:
-            parts.append(self._beyond_text)
-        if not parts:
-            return ""
-        return f"partial: {'; '.join(parts)}" + ("" if self.worse_as_it_stands else f"; {self.figure}")
 
     @property
     def _beyond_text(self) -> str:
@@ -720,7 +699,16 @@ def verify(
     where = points or Points(grid_mm)
     if reversal is not None and where.approach is None:
         where = in_both_directions(where)
-    before, after = _errors_before_after(machine, tables, errors, where, reversal)
+    # the exact model without and with the correction, which is looked up at the commanded position
+    correction = tables.correction(machine, where)
+    before = exact_error(machine, errors, where.position_mm, where.tool_mm)
+    after = exact_error(machine, errors, where.position_mm + correction, where.tool_mm) + correction
+    not_in_tables = None
+    if reversal is not None:
+        # it comes on top of both, by the direction in which each point was approached
+        moved = 0.0 if where.approach is None else reversal.displacement(where.position_mm, where.approach)
+        before, after = before + moved, after + moved
+        not_in_tables = reversal.without(control.reversal_in_tables(reversal))
     nominal = where.position_mm + tool_of(machine, where.tool_mm)
     rest = wanted_correction(machine, errors, grid_mm) - judge.best_mm
     if control.anchored:
@@ -740,7 +728,7 @@ def verify(
         unrepresentable_um=float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM,
         uncorrected_um={
             **_uncorrected(machine, errors, solver),
-            **left_by_reversal(_not_in_tables(tables, reversal), corrected=False),
+            **left_by_reversal(not_in_tables, corrected=False),
         },
         points=len(where),
         files=tables.files,
@@ -771,10 +759,15 @@ def reasons_against(
     control = tables.controller
     on_grid, on_lines = (tables.mean_correction(machine, part) for part in (judge.grid.position_mm, judge.line_mm))
     safety = safety_of(machine, control, tables.tables, lambda part: judge.solver.field(judge.values, part), limits)
+    turned: list[str] = []
+    if reversal is not None and control.bidirectional:
+        in_tables = control.reversal_in_tables(reversal)
+        rounding_mm = 2.0 * control.resolution_mm()  # of both directions
+        turned = reversal_reasons(machine, lambda points: tables.correction(machine, points), in_tables, rounding_mm)
     reasons = [
         *control.violations(tables.tables),
         *(judge.reasons(on_grid, on_lines) or entry_check(machine, judge, tables, reversal).reasons()),
-        *_reversal_reasons(machine, tables, reversal),
+        *turned,
         *tables.contradictions,
         *safety.reasons,
     ]
@@ -811,38 +804,6 @@ def _useless_reasons(
             f"{um_text(removed[1].rms_um)} after"
         ]
     return []
-
-
-def _errors_before_after(
-    machine: Machine, tables: ReadTables, errors: ErrorTable, points: Points, reversal: ReversalCurves | None
-) -> tuple[FloatArray, FloatArray]:
-    """Exact errors of the tip without and with the correction; it is looked up at the commanded position.
-
-    The reversal comes on top of both, by the direction in which each point was approached.
-    """
-    correction = tables.correction(machine, points)
-    before = exact_error(machine, errors, points.position_mm, points.tool_mm)
-    after = exact_error(machine, errors, points.position_mm + correction, points.tool_mm) + correction
-    if reversal is not None and points.approach is not None:
-        moved = reversal.displacement(points.position_mm, points.approach)
-        return before + moved, after + moved
-    return before, after
-
-
-def _reversal_reasons(machine: Machine, tables: ReadTables, reversal: ReversalCurves | None) -> list[str]:
-    control = tables.controller
-    if reversal is None or not control.bidirectional:
-        return []
-    in_tables = control.reversal_in_tables(reversal)
-    rounding_mm = 2.0 * control.resolution_mm()  # of both directions
-    return reversal_reasons(machine, lambda points: tables.correction(machine, points), in_tables, rounding_mm)
-
-
-def _not_in_tables(tables: ReadTables, reversal: ReversalCurves | None) -> ReversalCurves | None:
-    """Part of a reversal that no table of one direction holds."""
-    if reversal is None:
-        return None
-    return reversal.without(tables.controller.reversal_in_tables(reversal))
 
 
 def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dict[str, float]:
