@@ -129,7 +129,7 @@ def draw_tables(control: str, number: int, curves: Sequence[TableCurve]) -> list
         series = [CurveSeries(c.name, c.position_mm, c.value).data() for c in group]
         data = {**plot.data, "unit": LABEL[unit], "series": series}
         drawn = svg(key, title, [plot], more=names)
-        pictures.append(Picture(key, f"over {axis}, {LABEL[unit]}", drawn, data, title))
+        pictures.append(Picture(key, f"over {axis}, {LABEL[unit]}", drawn, data))
     return pictures
 
 
