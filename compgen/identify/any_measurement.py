@@ -163,7 +163,18 @@ def identify_measurement(
         first = identify_measurement(machine, measurement.other, chosen)
         return merge(machine, first, identify_sixdof(machine, measurement.sixdof))
     if isinstance(measurement, Deviations | AxisRuns) and not chosen.small_deviations:
-        _check_size(measurement)
+        # deviations that are all zero, or so small that their unit must be another one
+        known = measurement.deviation_mm[np.isfinite(measurement.deviation_mm)]
+        largest_um = float(np.max(np.abs(known), initial=0.0)) / MM_PER_UM
+        if largest_um < SMALLEST_UM:
+            message = "all deviations are zero; was nothing measured? Give the measured values"
+            if largest_um:
+                message = (
+                    f"the largest deviation is {largest_um:.3g} um, which no machine tool reaches; are the values "
+                )
+                message += "in mm, a thousand times too small for um? Give them in um"
+            file = measurement.origin[0][0] if measurement.origin else None
+            raise InputError(f"{message}, or add --small-deviations if they are right", file=file)
     stated = chosen.u_length_um is not None or chosen.u_length_um_per_m is not None
     other = stated or chosen.method != "joint" or chosen.stations is not None
     other = other or chosen.systematic != SystematicInputs()
@@ -187,23 +198,6 @@ def identify_measurement(
             "whose uncertainties the instrument file gives ([noise], [u_constants], [u_systematics])"
         )
     return identify_sixdof(machine, measurement)
-
-
-def _check_size(measurement: Deviations | AxisRuns) -> None:
-    """Ask about deviations that are all zero, or so small that their unit must be another one."""
-    values = measurement.deviation_mm
-    largest_um = float(np.max(np.abs(values[np.isfinite(values)]), initial=0.0)) / MM_PER_UM
-    if largest_um >= SMALLEST_UM:
-        return
-    file = measurement.origin[0][0] if measurement.origin else None
-    if largest_um == 0.0:
-        message = "all deviations are zero; was nothing measured? Give the measured values"
-    else:
-        message = (
-            f"the largest deviation is {largest_um:.3g} um, which no machine tool reaches; are the values in mm, a thousand "
-            "times too small for um? Give them in um"
-        )
-    raise InputError(f"{message}, or add --small-deviations if they are right", file=file)
 
 
 # What a later report needs beside the results of an identification: the machine file, and the residuals.

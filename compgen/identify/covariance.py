@@ -358,11 +358,6 @@ def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covarianc
     shapes = (covariance.position_mm.shape, covariance.setup.shape, covariance.factor.shape[:1], covariance.factor.ndim)
     if shapes != ((count,), (len(covariance.station),), (rows,), 2):
         raise InputError(f"its parts do not fit together: {count} error values, shapes {shapes}", file=source)
-    _check_numbers(source, covariance)
-    return covariance
-
-
-def _check_numbers(source: Path, covariance: Covariance) -> None:
     if not (np.abs(covariance.factor) <= LARGEST).all():
         raise InputError(f"the factor holds numbers that are not finite, or above {LARGEST:g}", file=source)
     for name in dict.fromkeys(covariance.error):
@@ -373,3 +368,4 @@ def _check_numbers(source: Path, covariance: Covariance) -> None:
             right = bool(np.isfinite(position).all() and np.all(np.diff(position) > 0))
         if not right:
             raise InputError(f"the positions of {name} are not those of one error in ascending order", file=source)
+    return covariance

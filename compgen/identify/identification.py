@@ -174,13 +174,19 @@ class Identification(Drawable):
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``identify.json``."""
+        of_lengths = self.method not in ("deviations", "sixdof", "axis-runs", "given")
         return {
             "method": self.method,
             "residual_rms_um": self.rms_um,
             "residual_max_um": float(np.max(np.abs(self.residual_mm[self.accepted]))) / MM_PER_UM,
             "degrees_of_freedom": self.degrees_of_freedom,
             "reduced_chi_square": None if np.isnan(self.reduced_chi_square) else self.reduced_chi_square,
-            **self._u_of_the_readings(),
+            ("u_length" if of_lengths else "u_deviation"): {
+                "source": self.u_source,
+                "constant_um": self.u_length_um,
+                **({"proportional_um_per_m": self.u_length_um_per_m} if of_lengths else {}),
+                "scaled_by": self.u_scale,
+            },
             "readings": self.readings,
             "readings_used": self.readings_used,
             "rank": self.rank,
@@ -208,13 +214,6 @@ class Identification(Drawable):
             **({self.method: dict(self.details)} if self.details else {}),
             **({"objections": list(self.objections)} if self.objections else {}),
         }
-
-    def _u_of_the_readings(self) -> dict[str, Any]:
-        known = {"source": self.u_source, "constant_um": self.u_length_um}
-        if self.method in ("deviations", "sixdof", "axis-runs", "given"):
-            return {"u_deviation": {**known, "scaled_by": self.u_scale}}
-        proportional = {"proportional_um_per_m": self.u_length_um_per_m, "scaled_by": self.u_scale}
-        return {"u_length": {**known, **proportional}}
 
     def overview(self) -> Overview:
         """How well the model fits the readings, and the largest value of each error."""

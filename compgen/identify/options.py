@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -261,8 +261,15 @@ def reading_noise(lengths: Lengths, options: IdentifyOptions) -> ReadingNoise:
     column = _column(lengths) if options.u_length_um is None and options.u_length_um_per_m is None else None
     if column is not None and np.isfinite(column).all():
         return ReadingNoise("stated", float(np.median(column)), 0.0, column)
-    noise = _common_noise(lengths, options)
-    return noise if column is None else replace(noise, column_um=column)
+    constant, proportional = options.u_length_um, options.u_length_um_per_m
+    constant = number_in_comment(lengths, "u_length_um") if constant is None else constant
+    proportional = number_in_comment(lengths, "u_length_um_per_m") if proportional is None else proportional
+    if constant is None and proportional is None:
+        return ReadingNoise("assumed", ASSUMED_U_UM, ASSUMED_U_UM_PER_M, column)
+    values = (constant or 0.0, proportional or 0.0)
+    if min(values) < 0 or not sum(values) > 0 or not np.isfinite(sum(values)):
+        raise InputError(f"the uncertainty of a length is {values[0]:g} um + {values[1]:g} um/m; it must be above zero")
+    return ReadingNoise("stated", *values, column)
 
 
 def _column(lengths: Lengths) -> FloatArray | None:
@@ -275,20 +282,6 @@ def _column(lengths: Lengths) -> FloatArray | None:
         message = f"{column[wrong[0]]:g} is not a standard uncertainty; give a number above zero"
         raise InputError(message, file=file, line=line, field="column u_length_um")
     return column
-
-
-def _common_noise(lengths: Lengths, options: IdentifyOptions) -> ReadingNoise:
-    """Uncertainty a + b L of all readings."""
-    constant, proportional = options.u_length_um, options.u_length_um_per_m
-    constant = number_in_comment(lengths, "u_length_um") if constant is None else constant
-    proportional = number_in_comment(lengths, "u_length_um_per_m") if proportional is None else proportional
-    if constant is None and proportional is None:
-        return ReadingNoise("assumed", ASSUMED_U_UM, ASSUMED_U_UM_PER_M)
-    noise = ReadingNoise("stated", constant or 0.0, proportional or 0.0)
-    values = (noise.constant_um, noise.proportional_um_per_m)
-    if min(values) < 0 or not sum(values) > 0 or not np.isfinite(sum(values)):
-        raise InputError(f"the uncertainty of a length is {values[0]:g} um + {values[1]:g} um/m; it must be above zero")
-    return noise
 
 
 def number_in_comment(readings: Lengths | Deviations, key: str) -> float | None:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import PART, Deviations, aligned, setups_of
-from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
@@ -159,7 +158,14 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
         reject=options.reject,
     )
     result = _free_pose_result(machine, deviations, readings, solution, accepted, source)
-    _say_what_is_not_reached(solution)
+    texts = [f"{name} at {', '.join(f'{value:g}' for value in nodes)} mm" for name, nodes in solution.unreached.items()]
+    if texts:
+        warnings.warn(
+            f"no reading reaches {'; '.join(texts[:6])}{' ...' if len(texts) > 6 else ''}: these nodes follow their "
+            "neighbours by smoothness, with the uncertainty of an extrapolation; --range from-data keeps to what was measured",
+            CompgenWarning,
+            stacklevel=3,
+        )
     return result
 
 
@@ -291,6 +297,11 @@ def _solve(
     if bend is None and tied:
         bend = _bends(layout, unknowns, tied)
         return _solve(machine, readings, accepted, free_scale=free_scale, bend=bend)
+    unreached = {}  # nodes without a reading in the intervals next to them
+    for curve in layout.curves:
+        near = (hat_matrix(curve.nodes_mm, readings.position_mm[accepted, curve.error.axis]) > 1e-6).any(axis=0)
+        if not near.all():
+            unreached[curve.error.name] = curve.nodes_mm[~near]
     share = np.einsum("ij,ij->i", shown, shown)
     partly = tuple(name for name, columns in _columns_of(layout) if share[columns].min(initial=1.0) < 1.0 - 1e-4)
     width = pose.shape[1] // len(np.unique(readings.setup))
@@ -304,7 +315,7 @@ def _solve(
         residual,
         rank,
         float(values[0] / values[values > RCOND * values[0]][-1]),
-        _unreached(layout, readings.position_mm[accepted]),
+        unreached,
         left_out=tuple(name for name in names if name not in kept),
         partly=partly,
     )
@@ -378,16 +389,6 @@ def _range(matrix: FloatArray) -> FloatArray:
     return np.asarray(left[:, values > 1e-9 * max(1.0, float(values.max(initial=0.0)))])
 
 
-def _unreached(layout: ErrorParameters, position_mm: FloatArray) -> dict[str, FloatArray]:
-    """Nodes without a reading in the intervals beside them, by error; ``position_mm`` (k, 3)."""
-    found = {}
-    for curve in layout.curves:
-        near = (hat_matrix(curve.nodes_mm, position_mm[:, curve.error.axis]) > 1e-6).any(axis=0)
-        if not near.all():
-            found[curve.error.name] = curve.nodes_mm[~near]
-    return found
-
-
 def _bends(layout: ErrorParameters, unknowns: FloatArray, tied: Mapping[str, FloatArray]) -> dict[str, float]:
     """Second difference of the tied curves between nodes that readings show, rms, mm and rad; at least what is usual."""
     found = {}
@@ -434,18 +435,6 @@ def _ties(
     return (np.array(rows) if rows else np.zeros((0, layout.size))), tied
 
 
-def _say_what_is_not_reached(solution: _Solution) -> None:
-    texts = [f"{name} at {', '.join(f'{value:g}' for value in nodes)} mm" for name, nodes in solution.unreached.items()]
-    if not texts:
-        return
-    warnings.warn(
-        f"no reading reaches {'; '.join(texts[:6])}{' ...' if len(texts) > 6 else ''}: these nodes follow their "
-        "neighbours by smoothness, with the uncertainty of an extrapolation; --range from-data keeps to what was measured",
-        CompgenWarning,
-        stacklevel=4,
-    )
-
-
 def _free_pose_result(
     machine: Machine,
     deviations: Deviations,
@@ -465,7 +454,12 @@ def _free_pose_result(
     standard = (solution.residual_mm / readings.sigma_mm)[accepted]
     chi_square = float(standard @ standard) / freedom
     u_scale = uncertainty_scale(chi_square, source)
-    errors, values_factor = _error_table(layout, solution.unknowns, solution.factor * u_scale)
+    values, rows = [], {}  # the factor of the covariance of the values goes in the order of the errors file
+    for name, position_mm, span, matrix in error_values(layout):
+        rows[name] = matrix @ (solution.factor * u_scale)[span]
+        values.append((name, position_mm, matrix @ solution.unknowns[span], np.linalg.norm(rows[name], axis=1)))
+    errors = table_of_values(values)
+    values_factor = np.vstack([rows[name] for name in errors.names])
     errors = errors.replace(metadata=metadata_of(machine, deviations.metadata))
     poses = _poses(deviations, readings, solution, u_scale)
     return Identification(
@@ -513,16 +507,6 @@ def _free_pose_result(
             ),
         ),
     )
-
-
-def _error_table(layout: ErrorParameters, unknowns: FloatArray, factor: FloatArray) -> tuple[ErrorTable, FloatArray]:
-    """Curves and squareness, and the factor of the covariance of their values in the order of the errors file."""
-    values, rows = [], {}
-    for name, position_mm, columns, matrix in error_values(layout):
-        rows[name] = matrix @ factor[columns]
-        values.append((name, position_mm, matrix @ unknowns[columns], np.linalg.norm(rows[name], axis=1)))
-    table = table_of_values(values)
-    return table, np.vstack([rows[name] for name in table.names])
 
 
 def _poses(

@@ -189,7 +189,11 @@ def reading_conditions(machine: Machine, lengths: Lengths, *, temperature: bool 
     """
     growth, notes = (_growth(machine, lengths)) if temperature else (np.zeros(lengths.position_mm.shape), {})
     share = np.zeros(len(lengths))
-    if _says_uncompensated(lengths):
+    text = lengths.metadata.get("wavelength_compensated", "true").lower()
+    if text not in ("true", "yes", "1", "false", "no", "0"):
+        file = lengths.origin[0][0] if lengths.origin else None
+        raise InputError(f"the comment wavelength_compensated = {text!r} is neither true nor false", file=file)
+    if text in ("false", "no", "0"):
         index, assumed = _refractive_indices(lengths)
         lengths = replace(lengths, length_mm=lengths.length_mm * assumed / index)
         share = float(index.mean()) / index - 1.0
@@ -240,16 +244,6 @@ def _check_complete(lengths: Lengths, column: str, values: FloatArray) -> None:
             line=line,
             field=f"column {column}",
         )
-
-
-def _says_uncompensated(lengths: Lengths) -> bool:
-    text = lengths.metadata.get("wavelength_compensated", "true").lower()
-    if text in ("true", "yes", "1"):
-        return False
-    if text in ("false", "no", "0"):
-        return True
-    file = lengths.origin[0][0] if lengths.origin else None
-    raise InputError(f"the comment wavelength_compensated = {text!r} is neither true nor false", file=file)
 
 
 def _refractive_indices(lengths: Lengths) -> tuple[FloatArray, float]:

@@ -174,8 +174,21 @@ def estimate_reversal(lengths: Lengths, approach: FloatArray, stops: ReversalSto
     if np.count_nonzero(moved) < LEAST_READINGS:
         return None
     value, u, known = _solved(cell[moved], columns[moved], target[moved], weight[moved])
-    u *= _alikeness(lengths, np.where(moved, target - columns @ value, np.nan))
-    stations = _by_station(lengths, _centred(0.5 * approach, cell, weight), target, weight, cell)
+    # The uncertainty of a mean grows where successive residuals are alike: for an autoregressive process of first order
+    # with correlation rho by the root of (1 + rho)/(1 - rho).
+    order = time_order(lengths)
+    order = order[np.argsort(lengths.station[order], kind="stable")]
+    series = (target - columns @ value)[order][moved[order]]
+    square = float(series @ series)
+    rho = min(max(float(series[1:] @ series[:-1]) / square if square > 0 else 0.0, 0.0), 0.98)
+    u *= float(np.sqrt((1.0 + rho) / (1.0 - rho)))
+    # mean difference of the readings of each station between the directions of each axis
+    stations, along = {}, _centred(0.5 * approach, cell, weight)
+    for k, station in enumerate(lengths.stations):
+        rows = (lengths.station == k) & (weight > 0) & np.any(np.abs(along) > 1e-9, axis=1)
+        if np.count_nonzero(rows) >= LEAST_READINGS:
+            mean, u_mean, shown = _solved(cell[rows], along[rows], target[rows], weight[rows])
+            stations[station] = {AXES[a]: (float(mean[a]), float(u_mean[a])) for a in range(3) if shown[a]}
     axes = {}
     for axis, name in enumerate(AXES):
         x, y, z = range(3 * axis, 3 * axis + 3)
@@ -231,30 +244,3 @@ def _solved(
     freedom = len(target) - int(np.count_nonzero(np.bincount(cell))) - int(np.count_nonzero(kept & (eigenvalues > 0)))
     variance = float(weight @ left**2) / max(freedom, 1)
     return value, np.sqrt(np.maximum(np.diag(inverse), 0.0) * variance), known
-
-
-def _alikeness(lengths: Lengths, left_mm: FloatArray) -> float:
-    """Factor by which the uncertainty of a mean grows because successive residuals (n,) are alike; nan ones left out.
-
-    For an autoregressive process of first order with correlation rho it is the root of (1 + rho)/(1 - rho).
-    """
-    order = time_order(lengths)
-    order = order[np.argsort(lengths.station[order], kind="stable")]
-    series = left_mm[order][np.isfinite(left_mm[order])]
-    square = float(series @ series)
-    rho = float(series[1:] @ series[:-1]) / square if square > 0 else 0.0
-    rho = min(max(rho, 0.0), 0.98)
-    return float(np.sqrt((1.0 + rho) / (1.0 - rho)))
-
-
-def _by_station(
-    lengths: Lengths, columns: FloatArray, target: FloatArray, weight: FloatArray, cell: IntArray
-) -> dict[str, dict[str, tuple[float, float]]]:
-    """Mean difference of the readings of each station between the directions of each axis, with its uncertainty."""
-    found = {}
-    for k, name in enumerate(lengths.stations):
-        rows = (lengths.station == k) & (weight > 0) & np.any(np.abs(columns) > 1e-9, axis=1)
-        if np.count_nonzero(rows) >= LEAST_READINGS:
-            value, u, known = _solved(cell[rows], columns[rows], target[rows], weight[rows])
-            found[name] = {AXES[a]: (float(value[a]), float(u[a])) for a in range(3) if known[a]}
-    return found

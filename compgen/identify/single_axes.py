@@ -119,6 +119,17 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
         (a, round(p / SAME_TARGET_MM), d)
         for a, p, d in zip(runs.axis.tolist(), runs.position_mm.tolist(), runs.direction.tolist(), strict=True)
     }
+    summaries = {}
+    for axis in runs.axes:
+        rows = runs.axis == axis
+        summaries[AXES[axis]] = {
+            "targets": len(np.unique(np.round(runs.position_mm[rows] / SAME_TARGET_MM))),
+            "runs": len(np.unique(runs.run[rows])),
+            "directions": sorted(set(runs.direction[rows].tolist())),
+            "from_mm": float(runs.position_mm[rows].min()),
+            "to_mm": float(runs.position_mm[rows].max()),
+            "taken_off_um": offsets[POSITIONING[axis]] / MM_PER_UM,
+        }
     rms_um = float(np.sqrt(np.mean(residual**2))) / MM_PER_UM
     known = all(np.isfinite(curve.u).all() for curve in errors.curves.values())
     return Identification(
@@ -139,21 +150,5 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
         layout=error_parameters(machine, errors.names),
         reversal_curves=reversal,
         method="axis-runs",
-        details={
-            "axes": {
-                AXES[axis]: _axis_summary(runs, axis, offsets[POSITIONING[axis]] / MM_PER_UM) for axis in runs.axes
-            }
-        },
+        details={"axes": summaries},
     )
-
-
-def _axis_summary(runs: AxisRuns, axis: int, offset_um: float) -> dict[str, object]:
-    rows = runs.axis == axis
-    return {
-        "targets": len(np.unique(np.round(runs.position_mm[rows] / SAME_TARGET_MM))),
-        "runs": len(np.unique(runs.run[rows])),
-        "directions": sorted(set(runs.direction[rows].tolist())),
-        "from_mm": float(runs.position_mm[rows].min()),
-        "to_mm": float(runs.position_mm[rows].max()),
-        "taken_off_um": offset_um,
-    }

@@ -19,7 +19,6 @@ from compgen.identify.identification import Identification, metadata_of, worst_u
 from compgen.identify.reversal_errors import SIGNIFICANT
 from compgen.instruments.interferometer import compensated, summary_of
 from compgen.instruments.sixdof_evaluation import (
-    AxisErrors,
     Evaluation,
     axis_runs,
     each_run,
@@ -55,6 +54,11 @@ def details_of(
     """Everything about the six-DOF evaluation that has no place in the errors file."""
     reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
     repeated = half_ranges(each_run(machine, instrument, runs))
+    freedom = []  # of the scatter of repeated runs, by axis
+    for axis in {run.axis for run in reduced}:
+        own = [run for run in reduced if run.axis == axis]
+        if len(own) > 1:
+            freedom.append((len(own) - 1) * max(len(np.unique(own[0].position_mm)) - 2, 1))
     columns: dict[str, Mapping[str, float]] = {"repeatability": repeated} if repeated else {}
     contributions = {} if budget is None else budget.contributions()
     parts = {}
@@ -71,7 +75,7 @@ def details_of(
         "slopes_arcsec": {name: value / RAD_PER_ARCSEC for name, value in evaluation.slopes.items()},
         "squareness": _squareness(instrument, evaluation),
         "contradictions": list(dict.fromkeys(run.contradiction for run in runs if run.contradiction)),
-        "repeatability_freedom": _freedom(reduced),
+        "repeatability_freedom": min(freedom, default=None),
         "repeatability_half_range": in_table_units(repeated),
         "reversal_angles_urad": {  # mean difference of both directions
             AXES[axis]: (1e6 * np.nanmean(entry.reversal[:, 3:], axis=0)).tolist()
@@ -81,16 +85,6 @@ def details_of(
         "budget": parts,
         "table": format_table(columns).splitlines() if columns else [],
     }
-
-
-def _freedom(runs: Sequence[RelativeRun]) -> int | None:
-    """Degrees of freedom of the scatter of repeated runs, the fewest of all axes; None without repeats."""
-    found = []
-    for axis in {run.axis for run in runs}:
-        own = [run for run in runs if run.axis == axis]
-        if len(own) > 1:
-            found.append((len(own) - 1) * max(len(np.unique(own[0].position_mm)) - 2, 1))
-    return min(found, default=None)
 
 
 def _axis(readings: SixDof, instrument: SixDofInstrument, runs: Sequence[RelativeRun]) -> dict[str, Any]:
@@ -299,7 +293,10 @@ def _reversal(
     for axis, entry in evaluation.axes.items():
         if entry.reversal is None:
             continue
-        u = _u_of_reversal(machine, readings, instrument, axis, entry, reduced)
+        # standard uncertainty of the difference of both directions
+        scatter = scatter_of(machine, readings, instrument, [run for run in reduced if run.axis == axis])
+        variance = sum((value.mean(axis=0) for value in scatter.sources.values()), np.zeros((6, 6)))
+        u = np.sqrt(2.0 * np.diag(variance)[:3] / max(1.0, 0.5 * float(np.median(entry.count))))
         for component in range(3):
             value = entry.reversal[:, component]
             known = np.isfinite(value)
@@ -307,19 +304,3 @@ def _reversal(
                 at = entry.position_mm[known]
                 curves[axis, component] = Curve(at, value[known], np.full(len(at), u[component]))
     return ReversalCurves(curves, {"machine": machine.name}) if curves else None
-
-
-def _u_of_reversal(
-    machine: Machine,
-    readings: SixDof,
-    instrument: SixDofInstrument,
-    axis: int,
-    entry: AxisErrors,
-    reduced: Sequence[Any],
-) -> FloatArray:
-    """Standard uncertainty (3,) of the difference of both directions, mm."""
-    own = [run for run in reduced if run.axis == axis]
-    scatter = scatter_of(machine, readings, instrument, own)
-    variance = sum((value.mean(axis=0) for value in scatter.sources.values()), np.zeros((6, 6)))
-    each = max(1.0, 0.5 * float(np.median(entry.count)))
-    return np.asarray(np.sqrt(2.0 * np.diag(variance)[:3] / each))

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -474,7 +474,16 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
     noise = reading_noise(lengths, options)
     task, sigma_mm, weights = with_weights(task, start, noise)
     if options.stations is not None:
-        task, start = _with_known_stations(task, start, options.stations, float(sigma_mm.min()))
+        known = options.stations
+        if not isinstance(known, KnownStations):
+            known = locate_stations(machine, lengths)
+            message = (
+                "the stations were located with the machine taken as perfect: its errors are part of their positions"
+            )
+            warnings.warn(f"{message} (to {known.u_mm.max() * 1e3:.1f} um)", CompgenWarning, stacklevel=4)
+        start = with_known_start(start, known, lengths, task.target_mm, task.group)
+        observed = known_positions(known, lengths.stations, float(sigma_mm.min()))
+        task = replace(task, problem=replace(task.problem, known=observed))
     factor, rank = determined(task, start)
     start = unmirrored(task, start, searched)
     if options.method == "two-step":
@@ -507,19 +516,6 @@ def _undisturbed(task: Task, start: State, options: IdentifyOptions) -> Identifi
         return None
     accepted = np.ones(len(residual), dtype=bool)
     return assemble(task, RobustFit(task.problem, task.group, solution, accepted, residual), sigma_mm, noise, rank)
-
-
-def _with_known_stations(
-    task: Task, start: State, stations: KnownStations | Literal["nominal"], sigma_mm: float
-) -> tuple[Task, State]:
-    """Add the known stations to the problem and start from them."""
-    known = stations if isinstance(stations, KnownStations) else locate_stations(task.machine, task.lengths)
-    if known is not stations:
-        message = "the stations were located with the machine taken as perfect: its errors are part of their positions"
-        warnings.warn(f"{message} (to {known.u_mm.max() * 1e3:.1f} um)", CompgenWarning, stacklevel=5)
-    observed = known_positions(known, task.lengths.stations, sigma_mm)
-    start = with_known_start(start, known, task.lengths, task.target_mm, task.group)
-    return replace(task, problem=replace(task.problem, known=observed)), start
 
 
 def _two_step_result(

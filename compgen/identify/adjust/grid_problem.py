@@ -10,7 +10,7 @@ import numpy as np
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import SQUARENESS_NAMES
-from compgen.identify.adjust.levels import LevelGrid, MotionMap, ToolData, levels_of, merge, motion_map
+from compgen.identify.adjust.levels import LevelGrid, ToolData, levels_of, merge, motion_map
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State
 from compgen.kinematics.exact_chain import cross_matrices, level_rotations, passing_order
 from compgen.kinematics.kernel_switch import use_compiled
@@ -161,7 +161,14 @@ def moments(grid: LevelGrid, data: ToolData, tip: FloatArray, state: State) -> M
         weighted += products[:, :6].sum(axis=0) if len(products) > 1 else products[0, :6]
         parts.append(_tables_by_level(grid, products))
     by_level = [np.concatenate(tables) for tables in zip(*parts, strict=True)]
-    return Moments(_tables_of_pairs(grid, weighted), (by_level[0], by_level[1], by_level[2]))
+    # w u u^T (6, n_out, n_mid, n_in) summed over one axis, times the powers of its coordinate
+    out, mid, inner = (_powers(grid.levels_mm[axis], 3) for axis in grid.order)
+    by_pair = (
+        (weighted @ inner).transpose(3, 0, 1, 2),
+        (mid.T @ weighted).transpose(2, 0, 1, 3),
+        _contract_first(weighted, out).transpose(1, 0, 2, 3),
+    )
+    return Moments(by_pair, (by_level[0], by_level[1], by_level[2]))
 
 
 def _outer_products(unit: FloatArray, weight: FloatArray, shape: tuple[int, ...]) -> FloatArray:
@@ -203,16 +210,6 @@ def _tables_by_level(grid: LevelGrid, products: FloatArray) -> list[FloatArray]:
     return [np.stack([t[..., 0, 0], t[..., 1, 0], t[..., 0, 1]]).transpose(1, 3, 0, 2) for t in tables]
 
 
-def _tables_of_pairs(grid: LevelGrid, weighted: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sum w u u^T (6, n_out, n_mid, n_in) over one axis, times the powers of its coordinate."""
-    out, mid, inner = (_powers(grid.levels_mm[axis], 3) for axis in grid.order)
-    return (
-        (weighted @ inner).transpose(3, 0, 1, 2),
-        (mid.T @ weighted).transpose(2, 0, 1, 3),
-        _contract_first(weighted, out).transpose(1, 0, 2, 3),
-    )
-
-
 def _contract_first(table: FloatArray, powers: FloatArray) -> FloatArray:
     """Sum over the second axis of (k, a, b, c) with powers (a, q): (k, q, b, c) by matrix products."""
     count, first = table.shape[:2]
@@ -246,7 +243,16 @@ def add_normal(grid: LevelGrid, moments: Moments, tool_mm: FloatArray, state: St
     by_levels = np.zeros((motion.shape[0], motion.shape[0]))
     by_group = np.zeros((first, grid.groups, 4))
     if grid.compiled:
-        _add_compiled(grid, moments, levers, tool_mm, motion, by_levels, by_group, matrix)
+        from compgen.identify.adjust import grid_kernels as kernels
+
+        rows, entries, levels = np.array(grid.first_rows), (motion.row, motion.column, motion.value), grid.levels_mm
+        for axes, table, own_a, own_b in _ordered(grid, moments):
+            a, b = levels[axes[0]], levels[axes[1]]
+            kernels.add_pair(table, axes, a, b, levers, tool_mm, rows, own_a, own_b, by_levels)
+        for of_axis, table in zip(_with_levers(grid), moments.levels, strict=True):
+            along = levels[of_axis[0]]
+            kernels.add_stations(table, np.array(of_axis), along, levers, tool_mm, rows, *entries, by_group)
+        kernels.project(*entries, by_levels, matrix)
     else:
         from scipy.sparse import csr_array  # imported here: slow to load, and compiled kernels do without
 
@@ -300,28 +306,6 @@ def _ordered(grid: LevelGrid, moments: Moments) -> list[tuple[IntArray, FloatArr
     ]
 
 
-def _add_compiled(  # noqa: PLR0913 - what the compiled loops ask for
-    grid: LevelGrid,
-    moments: Moments,
-    levers: FloatArray,
-    tool_mm: FloatArray,
-    motion: MotionMap,
-    by_levels: FloatArray,
-    by_group: FloatArray,
-    matrix: FloatArray,
-) -> None:
-    """Add the parts of the errors to ``matrix`` and ``by_group`` by the compiled loops; ``by_levels`` is room for them."""
-    from compgen.identify.adjust import grid_kernels as kernels
-
-    rows, entries, levels = np.array(grid.first_rows), (motion.row, motion.column, motion.value), grid.levels_mm
-    for axes, table, own_a, own_b in _ordered(grid, moments):
-        a, b = levels[axes[0]], levels[axes[1]]
-        kernels.add_pair(table, axes, a, b, levers, tool_mm, rows, own_a, own_b, by_levels)
-    for of_axis, table in zip(_with_levers(grid), moments.levels, strict=True):
-        kernels.add_stations(table, np.array(of_axis), levels[of_axis[0]], levers, tool_mm, rows, *entries, by_group)
-    kernels.project(*entries, by_levels, matrix)
-
-
 def _with_levers(grid: LevelGrid) -> list[tuple[int, int, int]]:
     """Each axis in the order of ``LevelGrid.order`` with the two whose coordinates its table of moments has as factors."""
     out, mid, inner = grid.order
@@ -339,7 +323,12 @@ def _pairs(grid: LevelGrid, moments: Moments, levers: FloatArray, tool_mm: Float
         for axis in (a, b):
             arm = tool_mm + grid.levels_mm[a][:, None, None] * levers[axis, a]
             arm = arm + grid.levels_mm[b][:, None] * levers[axis, b]
-            maps.append(_derivatives(arm, levers[axis, third]))
+            # from (u, q u) to the derivatives by delta and eps, with lever arms arm + q step
+            derivatives = np.zeros((count_a, count_b, 6, 6))
+            derivatives[:, :, :3, :3] = np.eye(3)
+            derivatives[:, :, 3:, :3] = cross_matrices(arm.reshape(-1, 3)).reshape(*arm.shape, 3)
+            derivatives[:, :, 3:, 3:] = cross_matrices(levers[axis, third][None])
+            maps.append(derivatives)
         rows, columns = slice(starts[a], starts[a + 1]), slice(starts[b], starts[b + 1])
         half = maps[0] @ sums
         block = (half @ maps[1].swapaxes(2, 3)).transpose(0, 2, 1, 3).reshape(6 * count_a, 6 * count_b)
@@ -359,15 +348,6 @@ def _extended(table: FloatArray) -> FloatArray:
     sums[:, :, :3, 3:] = sums[:, :, 3:, :3] = moments[:, :, 1]
     sums[:, :, 3:, 3:] = moments[:, :, 2]
     return sums
-
-
-def _derivatives(arm: FloatArray, step: FloatArray) -> FloatArray:
-    """From (u, q u) to the derivatives by delta and eps, with lever arms ``arm`` + q ``step``: (first, second, 6, 6)."""
-    maps = np.zeros((*arm.shape[:2], 6, 6))
-    maps[:, :, :3, :3] = np.eye(3)
-    maps[:, :, 3:, :3] = cross_matrices(arm.reshape(-1, 3)).reshape(*arm.shape, 3)
-    maps[:, :, 3:, 3:] = cross_matrices(step[None])
-    return maps
 
 
 def _set_own(matrix: FloatArray, start: int, blocks: FloatArray) -> None:
@@ -440,30 +420,21 @@ class GridProblem(LevelGrid):
         """Half the weighted sum of squares with the exact model, and its exact gradient (size,)."""
         gradient = np.zeros(self.size)
         cost = 0.5 * self.scatter
-        cost += self._compiled(state, gradient) if self.compiled else self._plain(state, gradient)
+        if self.compiled:
+            from compgen.identify.adjust.grid_kernels import chain_gradient
+
+            arguments, derivatives = self.kernel_arguments(state), self.travel_directions(state)[1]
+            unknowns = state.stations_mm, state.dead_length_mm, self.station_of
+            for data in self.tools:
+                readings = data.tool_mm, *unknowns, data.weight, data.length_mm
+                cost += chain_gradient(*arguments, derivatives, self.squareness_columns, *readings, gradient)
+        else:
+            bodies, places = self._geometry(state)
+            for data, tips in zip(self.tools, places, strict=True):
+                force = np.zeros_like(tips[-1])
+                cost += self._forces(state, data, tips[-1], force, gradient)
+                pull_back(self, bodies, tips, force, gradient)
         return cost + (self.known.add_gradient(state, gradient) if self.known else 0.0), gradient
-
-    def _plain(self, state: State, gradient: FloatArray) -> float:
-        """Return the cost and add the gradient, with numpy."""
-        cost = 0.0
-        bodies, places = self._geometry(state)
-        for data, tips in zip(self.tools, places, strict=True):
-            force = np.zeros_like(tips[-1])
-            cost += self._forces(state, data, tips[-1], force, gradient)
-            pull_back(self, bodies, tips, force, gradient)
-        return cost
-
-    def _compiled(self, state: State, gradient: FloatArray) -> float:
-        """Return the cost and add the gradient, all in one compiled pass."""
-        from compgen.identify.adjust.grid_kernels import chain_gradient
-
-        arguments, derivatives = self.kernel_arguments(state), self.travel_directions(state)[1]
-        unknowns = state.stations_mm, state.dead_length_mm, self.station_of
-        cost = 0.0
-        for data in self.tools:
-            readings = data.tool_mm, *unknowns, data.weight, data.length_mm
-            cost += chain_gradient(*arguments, derivatives, self.squareness_columns, *readings, gradient)
-        return cost
 
     def _forces(self, state: State, data: ToolData, tip: FloatArray, force: FloatArray, gradient: FloatArray) -> float:
         """Return the cost; add forces on the tips and the gradient by stations and dead lengths (numpy)."""

@@ -218,24 +218,18 @@ def merge(
     merged, scatter = [], 0.0
     for k, data in enumerate(tools):
         rows = slice(None) if len(tools) == 1 else np.flatnonzero(tool == k)
-        total, mean, square = _cell_means(index[rows], weight[rows], reading_mm[rows], int(np.prod(shape)), compiled)
-        scatter += square
+        cells, own, reading, count = index[rows], weight[rows], reading_mm[rows], int(np.prod(shape))
+        if compiled:
+            from compgen.identify.adjust.grid_kernels import cell_means
+
+            total, mean = np.zeros(count), np.zeros(count)
+            scatter += float(cell_means(cells, _plain(own), _plain(reading), total, mean))
+        else:
+            total = np.bincount(cells, own, count).astype(np.float64)
+            mean = np.bincount(cells, own * reading, count) / np.where(total > 0, total, 1.0)
+            scatter += float(np.dot(own, (reading - mean[cells]) ** 2))
         merged.append(replace(data, weight=total.reshape(shape), length_mm=mean.reshape(shape)))
     return tuple(merged), scatter
-
-
-def _cell_means(
-    cells: IntArray, weight: FloatArray, reading: FloatArray, count: int, compiled: bool
-) -> tuple[FloatArray, FloatArray, float]:
-    """Weight and weighted mean (count,) of the readings of each cell, and their weighted square sum about the means."""
-    if compiled:
-        from compgen.identify.adjust.grid_kernels import cell_means
-
-        sums, mean = np.zeros(count), np.zeros(count)
-        return sums, mean, float(cell_means(cells, _plain(weight), _plain(reading), sums, mean))
-    total = np.bincount(cells, weight, count).astype(np.float64)
-    mean = np.bincount(cells, weight * reading, count) / np.where(total > 0, total, 1.0)
-    return total, mean, float(np.dot(weight, (reading - mean[cells]) ** 2))
 
 
 def _plain(values: FloatArray) -> FloatArray:

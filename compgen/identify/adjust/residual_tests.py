@@ -351,22 +351,16 @@ def labels_of(
         keys = np.round(np.asarray(position_mm), 4)
         keys = keys if group is None else np.column_stack([keys, group])
         _, stop = np.unique(keys, axis=0, return_inverse=True)
-        found["run"] = _occurrence(stop.ravel())
+        # how often, from 0, each value has been there before
+        stop = stop.ravel()
+        order = np.argsort(stop, kind="stable")
+        first = np.flatnonzero(np.diff(stop[order], prepend=-1))
+        found["run"] = np.empty(len(stop), dtype=np.int64)
+        found["run"][order] = np.arange(len(stop)) - np.repeat(first, np.diff(np.append(first, len(stop))))
     names = {file: k for k, file in enumerate(dict.fromkeys(file for file, _ in origin))}
     if len(names) > 1:
         found["file"] = np.array([names[file] for file, _ in origin], dtype=np.int64)
     return found
-
-
-def _occurrence(value: IntArray) -> IntArray:
-    """Number, from 0, how often each value has been there before (n,)."""
-    order = np.argsort(value, kind="stable")
-    ranked = value[order]
-    first = np.flatnonzero(np.concatenate([[True], ranked[1:] != ranked[:-1]]))
-    counted = np.arange(len(value)) - np.repeat(first, np.diff(np.append(first, len(value))))
-    result = np.empty(len(value), dtype=np.int64)
-    result[order] = counted
-    return result
 
 
 # Whether the residuals are noise: tests along time, between stations, over distance and along the axes.
@@ -585,7 +579,16 @@ def warn_of_weakness(
                 stacklevel=4,
             )
             return
-    weak = [name for name in errors.names if _weak(machine, errors, name, sigma_mm)]
+    weak = []
+    corners = np.array(list(itertools.product(*zip(machine.lower_mm, machine.upper_mm, strict=True))))
+    levers = np.linalg.norm(c_matrix(machine, corners), axis=1).max(axis=0)
+    for name in errors.names:
+        if name in errors.squareness:
+            size, u = (abs(part) for part in errors.squareness[name])
+        else:
+            size, u = float(np.abs(errors.curves[name].value).max()), float(errors.curves[name].u.max())
+        if u > WEAK_SHARE * size and u * levers[ERROR_INDEX[name]] > WEAK_READINGS * sigma_mm:
+            weak.append(name)
     if weak:
         warnings.warn(
             f"{', '.join(weak)} {'are' if len(weak) > 1 else 'is'} hardly determined: the standard uncertainty is more than a "
@@ -593,17 +596,6 @@ def warn_of_weakness(
             CompgenWarning,
             stacklevel=4,
         )
-
-
-def _weak(machine: Machine, errors: ErrorTable, name: str, sigma_mm: float) -> bool:
-    if name in errors.squareness:
-        value, u = (abs(part) for part in errors.squareness[name])
-    else:
-        curve = errors.curves[name]
-        value, u = float(np.abs(curve.value).max()), float(curve.u.max())
-    corners = np.array(list(itertools.product(*zip(machine.lower_mm, machine.upper_mm, strict=True))))
-    lever = float(np.linalg.norm(c_matrix(machine, corners)[:, :, ERROR_INDEX[name]], axis=1).max())
-    return bool(u > WEAK_SHARE * value and u * lever > WEAK_READINGS * sigma_mm)
 
 
 def warn_of_residuals(whiteness: Whiteness, reduced_chi_square: float, u_source: str) -> None:

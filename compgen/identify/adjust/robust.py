@@ -174,20 +174,16 @@ def _steps(residual_mm: FloatArray) -> list[int]:
     found: list[int] = []
     while step.size and step.max() > limit:
         peak = int(np.argmax(step))
-        found.append(_sharpened(residual_mm, peak + WINDOW))
+        # the index near the peak at which two levels leave the smallest absolute residuals
+        low, high = peak, min(count, peak + 2 * WINDOW)
+        part = residual_mm[low:high]
+        before, after = float(np.median(part[: WINDOW // 2])), float(np.median(part[-WINDOW // 2 :]))
+        gain = np.abs(part - after) - np.abs(part - before)
+        found.append(low + int(np.argmax(np.concatenate([[0.0], np.cumsum(gain)]))))
         step[max(0, peak - WINDOW) : peak + WINDOW + 1] = 0.0
         if len(found) > MOST_BREAKS:
             return []
     return sorted(set(found))
-
-
-def _sharpened(residual_mm: FloatArray, guess: int) -> int:
-    """Index near ``guess`` at which two levels leave the smallest absolute residuals."""
-    low, high = max(0, guess - WINDOW), min(len(residual_mm), guess + WINDOW)
-    part = residual_mm[low:high]
-    before, after = float(np.median(part[: WINDOW // 2])), float(np.median(part[-WINDOW // 2 :]))
-    gain = np.abs(part - after) - np.abs(part - before)
-    return low + int(np.argmax(np.concatenate([[0.0], np.cumsum(gain)])))
 
 
 def _without_common(
@@ -454,7 +450,15 @@ def explain_rejected(
     for row in rows:
         size = f"differs from the model by {-residual_mm[row] * 1000.0:+.1f} um, "
         size += f"{abs(residual_mm[row]) / sigma_mm[row]:.0f} standard deviations"
-        why = broken.get(row) or _other_station(lengths, expected, row) or exchanged.get(row)
+        # is it another station's length at this point?
+        predicted = expected.distance_mm[expected.pose[row], expected.station_of] - expected.dead_mm
+        off = np.abs(predicted - lengths.length_mm[row])
+        off[expected.station_of == lengths.station[row]] = np.inf
+        best, label = int(np.argmin(off)), None
+        if off[best] <= expected.close_mm[row]:
+            name = lengths.stations[expected.station_of[best]]
+            label = f"it fits station {name!r} at this point: wrong station label?"
+        why = broken.get(row) or label or exchanged.get(row)
         file, line = lengths.origin[row] if lengths.origin else ("", 0)
         found.append(
             Rejected(
@@ -503,17 +507,6 @@ def _rows_of(lengths: Lengths, segments: Sequence[Segment], rejected: set[int]) 
             text = f"one of {segment.readings} readings off by {segment.offset_mm:+.3f} mm ({where}): beam break"
             found.update({row: text for row in segment.rows if row in rejected})
     return found
-
-
-def _other_station(lengths: Lengths, expected: _Expected, row: int) -> str | None:
-    """Say which other station's length at this point the reading is, if it is one."""
-    predicted = expected.distance_mm[expected.pose[row], expected.station_of] - expected.dead_mm
-    off = np.abs(predicted - lengths.length_mm[row])
-    off[expected.station_of == lengths.station[row]] = np.inf
-    best = int(np.argmin(off))
-    if off[best] > expected.close_mm[row]:
-        return None
-    return f"it fits station {lengths.stations[expected.station_of[best]]!r} at this point: wrong station label?"
 
 
 def _exchanges(lengths: Lengths, expected: _Expected, rows: Sequence[int], residual_mm: FloatArray) -> dict[int, str]:
@@ -647,16 +640,41 @@ def fit_robustly(
     ConvergenceError
         if more than 30 % of the readings, or more than half of those of a station, do not fit.
     """
-    solution = _first(problem, start, readings, factor, disturbed=disturbed)
+    if disturbed:  # readings that are far off at the start do not take part in the first adjustment
+        residual = problem.residuals(start)
+        near = np.ones(len(residual), dtype=bool)
+        for k in range(int(readings.group.max()) + 1):
+            own = readings.group == k
+            near[own] = np.abs(residual[own]) <= FAR_AT_START * max(robust_spread(residual[own]), 1e-6)
+        solution = _weighted(problem, start, readings, near)
+    else:
+        solution = solve(problem, start, factor)
     residual = problem.residuals(solution.state)
     if not disturbed and (accepted := accepted_readings(residual / readings.sigma_mm)).all():
         return RobustFit(problem, readings.group, solution, accepted, residual)
     problem, group, solution = _split(problem, solution, readings, rebuild)
     solution = _tukey(problem, solution, readings)
-    problem, group, solution = _merged(problem, group, solution, readings, rebuild)
+    # dead lengths that turn out to be the same are taken together
+    spread, dead = standardised_spread(_standardised(problem, solution, readings)), solution.state.dead_length_mm
+    again = merged_groups(readings.group, group, dead, LIMIT * spread * float(np.median(readings.sigma_mm)))
+    if again is not None:
+        kept = np.zeros(int(again.max()) + 1)
+        kept[again[::-1]] = dead[group[::-1]]
+        problem, group = rebuild(again), again
+        solution = _tukey(problem, replace(solution, state=replace(solution.state, dead_length_mm=kept)), readings)
     fit = _rejected(problem, group, solution, readings)
-    _warn_of_many(fit, readings)
-    return replace(fit, segments=_segments(fit, readings))
+    if 1.0 - np.mean(fit.accepted) > MANY_REJECTED or _shares(fit.accepted, readings).max() > MANY_REJECTED_OF_STATION:
+        warnings.warn(
+            f"{_suspicion(fit.accepted, readings)}; they were left out, but so many point to a mistake in the "
+            "readings, their labels or the machine file",
+            CompgenWarning,
+            stacklevel=4,
+        )
+    lengths = readings.lengths
+    spread_mm = standardised_spread(fit.residual_mm / readings.sigma_mm) * readings.sigma_mm
+    segments = kept_segments(lengths, readings.group, group, fit.solution.state.dead_length_mm)
+    segments += rejected_runs(lengths, group, fit.accepted, fit.residual_mm, spread_mm)
+    return replace(fit, segments=segments)
 
 
 def _split(
@@ -665,7 +683,10 @@ def _split(
     """Reweighted adjustment in which beam breaks get dead lengths of their own until no more come to light."""
     group = readings.group
     for _ in range(BREAK_ROUNDS):
-        solution = _huber(problem, solution, readings)
+        for _ in range(HUBER_STEPS):
+            standardised = _standardised(problem, solution, readings)
+            size = np.abs(standardised) / standardised_spread(standardised)
+            solution = _weighted(problem, solution.state, readings, HUBER / np.maximum(size, HUBER))
         state = solution.state
         sight = readings.target_mm - state.stations_mm[readings.lengths.station]
         sight = sight / np.linalg.norm(sight, axis=1)[:, None]
@@ -674,60 +695,19 @@ def _split(
             break
         group, offset_mm = split
         problem = rebuild(group)
-        solution = replace(solution, state=_with_dead_lengths(state, readings.group, group, offset_mm))
+        # the groups that a break split off begin with the dead length of theirs, less what their readings are off
+        known, main = len(state.dead_length_mm), np.zeros(len(offset_mm), dtype=np.int64)
+        main[group] = readings.group
+        own = state.dead_length_mm[main[known:]] - offset_mm[known:]
+        state = replace(state, dead_length_mm=np.concatenate([state.dead_length_mm, own]))
+        solution = replace(solution, state=state)
     return problem, group, solution
-
-
-def _merged(
-    problem: P,
-    group: IntArray,
-    solution: LeastSquaresSolution,
-    readings: WeightedReadings,
-    rebuild: Callable[[IntArray], P],
-) -> tuple[P, IntArray, LeastSquaresSolution]:
-    """Take dead lengths together that turn out to be the same."""
-    spread = standardised_spread(_standardised(problem, solution, readings))
-    dead = solution.state.dead_length_mm
-    again = merged_groups(readings.group, group, dead, LIMIT * spread * float(np.median(readings.sigma_mm)))
-    if again is None:
-        return problem, group, solution
-    kept = np.zeros(int(again.max()) + 1)
-    kept[again[::-1]] = dead[group[::-1]]
-    problem = rebuild(again)
-    solution = replace(solution, state=replace(solution.state, dead_length_mm=kept))
-    return problem, again, _tukey(problem, solution, readings)
 
 
 def _standardised(
     problem: LeastSquaresProblem, solution: LeastSquaresSolution, readings: WeightedReadings
 ) -> FloatArray:
     return np.asarray(problem.residuals(solution.state) / readings.sigma_mm)
-
-
-def _first(
-    problem: LeastSquaresProblem, start: State, readings: WeightedReadings, factor: Factor | None, *, disturbed: bool
-) -> LeastSquaresSolution:
-    """Least squares from the start; readings that are far off there, where that is known, do not take part."""
-    if not disturbed:
-        return solve(problem, start, factor)
-    residual = problem.residuals(start)
-    near = np.ones(len(residual), dtype=bool)
-    for k in range(int(readings.group.max()) + 1):
-        own = readings.group == k
-        near[own] = np.abs(residual[own]) <= FAR_AT_START * max(robust_spread(residual[own]), 1e-6)
-    return _weighted(problem, start, readings, near)
-
-
-def _huber(
-    problem: LeastSquaresProblem, solution: LeastSquaresSolution, readings: WeightedReadings
-) -> LeastSquaresSolution:
-    """Iteratively reweighted least squares with Huber's weights."""
-    for _ in range(HUBER_STEPS):
-        standardised = _standardised(problem, solution, readings)
-        size = np.abs(standardised) / standardised_spread(standardised)
-        weight = HUBER / np.maximum(size, HUBER)
-        solution = _weighted(problem, solution.state, readings, weight)
-    return solution
 
 
 def _tukey(
@@ -759,22 +739,6 @@ def _rejected(problem: P, group: IntArray, solution: LeastSquaresSolution, readi
         solution = _weighted(problem, solution.state, readings, accepted)
     assert accepted is not None
     return RobustFit(problem, group, solution, accepted, residual)
-
-
-def _with_dead_lengths(state: State, first: IntArray, group: IntArray, offset_mm: FloatArray) -> State:
-    """Add dead lengths for the groups that a break split off; ``offset_mm`` says how much their readings are off."""
-    known = len(state.dead_length_mm)
-    dead = np.concatenate([state.dead_length_mm, np.zeros(len(offset_mm) - known)])
-    main = np.zeros(len(offset_mm), dtype=np.int64)
-    main[group] = first
-    dead[known:] = state.dead_length_mm[main[known:]] - offset_mm[known:]
-    return replace(state, dead_length_mm=dead)
-
-
-def _segments(fit: RobustFit[P], readings: WeightedReadings) -> tuple[Segment, ...]:
-    spread = standardised_spread(fit.residual_mm / readings.sigma_mm) * readings.sigma_mm
-    kept = kept_segments(readings.lengths, readings.group, fit.group, fit.solution.state.dead_length_mm)
-    return kept + rejected_runs(readings.lengths, fit.group, fit.accepted, fit.residual_mm, spread)
 
 
 def _weighted(
@@ -818,15 +782,3 @@ def _check_share(keep: NDArray[np.bool_], readings: WeightedReadings) -> None:
         advice = f"check station {name!r}: its label, its unit, and whether readings of another station are "
         advice += "labelled with its name"
     raise ConvergenceError(f"{_suspicion(keep, readings)}; {advice}")
-
-
-def _warn_of_many(fit: RobustFit[P], readings: WeightedReadings) -> None:
-    """Warn when so many readings were rejected that a mistake is more likely than disturbed readings."""
-    out = _shares(fit.accepted, readings)
-    if 1.0 - np.mean(fit.accepted) > MANY_REJECTED or out.max() > MANY_REJECTED_OF_STATION:
-        warnings.warn(
-            f"{_suspicion(fit.accepted, readings)}; they were left out, but so many point to a mistake in the "
-            "readings, their labels or the machine file",
-            CompgenWarning,
-            stacklevel=5,
-        )

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
-from compgen.data.machine import Reference
 from compgen.data.names import AXES
 from compgen.errors import ConvergenceError, InputError
 from compgen.identify.adjust.grid_problem import GridProblem
@@ -215,7 +214,14 @@ def affine_start(problem: GridProblem, start: State) -> State:
     p = target[:, picked].T
     weight = data.weight.reshape(problem.groups, -1)[:, picked]
     reading = data.length_mm.reshape(problem.groups, -1)[:, picked]
-    fields = _fields(p, problem.parameters.machine.squareness_reference)
+    # displacement fields (n, 3, 6): scales of X, Y, Z, then EC0Y, EB0Z, EA0Z
+    fields = np.zeros((len(p), 3, 6))
+    for axis in range(3):
+        fields[:, axis, axis] = p[:, axis]
+    in_y = problem.parameters.machine.squareness_reference == "Y"
+    fields[:, int(in_y), 3] = -p[:, 0 if in_y else 1]
+    fields[:, 0, 4] = p[:, 2]
+    fields[:, 1, 5] = -p[:, 2]
     affine, stations, dead = np.zeros(6), start.stations_mm.copy(), start.dead_length_mm.copy()
     for _ in range(STEPS):
         tip = p + fields @ affine
@@ -234,20 +240,6 @@ def affine_start(problem: GridProblem, start: State) -> State:
 
 def _spread(count: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return np.round(np.linspace(0, count - 1, min(count, SAMPLE))).astype(np.int64)
-
-
-def _fields(p: FloatArray, reference: Reference) -> FloatArray:
-    """Displacement fields (n, 3, 6) at points (n, 3): scales of X, Y, Z, then EC0Y, EB0Z, EA0Z."""
-    fields = np.zeros((len(p), 3, 6))
-    for axis in range(3):
-        fields[:, axis, axis] = p[:, axis]
-    if reference == "Y":
-        fields[:, 1, 3] = -p[:, 0]
-    else:
-        fields[:, 0, 3] = -p[:, 1]
-    fields[:, 0, 4] = p[:, 2]
-    fields[:, 1, 5] = -p[:, 2]
-    return fields
 
 
 def _step(
@@ -368,8 +360,10 @@ def robust_state(
         own, member = np.unique(group[rows], return_inverse=True)
         part = _Station(target_mm[rows], lengths.length_mm[rows], member.ravel().astype(np.int64))
         first = StationStart(stations[k], dead[own])
-        if _looks_sound(part, first):
-            continue
+        residual = part.part(_sample(len(rows), 2000)).residuals(first)
+        spread = robust_spread(residual)
+        if spread < ORDINARY_MM and np.abs(residual).max() <= START_LIMIT * max(spread, 1e-9):
+            continue  # looks sound
         better = _robust(part, first)
         stations[k], dead[own] = better.position_mm, better.dead_length_mm
         misfit_mm[k], parts[k] = robust_spread(part.residuals(better)), part
@@ -379,13 +373,6 @@ def robust_state(
     if bad.size:
         raise _no_place(lengths, bad.tolist(), misfit_mm, parts, station)
     return replace(start, stations_mm=stations, dead_length_mm=dead), found_any
-
-
-def _looks_sound(part: _Station, start: StationStart) -> bool:
-    rows = _sample(len(part.length_mm), 2000)
-    residual = part.part(rows).residuals(start)
-    spread = robust_spread(residual)
-    return bool(spread < ORDINARY_MM and np.abs(residual).max() <= START_LIMIT * max(spread, 1e-9))
 
 
 def _sample(count: int, most: int) -> IntArray:
