@@ -9,7 +9,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import resource
+import tempfile
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -17,9 +21,10 @@ import timing
 from scipy.linalg.blas import dsyrk
 from scipy.optimize import least_squares
 
+from compgen.data.length_archive import write_archive
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Axis, Chain, Machine
-from compgen.identify import identify, joint_covariance, sample_errors
+from compgen.identify import identify, identify_measurement, joint_covariance, read_measurement, sample_errors
 from compgen.identify.adjust.grid_problem import grid_problem
 from compgen.identify.adjust.starts import start_moments, station_start_from_moments
 from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
@@ -192,6 +197,45 @@ def million(clock: timing.Clock) -> None:
     print(f"  ratio {np.median(ratios):.3g} ({ratios.min():.3g}-{ratios.max():.3g})")
 
 
+def archive(count: int = 10_000_000) -> None:
+    """Readings on the fly from a ``*.lengths.npz`` file, four stations at each stop: time, processor time, peak memory."""
+    case, stops = Case(3, 11), count // 4
+    rng = np.random.default_rng(1)
+    truth = rng.normal(0.0, 1e-5, case.layout.size)
+    truth[-3:] = (2903e-6, -61e-6, 23e-6)
+
+    def parts() -> Iterator[dict[str, np.ndarray]]:
+        for first in range(0, stops, 50_000):
+            time_s = np.arange(first, min(first + 50_000, stops)) / stops * 2e3
+            waves = [np.sin(time_s), np.sin(3.1 * time_s), np.sin(0.73 * time_s)]
+            position = np.stack(
+                [0.5 * t * (w - 1.0) for t, w in zip((800.0, 1000.0, 350.0), waves, strict=True)], axis=1
+            )
+            tip = tip_position(case.machine, case.layout.values(truth, case._bases(position)), position)
+            distance = np.linalg.norm(tip[:, None] - STATIONS_MM, axis=2)
+            length = distance - (400.0, 500.0, 600.0, 700.0) + NOISE_MM * rng.standard_normal(distance.shape)
+            columns = {f"{axis}_mm": position[:, k].repeat(4) for k, axis in enumerate("xyz")}
+            yield {
+                "station": np.tile(np.arange(4, dtype=np.int16), len(time_s)),
+                **columns,
+                "length_mm": length.ravel(),
+            }
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "fly.lengths.npz"
+        write_archive(path, ["LT1", "LT2", "LT3", "LT4"], parts(), {"u_length_um": NOISE_MM * 1e3})
+        print(f"\n{count} lengths from an archive of {path.stat().st_size / 1e6:.0f} MB")
+        for run in range(3):
+            begun, worked = time.perf_counter(), time.process_time()
+            found = identify_measurement(case.machine, read_measurement([path]))
+            took, worked = time.perf_counter() - begun, time.process_time() - worked
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            what = "with compilation, " if run == 0 else ""
+            print(
+                f"  {what}{took:.2f} s, processor time {worked:.2f} s, peak memory {peak:.0f} MB, {found.iterations} passes"
+            )
+
+
 def sampling() -> None:
     """10000 draws of all errors from the covariance, against identifying as often with scipy."""
     case = Case(11, 11)
@@ -219,10 +263,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=5, help="rounds, at least 5")
     parser.add_argument("--cpu", action="store_true", help="processor time instead of time: for a busy computer")
+    parser.add_argument("--archive", action="store_true", help="1e7 lengths from a file, nothing else")
     parser.add_argument("--quick", action="store_true", help="the small case only")
     arguments = parser.parse_args()
     clock = time.process_time if arguments.cpu else time.perf_counter
     print(timing.machine_line())
+    if arguments.archive:
+        archive()
+        return
     print("identify with the compiled loops of COMPGEN_KERNELS=compiled:", load_kernels())
     compare(11, 11, arguments.runs, ("trf", "lm"), clock)
     if not arguments.quick:

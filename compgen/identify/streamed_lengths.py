@@ -26,7 +26,7 @@ from compgen.errors import ConvergenceError, InputError
 from compgen.identify.adjust.path_problem import Chunk, Noise, PathModel, Sums, chunk_of, path_model
 from compgen.identify.adjust.problem import LengthProblem
 from compgen.identify.adjust.propagation import SystematicInputs
-from compgen.identify.adjust.rank import determined_factor, unknown_names
+from compgen.identify.adjust.rank import Rank, determined_factor, unknown_names
 from compgen.identify.adjust.residual_tests import misfit_of, residual_series
 from compgen.identify.adjust.robust import LIMIT, MOST_REJECTED, Rejected, standardised_spread
 from compgen.identify.adjust.solver import Factor, step_levers
@@ -64,7 +64,15 @@ class _Stream:
         for rows in self.archive.chunks():
             station = group = np.asarray(columns["station"][rows], dtype=np.int64)
             if "setup" in columns:
-                group = np.searchsorted(self.setups @ (most, 1), station * most + columns["setup"][rows])
+                setup = columns["setup"][rows]
+                group = np.searchsorted(self.setups @ (most, 1), station * most + setup)
+                group = np.minimum(group, len(self.setups) - 1)
+                for row in np.flatnonzero((self.setups[group] != np.stack([station, setup], axis=1)).any(axis=1))[:1]:
+                    name = self.archive.stations[int(station[row])]
+                    message = (
+                        f"setup {setup[row]} of station {name!r} has so few readings that a sample has none of them"
+                    )
+                    raise InputError(f"{message}; leave them out", file=self.archive.path, field="setup")
             x, y, z = (columns[name][rows] for name in POSITION_COLUMNS)
             yield chunk_of((x, y, z), station, group, columns["length_mm"][rows])
 
@@ -170,6 +178,46 @@ def identify_archive(
         return _with_all(machine, archive, sample, found, reject=chosen.reject)
 
 
+@dataclass(frozen=True)
+class _Optimum:
+    """Where the passes over all readings end, with the sums there and the rejected readings that are named."""
+
+    state: State
+    factor: Factor
+    rank: Rank | None
+    sums: Sums
+    rejected: list[tuple[int, float]]
+    passes: int
+
+
+def _optimum(stream: _Stream, state: State, noise: Noise) -> _Optimum:
+    """Gauss-Newton with one normal matrix, made in the first pass, until no unknown moves and the same readings count."""
+    archive, layout, setups, count = stream.archive, stream.layout, stream.setups, len(stream.archive)
+
+    def names() -> list[str]:
+        return unknown_names(layout, archive.stations, setups[:, 0], np.arange(len(setups)))
+
+    rejected: list[tuple[int, float]] = []
+    sums = stream.sums(state, noise, rejected, matrix=True)
+    assert sums.matrix is not None
+    factor, rank = determined_factor(sums.matrix, names, "the readings")
+    levers, previous, used = step_levers(layout, len(sums.gradient)), np.inf, -1.0
+    for passes in range(1, MOST_PASSES + 1):
+        before, used = used, float(sums.by_group[:, 0].sum())
+        if count - used > MOST_REJECTED * count:
+            break
+        step = -factor.solve(sums.gradient)
+        length = float(np.max(np.abs(step) * levers))
+        state = state.moved(step)
+        if length * min(length / previous, 1.0) < TOLERANCE_MM and used == before:
+            return _Optimum(state, factor, rank, sums, rejected, passes)
+        previous, sums = length, stream.sums(state, noise, rejected, matrix=False)
+    raise ConvergenceError(
+        f"{count - used:.0f} of {count} readings do not fit the model of a sample of them; look for beam breaks (readings "
+        "behind one need a setup of their own), and check station labels and units"
+    )
+
+
 def _with_all(
     machine: Machine, archive: LengthArchive, sample: Lengths, found: Identification, *, reject: bool
 ) -> Identification:
@@ -190,33 +238,10 @@ def _with_all(
     standardised = found.residual_mm / (constant_mm + proportional * distance)
     limit = LIMIT * standardised_spread(standardised) if reject else np.inf
     noise = Noise(constant_mm, proportional, scale_mm, limit)
-    size = layout.size + 3 * len(archive.stations) + len(setups)
-    levers = step_levers(layout, size)
-
-    def names() -> list[str]:
-        return unknown_names(layout, archive.stations, setups[:, 0], np.arange(len(setups)))
-
-    rejected: list[tuple[int, float]] = []
-    factor: Factor | None = None
-    rank, previous, used, passes = None, np.inf, -1.0, 0
-    while True:
-        sums, before, passes = stream.sums(state, noise, rejected, matrix=factor is None), used, passes + 1
-        used = float(sums.by_group[:, 0].sum())
-        if len(archive) - used > MOST_REJECTED * len(archive) or passes > MOST_PASSES:
-            raise ConvergenceError(
-                f"{len(archive) - used:.0f} of {len(archive)} readings do not fit the model of a sample of them; look for "
-                "beam breaks (readings behind one need a setup of their own), and check station labels and units"
-            )
-        if sums.matrix is not None:
-            factor, rank = determined_factor(sums.matrix, names, "the readings")
-        assert factor is not None
-        step = -factor.solve(sums.gradient)
-        length = float(np.max(np.abs(step) * levers))
-        state = state.moved(step)
-        if length * min(length / previous, 1.0) < TOLERANCE_MM and used == before:
-            break
-        previous = length
-    freedom = int(used) - size
+    optimum = _optimum(stream, state, noise)
+    state, factor, sums, used = optimum.state, optimum.factor, optimum.sums, int(optimum.sums.by_group[:, 0].sum())
+    size = len(sums.gradient)
+    freedom = used - size
     chi_square = 2.0 * sums.cost / scale_mm**2 / freedom
     u_scale = uncertainty_scale(chi_square, found.u_source)
     adjustment = replace(found.adjustment, state=state, factor=factor, sigma_mm=scale_mm * u_scale)
@@ -244,15 +269,15 @@ def _with_all(
         found,
         errors=errors,
         stations=tuple(stations),
-        counted=(len(archive), int(used)),
+        counted=(len(archive), used),
         rms_um=float(np.sqrt(sums.by_group[:, 1].sum() / used)) / MM_PER_UM,
         degrees_of_freedom=freedom,
         reduced_chi_square=chi_square,
         u_scale=u_scale,
-        rejected=tuple(_rejected(archive, row, off_mm) for row, off_mm in rejected),
-        rank=size if rank is None else rank.rank,
+        rejected=tuple(_rejected(archive, row, off_mm) for row, off_mm in optimum.rejected),
+        rank=size if optimum.rank is None else optimum.rank.rank,
         condition=1.0 / factor.rcond,
-        iterations=passes,
+        iterations=optimum.passes,
         worst_u=worst_uncertainty(errors),
         adjustment=adjustment,
         misfit=misfit_of(
@@ -266,7 +291,7 @@ def _with_all(
         ),
         details={
             "sample_readings": len(sample),
-            "passes": passes,
+            "passes": optimum.passes,
             "robust_limit": limit if np.isfinite(limit) else None,
             "from_the_sample": "residuals, whiteness, causes of a misfit, beam breaks",
         },

@@ -147,6 +147,17 @@ def test_each_setup_has_a_dead_length_of_its_own(machine, columns, tmp_path):
 
 
 @pytest.mark.usefixtures("streamed")
+def test_a_setup_that_the_sample_does_not_see_is_refused(machine, columns, tmp_path):
+    rows = open_archive(written(tmp_path, columns)).sample_rows
+    hidden = np.flatnonzero(~np.isin(np.arange(COUNT), rows))[:2]
+    setup = np.zeros(COUNT, dtype=np.int64)
+    for number in (1, 10**6):
+        setup[hidden] = number
+        with pytest.raises(InputError, match=f"setup {number} of station .* has so few readings"):
+            identify_measurement(machine, read_measurement([written(tmp_path, columns, setup=setup)]))
+
+
+@pytest.mark.usefixtures("streamed")
 def test_what_the_readings_leave_open_is_named(machine, columns, tmp_path):
     flat = written(tmp_path, columns, z_mm=np.full(COUNT, -100.0))
     with pytest.raises((UndeterminedError, ConvergenceError, InputError)):
