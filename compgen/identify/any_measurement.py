@@ -14,7 +14,6 @@ import numpy as np
 
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.error_table import ErrorTable
-from compgen.data.length_archive import MOST_WHOLE, LengthArchive, open_archive
 from compgen.data.lengths import Lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
@@ -28,6 +27,7 @@ from compgen.identify.tracer_lengths import identify
 if TYPE_CHECKING:
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import Deviations
+    from compgen.data.length_archive import LengthArchive
     from compgen.identify.six_dof import SixDofMeasurement
 
 #: Deviations that are all smaller than this are refused: 100 um in the wrong unit, mm for um.
@@ -65,6 +65,8 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
         for lengths together with deviations, six-DOF readings without an instrument file, or one without such readings.
     """
     if len(paths) == 1 and instrument is None and str(paths[0]).lower().endswith(ARCHIVE):
+        from compgen.data.length_archive import MOST_WHOLE, open_archive
+
         archive = open_archive(paths[0])
         if len(archive) > MOST_WHOLE:
             return archive
@@ -122,7 +124,7 @@ def _read_others(paths: Sequence[str | Path]) -> Lengths | Deviations | AxisRuns
 
 def describe(measurement: Measurement | ErrorTable) -> str:
     """Say in words what was measured."""
-    if isinstance(measurement, Lengths | LengthArchive):
+    if isinstance(measurement, Lengths):
         return f"{len(measurement)} lengths of {len(measurement.stations)} stations"
     if isinstance(measurement, ErrorTable):
         return f"{len(measurement.names)} errors of another program"
@@ -130,7 +132,10 @@ def describe(measurement: Measurement | ErrorTable) -> str:
         return f"{describe(measurement.other)}, {describe(measurement.sixdof)}"
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import PART, Deviations
+    from compgen.data.length_archive import LengthArchive
 
+    if isinstance(measurement, LengthArchive):
+        return f"{len(measurement)} lengths of {len(measurement.stations)} stations"
     if isinstance(measurement, Deviations):
         what = "features of parts" if measurement.metadata.get("measured") == PART else "measured positions"
         return f"{len(measurement)} {what}"
@@ -148,6 +153,8 @@ def identify_measurement(
         if chosen.u_deviation_um is not None:
             raise InputError("an uncertainty of deviations (--u-deviation-um) was given, but the files contain lengths")
         return identify(machine, measurement, chosen)
+    from compgen.data.length_archive import LengthArchive
+
     if isinstance(measurement, LengthArchive):
         from compgen.identify.streamed_lengths import identify_archive
 
@@ -224,8 +231,11 @@ def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, re
     measurement about instrument and operator are kept.
     """
     columns: dict[str, Sequence[str] | FloatArray] = {}
-    if isinstance(measurement, LengthArchive):
-        measurement = measurement.taken(measurement.sample_rows)
+    if not isinstance(measurement, Lengths):
+        from compgen.data.length_archive import LengthArchive
+
+        if isinstance(measurement, LengthArchive):
+            measurement = measurement.taken(measurement.sample_rows)
     if isinstance(measurement, Lengths) and len(measurement) == len(result.residual_mm):
         columns["station"] = [measurement.stations[k] for k in measurement.station.tolist()]
         columns |= {f"{axis}_mm": measurement.position_mm[:, k] for k, axis in enumerate("xyz")}
