@@ -121,6 +121,14 @@ def test_a_polyline_of_three_pieces_is_found_exactly():
     np.testing.assert_allclose(found.values, [3.0, -2.0, 5.0, 1.0], atol=1e-9)
 
 
+def test_the_four_knots_of_a_line_differ_from_each_other():
+    """Any inner knots hold a line; the control wants four different points in ascending order."""
+    position = np.linspace(-400.0, 450.0, 69)
+    for slope in np.linspace(-3e-5, 3e-5, 41):
+        knots = best_polyline(position[::4], position, slope * position + 1e-3, np.ones(69)).knots
+        assert knots[0] == 0 and knots[-1] == 17 and np.all(np.diff(knots) > 0)
+
+
 # --- round trip ------------------------------------------------------------------------------------------------------
 
 
