@@ -62,6 +62,19 @@ def added(machine, tables, position_mm):
     return CONTROL(machine).emulate(tables, Points(np.array(position_mm, dtype=float)))
 
 
+@pytest.mark.parametrize(
+    ("options", "um"),
+    [
+        ("", 0.75),  # three tables act on an axis, each rounds to half of a count of half a setting unit of 1 um
+        ("relative_errors = false", 0.25),
+        ('relative_errors = ["Y(x)"]', 0.5),
+        ("relative_errors = false\nscale = 3\nsetting_unit_um = 0.1", 0.075),
+    ],
+)
+def test_rounding_costs_half_a_count_for_each_table_of_an_axis(tmp_path, options, um):
+    assert CONTROL(machine_of(tmp_path, options)).resolution_mm() == pytest.approx(um * UM)
+
+
 def test_the_worked_values_of_the_formulas_push_away_from_the_reference_point(tmp_path):
     """(100.000 - 99.990) x 2 = +20 on the positive side, (100.000 + -99.990) x 2 = +20 on the negative side."""
     machine = machine_of(tmp_path)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from compgen.controls import Term
-from compgen.controls.shared.terms import continued, error_terms, one_dimensional_terms, product_terms
+from compgen.controls.shared.terms import ACROSS, continued, error_terms, one_dimensional_terms, product_terms
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.names import SQUARENESS_NAMES
 from compgen.kinematics.first_order import tool_of
@@ -120,3 +120,8 @@ def test_a_curve_that_is_not_known_adds_nothing():
     assert [term.name for term in terms if np.any(term.start)] == ["X(x)"]
     assert terms[0].start == pytest.approx(-curve.value)
     assert [term.name for term in error_terms(machine, ErrorTable({"EXX": curve}), nodes)] == ["EXX"]
+
+
+def test_the_names_of_tables_say_what_moves_and_over_which_axis():
+    known = {"Y(x)": (1, 0), "Z(x)": (2, 0), "X(y)": (0, 1), "Z(y)": (2, 1), "X(z)": (0, 2), "Y(z)": (1, 2)}
+    assert known == ACROSS
