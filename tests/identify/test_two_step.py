@@ -305,7 +305,7 @@ def test_gradient_and_normal_matrix_are_those_of_differences(machine):
         rest = np.einsum("mij,mj->mi", whitened, problem.residuals(moved).reshape(-1, 3))
         return np.concatenate([rest.ravel(), root @ moved.dead_length_mm])
 
-    steps = np.diag(1e-3 / step_levers(problem))
+    steps = np.diag(1e-3 / step_levers(problem.parameters, problem.size))
     jacobian = np.column_stack([(residual(h) - residual(-h)) / (2 * h.sum()) for h in steps])
     here = residual(np.zeros(problem.size))
     cost, gradient = problem.evaluate(state)

@@ -74,29 +74,26 @@ def describe_rank(matrix: FloatArray, names: list[str], zero: float = ZERO_EIGEN
     null = eigenvalues < zero
     kept = eigenvalues[~null]
     undetermined = np.sqrt(np.sum(vectors[:, null] ** 2, axis=1)) > 1e-4
-    return Rank(
-        rank=int(np.count_nonzero(~null)),
-        size=len(matrix),
-        condition=float(kept[-1] / kept[0]) if len(kept) else np.inf,
-        undetermined=undetermined,
-        combinations=_combinations(names, vectors[:, null], empty),
-    )
-
-
-def _combinations(names: list[str], null_vectors: FloatArray, empty: NDArray[np.bool_]) -> tuple[str, ...]:
     texts = []
     without = [names[k] for k in np.flatnonzero(empty)]
     if without:
         more = f" and {len(without) - MOST_NAMED} more" if len(without) > MOST_NAMED else ""
         texts.append(f"no data at all for: {', '.join(without[:MOST_NAMED])}{more}")
-    others = null_vectors[:, np.sum(null_vectors[empty] ** 2, axis=0) < 0.5]
+    # each direction without data is named by the errors that take part in it, the leading one first
+    others = vectors[:, null][:, np.sum(vectors[:, null][empty] ** 2, axis=0) < 0.5]
     for vector in _sparse_directions(others).T:
         share: dict[str, float] = {}
         for name, value in zip(names, vector, strict=True):
             share[name.split(" ")[0]] = share.get(name.split(" ")[0], 0.0) + float(value**2)
         leading = sorted((name for name in share if share[name] > 0.02), key=lambda name: -share[name])
         texts.append("cannot be told apart: " + " and ".join(leading[:6]) + (" and others" if len(leading) > 6 else ""))
-    return tuple(dict.fromkeys(texts))
+    return Rank(
+        rank=int(np.count_nonzero(~null)),
+        size=len(matrix),
+        condition=float(kept[-1] / kept[0]) if len(kept) else np.inf,
+        undetermined=undetermined,
+        combinations=tuple(dict.fromkeys(texts)),
+    )
 
 
 def _sparse_directions(vectors: FloatArray) -> FloatArray:

@@ -150,7 +150,22 @@ def start_moments(grid: LevelGrid) -> tuple[FloatArray, FloatArray, FloatArray, 
     centre = np.array([levels.mean() for levels in grid.levels_mm]) + grid.tools[0].tool_mm
     scale = max(max(float(np.ptp(levels)) for levels in grid.levels_mm), 1.0)
     if grid.compiled:
-        return *_compiled_moments(grid, centre, scale), centre, scale
+        from compgen.identify.adjust.grid_kernels import add_sums, start_sums
+
+        number, total, moments = np.zeros(grid.groups), np.zeros(grid.groups), np.zeros((grid.groups, 6, 6))
+        for data in grid.tools:
+            add_sums(data.weight, data.length_mm, number, total)
+        offset = total / np.maximum(number, 1.0) / scale
+        (out, mid, inner), axes = grid.order, np.array(grid.order)
+        for data in grid.tools:
+            along = [(levels + data.tool_mm[k] - centre[k]) / scale for k, levels in enumerate(grid.levels_mm)]
+            plane = np.stack([np.repeat(along[mid], len(along[inner])), np.tile(along[inner], len(along[mid]))])
+            for k in range(grid.groups):
+                readings = data.weight[k], data.length_mm[k], scale, float(offset[k])
+                start_sums(along[out], plane, axes, *readings, moments[k])
+        moments += moments.swapaxes(1, 2).copy()  # each product was entered once, on one side of the diagonal or on it
+        moments[:, np.arange(6), np.arange(6)] *= 0.5
+        return moments, offset, centre, scale
     readings = np.sum([np.sum(data.length_mm * (data.weight > 0), axis=(1, 2)) for data in grid.tools], axis=0)
     counts = np.sum([np.count_nonzero(data.weight, axis=(1, 2)) for data in grid.tools], axis=0)
     offset = readings / np.maximum(counts, 1) / scale
@@ -167,27 +182,6 @@ def start_moments(grid: LevelGrid) -> tuple[FloatArray, FloatArray, FloatArray, 
             present = (data.weight[group] > 0).ravel()
             moments[group] += (columns * present) @ columns.T
     return moments, offset, centre, scale
-
-
-def _compiled_moments(grid: LevelGrid, centre: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:
-    """Moments (groups, 6, 6) and offsets (groups,) by the compiled loops."""
-    from compgen.identify.adjust.grid_kernels import add_sums, start_sums
-
-    counts, readings = np.zeros(grid.groups), np.zeros(grid.groups)
-    for data in grid.tools:
-        add_sums(data.weight, data.length_mm, counts, readings)
-    offset = readings / np.maximum(counts, 1.0) / scale
-    moments = np.zeros((grid.groups, 6, 6))
-    out, mid, inner = grid.order
-    axes = np.array(grid.order)
-    for data in grid.tools:
-        along = [(levels + data.tool_mm[k] - centre[k]) / scale for k, levels in enumerate(grid.levels_mm)]
-        plane = np.stack([np.repeat(along[mid], len(along[inner])), np.tile(along[inner], len(along[mid]))])
-        for k in range(grid.groups):
-            start_sums(along[out], plane, axes, data.weight[k], data.length_mm[k], scale, float(offset[k]), moments[k])
-    moments += moments.swapaxes(1, 2).copy()  # each product was entered once, on one side of the diagonal or on it
-    moments[:, np.arange(6), np.arange(6)] *= 0.5
-    return moments, offset
 
 
 # A better start: the machine as an affine map (scales and squareness), stations and dead lengths, from a few readings.
