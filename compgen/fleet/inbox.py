@@ -76,8 +76,8 @@ def _is_named(path: Path, patterns: Iterable[str]) -> bool:
     return any(fnmatchcase(path.name, pattern) for pattern in patterns)
 
 
-def load(job: MachineJob, group: tuple[Path, ...]) -> NewMeasurement:
-    """Read the files of one measurement.
+def read_files(job: MachineJob, group: tuple[Path, ...]) -> tuple[str, dict[str, bytes], datetime]:
+    """Read the files of one measurement: its name, their contents, and the time of the newest.
 
     Raises
     ------
@@ -94,7 +94,13 @@ def load(job: MachineJob, group: tuple[Path, ...]) -> NewMeasurement:
         contents[path.name], left = content, left - len(content)
         times.append(state.st_mtime)
     name = group[0].name if len(group) == 1 else group[0].parent.name
-    return measurement_of(visible(name, flat=True), contents, datetime.fromtimestamp(max(times), UTC))
+    return visible(name, flat=True), contents, datetime.fromtimestamp(max(times), UTC)
+
+
+def digest_of(contents: Mapping[str, bytes]) -> str:
+    """Return the hash by which a measurement is known; names of files do not count."""
+    digests = sorted(sha256_of(content) for content in contents.values())
+    return digests[0] if len(digests) == 1 else sha256_of("\n".join(digests).encode())
 
 
 def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes, os.stat_result]:
@@ -204,9 +210,7 @@ def _opened_folder(folder: Path, *, real: bool) -> Iterator[int | None]:
 
 
 def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime) -> NewMeasurement:
-    """Return a measurement from the contents of its files; names of files do not count for its hash."""
-    digests = sorted(sha256_of(content) for content in contents.values())
-    digest = digests[0] if len(digests) == 1 else sha256_of("\n".join(digests).encode())
+    """Return a measurement from the contents of its files."""
     comments: dict[str, str] = {}
     for content in contents.values():
         comments = {**_comments(content), **comments}
@@ -215,7 +219,7 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
     for content in contents.values():
         temperatures |= _temperatures(content)
     return NewMeasurement(
-        sha256=digest,
+        sha256=digest_of(contents),
         name=name,
         measured_at=times[0][0] if times else file_time,
         measured_at_source=times[0][1] if times else "file time",

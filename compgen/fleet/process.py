@@ -491,7 +491,7 @@ def process(
     settings = job.settings_sha256()
     machine = load_machine(job.machine)
     tables = store.tables(record)
-    now = store.read(store.now)
+    now = store.now()
     with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)

@@ -83,9 +83,7 @@ def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord |
             seen = _look(folder)
             tables = store.tables(machine, figures=False)
             _compare(store, machine, tables, folder, seen)
-            past = lineage(store, machine)
-            about = {"machine": machine.name, "decisions": len(past), "sha256": past[-1] if past else ""}
-            ledger = json.dumps(about, indent=2) + "\n"
+            ledger = _ledger_text(store, machine)
             _remove_leftovers(store, machine, tables, folder)
             for table in tables:
                 required = folder / version_name(table)
@@ -99,6 +97,47 @@ def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord |
         return active
     except OSError as error:
         raise InputError(f"the tables cannot be written: {error.strerror or error}", file=folder) from error
+
+
+def is_published(store: Store, machine: MachineRecord, folder: Path) -> bool:
+    """Whether :func:`publish` would change nothing: the files are there, byte for byte, and no others of this program."""
+    try:
+        seen = _look(folder)
+        tables = store.tables(machine, figures=False)
+        _compare(store, machine, tables, folder, seen)
+        required, active, proposed = _proposed(tables), active_of(tables), folder / PROPOSED
+        kept = {version_name(table) for table in tables if table.state == "retired"}
+        left = [name for name in os.listdir(folder) if name.endswith(".tmp")]
+        for name in os.listdir(proposed) if proposed.exists() else ():
+            if name.endswith(".tmp") or (_PROPOSED.fullmatch(name) and name not in required):
+                left.append(name)
+        pointer = None if active is None else version_name(active)
+        if (
+            left
+            or kept - {*seen.versions}
+            or (seen.pointer, seen.ledger_text) != (pointer, _ledger_text(store, machine))
+        ):
+            return False
+        whole = {proposed / name: table for name, table in required.items()}
+        if active is not None:
+            whole[folder / version_name(active)] = active
+        files = store.file_hashes(machine)
+        return all(
+            _is_complete(path, files.get(table.id, []), _note(store, machine, table)) for path, table in whole.items()
+        )
+    except (InputError, OSError):  # publish says what is wrong
+        return False
+
+
+def _is_complete(folder: Path, files: Sequence[tuple[str, str, str]], note: bytes) -> bool:
+    """Whether the folder of a version holds its files (control, name, SHA-256) and the note ``version.json``."""
+    several = len({control for control, _, _ in files}) > 1
+    required = {f"{control}/{name}" if several else name: digest for control, name, digest in files}
+    paths = {folder / name: digest for name, digest in {**required, "version.json": sha256_of(note)}.items()}
+    return not folder.is_symlink() and all(
+        path.is_file() and not path.is_symlink() and sha256_of(path.read_bytes()) == digest
+        for path, digest in paths.items()
+    )
 
 
 def set_aside(folder: Path) -> Path | None:
@@ -148,6 +187,12 @@ def lineage(store: Store, machine: MachineRecord) -> list[str]:
         last = sha256_of(json.dumps([last, decision.kind, about]).encode())
         found.append(last)
     return found
+
+
+def _ledger_text(store: Store, machine: MachineRecord) -> str:
+    past = lineage(store, machine)
+    about = {"machine": machine.name, "decisions": len(past), "sha256": past[-1] if past else ""}
+    return json.dumps(about, indent=2) + "\n"
 
 
 def _look(folder: Path) -> _Seen:
@@ -288,8 +333,12 @@ def _contents(store: Store, machine: MachineRecord, table: TableRecord) -> dict[
     """Return the files of a version by name; with several controls each has its own sub-folder."""
     several = len(table.controllers) > 1
     files = {f"{f.controller}/{f.name}" if several else f.name: f.content for f in store.table_files(table)}
-    files["version.json"] = (json.dumps(_about(store, machine, table), indent=2) + "\n").encode()
+    files["version.json"] = _note(store, machine, table)
     return files
+
+
+def _note(store: Store, machine: MachineRecord, table: TableRecord) -> bytes:
+    return (json.dumps(_about(store, machine, table), indent=2) + "\n").encode()
 
 
 def _about(store: Store, machine: MachineRecord, table: TableRecord) -> dict[str, Any]:
@@ -348,13 +397,15 @@ def _point(folder: Path, active: TableRecord | None) -> None:
     _sync(folder)
 
 
+def _proposed(tables: Sequence[TableRecord]) -> dict[str, TableRecord]:
+    """Return the tables that the folder of proposals shows, by the names of their folders."""
+    closed = {table.id for table in [table for table in tables if table.state in HELD_BACK][:-KEPT]}
+    shown = [table for table in tables if table.state in PREFIX and table.id not in closed]
+    return {f"{PREFIX[table.state]}{version_name(table)}": table for table in shown}
+
+
 def _propose(store: Store, machine: MachineRecord, tables: Sequence[TableRecord], folder: Path) -> None:
-    closed = [table for table in tables if table.state in HELD_BACK][:-KEPT]
-    required = {
-        f"{PREFIX[table.state]}{version_name(table)}": table
-        for table in tables
-        if table.state in PREFIX and table not in closed
-    }
+    required = _proposed(tables)
     if not required and not folder.exists():
         return
     folder.mkdir(exist_ok=True)
@@ -400,15 +451,8 @@ MOST_SAID = 2000
 
 def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list[str]:
     """Tell what was not told yet, oldest first; return why it could not be told (empty: all was)."""
-    if not command:
-        return []
-
-    def told() -> set[str]:
-        return {event.subject for event in store.events(machine) if event.kind == NOTIFIED}
-
-    known, since = told(), (store.read(store.now) - OLDEST).isoformat()
-    for subject, message in _news(store, machine):
-        if subject in known or message["at"] < since or subject in told():  # another runner may tell it meanwhile
+    for subject, message in untold(store, machine) if command else ():
+        if subject in _told(store, machine):  # by another runner, meanwhile
             continue
         problem = _send(command, message)
         if problem:
@@ -416,6 +460,16 @@ def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list
             return [problem]
         store.add_event(NOTIFIED, subject, str(message["event"]), machine)
     return []
+
+
+def untold(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any]]]:
+    """Return what should be told and was not yet, oldest first."""
+    known, since = _told(store, machine), (store.now() - OLDEST).isoformat()
+    return [item for item in _news(store, machine) if item[0] not in known and item[1]["at"] >= since]
+
+
+def _told(store: Store, machine: MachineRecord) -> set[str]:
+    return {event.subject for event in store.events(machine) if event.kind == NOTIFIED}
 
 
 def _news(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any]]]:

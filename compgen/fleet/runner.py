@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import errno
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Container, Iterable, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -17,14 +17,14 @@ from typing import Any
 import sqlalchemy as sa
 
 from compgen.data.messages import visible
-from compgen.errors import CompgenError
+from compgen.errors import CompgenError, InputError
 from compgen.fleet import claims, inbox, logs
 from compgen.fleet.claims import ChangedMeanwhileError, Claim, ClaimLostError, keep_failure, keep_result
 from compgen.fleet.database import StoreError, plain, sqlite_path
 from compgen.fleet.job import Job, MachineJob
 from compgen.fleet.process import process, without_folder
-from compgen.fleet.publish import check_folder, notify, publish
-from compgen.fleet.records import HELD_BACK, OPEN, MachineRecord, MeasurementRecord, TableRecord
+from compgen.fleet.publish import check_folder, is_published, notify, publish, untold
+from compgen.fleet.records import HELD_BACK, OPEN, MachineRecord, MeasurementRecord, TableRecord, active_of
 from compgen.fleet.store import Clock, Store, open_store
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.kinematics.parallel import Packed, Processes, Stop, StoppedError, Workers, limited, spread, stopping
@@ -130,22 +130,25 @@ def run_jobs(
     """
     chosen = [job.machine(name) for name in names] if names else list(job.machines.values())
     chosen = inbox.with_twins(chosen, job.machines.values())
-    open_store(job.store).close()
-    work = partial(run_machine, url=job.store, clock=clock)
-    if mapper is map:
-        work = partial(work, stop=stop)
-    return RunOutcome(tuple(mapper(work, chosen)))
+    with closing(open_store(job.store, clock=clock)) as store:
+        if mapper is map:
+            return RunOutcome(tuple(_passed(lambda: nullcontext(store), item, stop) for item in chosen))
+    return RunOutcome(tuple(mapper(partial(run_machine, url=job.store, clock=clock), chosen)))
 
 
 def run_machine(
     job: MachineJob, url: str, stop: StopCheck = lambda: False, clock: Clock | None = None
 ) -> MachineOutcome:
     """Make one pass over one machine; whatever goes wrong is part of the outcome, nothing is raised."""
+    return _passed(lambda: closing(open_store(url, clock=clock)), job, stop)
+
+
+def _passed(opened: Callable[[], AbstractContextManager[Store]], job: MachineJob, stop: StopCheck) -> MachineOutcome:
     started = time.monotonic()
     if stop():
         return MachineOutcome(job.name, "stopped", ("not looked at: stopped",))
     try:
-        with closing(open_store(url, clock=clock)) as store, one_thread():
+        with opened() as store, one_thread():
             outcome = _Pass(store, job, store.add_machine(job.name), stop).run()
     except CompgenError as error:
         lost = isinstance(error, StoreError)
@@ -173,21 +176,51 @@ class _Pass:
         self.again = False
 
     def run(self) -> MachineOutcome:
-        """Take, process, publish, notify."""
+        """Take, process, publish, notify; as long as nothing is new the store is read at one moment and nothing is written."""
+        found, received = inbox.scan(self.job, self.store.now()), []
+        problems = [(problem.subject, problem.message) for problem in found.problems]
+        for group in found.groups:
+            try:
+                received.append(inbox.read_files(self.job, group))
+            except CompgenError as error:
+                place = str(getattr(error, "file", None) or group[0])
+                problems.append((place, str(getattr(error, "message", error))))
+        self.present = {inbox.digest_of(contents) for _, contents, _ in received}
+        unchanged = None if problems else self.store.together(self._unchanged)
+        if unchanged is not None:
+            return unchanged
         check_folder(self.store, self.machine, self.job.out)
         known = self.store.newest_entry(self.machine)
-        if known is not None and known > self.store.read(self.store.now):
+        if known is not None and known > self.store.now():
             behind = known.isoformat(timespec="seconds")
             text = f"the clock went backwards: the store holds an entry of {behind}"
             self._problem("clock", "clock", text, fail=False)
-        self._take()
+        for problem in problems:
+            self._problem("inbox", *problem)
+        for item in received:
+            self.store.add_measurement(self.machine, inbox.measurement_of(*item))
         settings = self.job.settings_sha256()  # a machine file that is missing ends here; what came in is kept
         self._process_all(settings)
         active = publish(self.store, self.machine, self.job.out)
-        problems = notify(self.store, self.machine, self.job.notify)
-        self.messages += problems
-        self.again = self.again or bool(problems)
+        failures = notify(self.store, self.machine, self.job.notify)
+        self.messages += failures
+        self.again = self.again or bool(failures)
         return self._outcome(active, settings)
+
+    def _unchanged(self) -> MachineOutcome | None:
+        """Return the outcome where nothing is to be done: all was taken, processed, published and told. Else None."""
+        store, machine = self.store, self.machine
+        newest = store.newest_entry(machine)
+        if self.present - {item.sha256 for item in store.measurements(machine)} or (newest and newest > store.now()):
+            return None
+        try:
+            settings = self.job.settings_sha256({item.settings_sha256 for item in store.attempts(machine)})
+        except InputError:
+            return None
+        told = not self.job.notify or not untold(store, machine)
+        if self._waiting(settings) or not told or not is_published(store, machine, self.job.out):
+            return None
+        return self._outcome(active_of(store.tables(machine, figures=False)), settings)
 
     def _problem(self, kind: str, subject: str, message: str, *, fail: bool = True) -> None:
         """Report something; it is kept in the store if it is news there."""
@@ -198,34 +231,16 @@ class _Pass:
         if self.store.add_event(kind, subject, message, self.machine):
             logs.warning(kind, machine=self.job.name, subject=subject, message=message)
 
-    def _take(self) -> None:
-        """Keep everything that is new in the inbox."""
-        found = inbox.scan(self.job, self.store.read(self.store.now))
-        for problem in found.problems:
-            self._problem("inbox", problem.subject, problem.message)
-        for group in found.groups:
-            try:
-                new = inbox.load(self.job, group)
-            except CompgenError as error:
-                place = str(getattr(error, "file", None) or group[0])
-                self._problem("inbox", place, str(getattr(error, "message", error)))
-                continue
-            self.store.add_measurement(self.machine, new)
-            self.present.add(new.sha256)
+    def _waiting(self, settings: str, seen: Container[int] = ()) -> list[MeasurementRecord]:
+        """Return what has no result yet in the order of measurement; what failed comes again only with other settings."""
+        attempts = [item for item in self.store.attempts(self.machine) if item.settings_sha256 == settings]
+        done = self.store.identified(self.machine) | {i.measurement_id for i in attempts if i.outcome == "failed"}
+        return [item for item in self.store.measurements(self.machine) if item.id not in done and item.id not in seen]
 
     def _process_all(self, settings: str) -> None:
-        """Process what has no result yet in the order of measurement; what failed comes again only with other settings.
-
-        Where another runner has a measurement, the later ones are left to it as well.
-        """
+        """Process what waits; where another runner has a measurement, the later ones are left to it as well."""
         seen: set[int] = set()
-        while True:
-            attempts = [item for item in self.store.attempts(self.machine) if item.settings_sha256 == settings]
-            failed = {item.measurement_id for item in attempts if item.outcome == "failed"}
-            passed_over = seen | failed | self.store.identified(self.machine)
-            waiting = [item for item in self.store.measurements(self.machine) if item.id not in passed_over]
-            if not waiting:
-                return
+        while waiting := self._waiting(settings, seen):
             for measurement in waiting:
                 if self.stop():
                     self.messages.append("stopped; the rest is processed by the next run")

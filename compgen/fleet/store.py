@@ -14,10 +14,11 @@ import zlib
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from contextvars import ContextVar
+from copy import copy
 from datetime import UTC, datetime
 from functools import wraps
 from pathlib import Path
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 import sqlalchemy as sa
 
@@ -44,8 +45,8 @@ from compgen.identify.covariance import Covariance, parse_covariance
 Result = TypeVar("Result")
 Arguments = ParamSpec("Arguments")
 Clock = Callable[[], datetime]
-#: The store whose reads go through one connection at the moment, and that connection.
-_together: ContextVar[tuple[Store, sa.Connection] | None] = ContextVar("compgen_store_together", default=None)
+#: The store whose reads go through one connection at the moment, that connection, and what was read by it.
+_together: ContextVar[tuple[Store, sa.Connection, dict[Any, Any]] | None] = ContextVar("compgen_store", default=None)
 
 #: Identifications, each with the time of its measurement.
 _IDENTIFICATIONS: sa.Select[Any] = sa.select(database.identifications, database.measurements.c.measured_at).join(
@@ -65,6 +66,26 @@ def at_one_moment(
     return wrapper
 
 
+def read_once(
+    function: Callable[Concatenate[Store, Arguments], Result],
+) -> Callable[Concatenate[Store, Arguments], Result]:
+    """As :func:`at_one_moment`, for a method with plain arguments: what is read twice at one moment is fetched once."""
+
+    @wraps(function)
+    def wrapper(store: Store, /, *args: Arguments.args, **options: Arguments.kwargs) -> Result:
+        def action() -> Result:
+            current = _together.get()
+            assert current is not None
+            key, known = (function, args, *sorted(options.items())), current[2]
+            if key not in known:
+                known[key] = function(store, *args, **options)
+            return copy(cast(Result, known[key]))
+
+        return store.together(action)
+
+    return wrapper
+
+
 class Store:
     """A store that is open; every method is one transaction. ``clock`` is for tests.
 
@@ -80,14 +101,16 @@ class Store:
         """Give the connections back."""
         self.engine.dispose()
 
-    def now(self, connection: sa.Connection) -> datetime:
+    def now(self, connection: sa.Connection | None = None) -> datetime:
         """Return the time by which leases count: that of the PostgreSQL server, or of this machine."""
         if self._clock is not None:
             return self._clock()
-        if connection.dialect.name == "postgresql":
-            found: datetime = connection.execute(sa.select(sa.func.clock_timestamp())).scalar_one()
-            return found.astimezone(UTC)
-        return datetime.now(UTC)
+        if self.engine.dialect.name != "postgresql":
+            return datetime.now(UTC)
+        if connection is None:
+            return self.read(self.now)
+        found: datetime = connection.execute(sa.select(sa.func.clock_timestamp())).scalar_one()
+        return found.astimezone(UTC)
 
     def read(self, action: Callable[[sa.Connection], Result]) -> Result:
         """Do ``action`` in a transaction that only reads; again while the store cannot be reached."""
@@ -119,7 +142,7 @@ class Store:
             if self.engine.dialect.name == "postgresql":
                 options["isolation_level"] = "REPEATABLE READ"
             with self.engine.connect().execution_options(**options) as connection:
-                token = _together.set((self, connection))
+                token = _together.set((self, connection, {}))
                 try:
                     return action()
                 finally:
@@ -207,7 +230,7 @@ class Store:
         """Return the machine's measurement with this hash, or None."""
         return next(iter(self.measurements(machine, sha256=sha256)), None)
 
-    @at_one_moment
+    @read_once
     def measurements(
         self, machine: MachineRecord | None = None, *, sha256: str | None = None
     ) -> list[MeasurementRecord]:
@@ -262,18 +285,19 @@ class Store:
             others.append((row.machine, said or f"measurement {row.id}, {row.name}"))
         return others
 
+    @read_once
     def identified(self, machine: MachineRecord) -> set[int]:
         """Return the ids of the machine's measurements that have a result."""
         table = database.identifications
         return {row[0] for row in self._rows(_where(sa.select(table.c.measurement_id), table, machine))}
 
+    @at_one_moment
     def newest_entry(self, machine: MachineRecord) -> datetime | None:
         """Return the time of the machine's last measurement received or decision, None if there is none."""
-        times = {"received_at": database.measurements, "at": database.decisions}
-        queries = [_where(sa.select(sa.func.max(table.c[name])), table, machine) for name, table in times.items()]
-        found = [row[0] for query in queries for row in self._rows(query)]
-        return max((time for time in found if time is not None), default=None)
+        times = [item.received_at for item in self.measurements(machine)]
+        return max(times + [item.at for item in self.decisions(machine)], default=None)
 
+    @read_once
     def attempts(self, machine: MachineRecord | None = None) -> list[AttemptRecord]:
         """Return all attempts to process measurements, oldest first."""
         query = sa.select(database.attempts).order_by(database.attempts.c.id)
@@ -307,7 +331,7 @@ class Store:
             return None
         return parse_covariance(self.blob(identification.covariance_sha256), Path("identified.covariance.npz"))
 
-    @at_one_moment
+    @read_once
     def tables(self, machine: MachineRecord | None = None, *, figures: bool = True) -> list[TableRecord]:
         """Return the sets of tables of a machine (or of all) by version, with their states.
 
@@ -329,6 +353,7 @@ class Store:
         """Return the files of a set of tables, byte for byte; StoreError if any is missing or damaged."""
         return self.read(lambda connection: files_of(connection, table.id))
 
+    @read_once
     def file_hashes(self, machine: MachineRecord) -> dict[int, list[tuple[str, str, str]]]:
         """Return control, name and SHA-256 of the files of every set of tables of a machine, by its id, in a fixed order."""
         files, tables = database.table_files, database.tables
@@ -339,6 +364,7 @@ class Store:
             found.setdefault(table_id, []).append((file[0], file[1], file[2]))
         return {table_id: sorted(listed) for table_id, listed in found.items()}
 
+    @read_once
     def decisions(self, machine: MachineRecord | None = None) -> list[DecisionRecord]:
         """Return all decisions in their order: who, what, when, why."""
         table = database.decisions
