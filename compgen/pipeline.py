@@ -404,7 +404,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         tables.usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
     measurement = open_measurement(measurements, instrument)
-    provenance = provenance_of(machine.source, *measurements, instrument)
+    provenance = provenance_of(machine.file, *measurements, instrument)
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):
         identification = identify_bare(machine, measurement, identify_options, active)

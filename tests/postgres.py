@@ -52,15 +52,19 @@ def _place():
 
 
 class Server:
-    """A running server; databases are made one after the other."""
+    """A running server; databases are made one after the other. ``network``: it also takes whoever comes from there."""
 
-    def __init__(self):
+    def __init__(self, network=""):
+        self.network = network
         self.programs, self.account, self.count = folder_of_programs(), _account(), 0
         self.folder = Path(tempfile.mkdtemp(prefix="compgen-pg-", dir=_place()))
         try:
             if self.account:
                 os.chown(self.folder, self.account["user"], self.account["group"])
             self._do("initdb", "--pgdata=data", "--username=tester", "--auth=trust", "--no-sync", "--encoding=UTF8")
+            if network:
+                with (self.folder / "data" / "pg_hba.conf").open("a") as rules:
+                    rules.write(f"host all all {network} trust\n")
             self.start()
         except BaseException:
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -76,7 +80,7 @@ class Server:
 
     def start(self):
         """Start the server and wait until it answers."""
-        own = ("listen_addresses=", f"unix_socket_directories={self.folder}")
+        own = (f"listen_addresses={'*' if self.network else ''}", f"unix_socket_directories={self.folder}")
         settings = [word for setting in (*FAST, *own) for word in ("-c", setting)]
         with (self.folder / "log").open("ab") as log:
             self.process = subprocess.Popen(

@@ -271,6 +271,12 @@ class Machine(Displayed):
     emphasis: Emphasis = Emphasis()
     effects: Mapping[str, toml_files.Section] = field(default_factory=dict)
     tool_range_mm: ToolRange | None = None
+    copy: Path | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def file(self) -> Path | None:
+        """Where the machine file can be read: ``source``, or the copy of it where that is on another computer."""
+        return self.copy or self.source
 
     @property
     def tool_range(self) -> ToolRange:

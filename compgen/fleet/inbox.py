@@ -6,7 +6,7 @@ import contextlib
 import csv
 import os
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
@@ -173,14 +173,19 @@ def with_twins(chosen: Iterable[MachineJob], every: Iterable[MachineJob]) -> lis
 def holds_one_of(other: OtherInbox, contents: Iterable[bytes]) -> bool:
     """Whether a file that fits, in another machine's inbox or a sub-folder, holds one of these contents, empty ones apart."""
     searched = {(len(content), sha256_of(content)) for content in contents if content}
-    sizes = {size for size, _ in searched}
+    held = found_in(other, {size for size, _ in searched}) if other.held is None else other.held
+    return not searched.isdisjoint(held)
+
+
+def found_in(other: OtherInbox, sizes: Container[int]) -> frozenset[tuple[int, str]]:
+    """Return size and SHA-256 of the files that fit, in another machine's inbox or a sub-folder, of some sizes."""
+    found = set()
     for path, size in _listed(other):
         if size in sizes:
             with contextlib.suppress(InputError):
                 content, _ = _read_regular(path, size, folder_is_real=path.parent != other.inbox)
-                if (len(content), sha256_of(content)) in searched:
-                    return True
-    return False
+                found.add((len(content), sha256_of(content)))
+    return frozenset(found)
 
 
 def _listed(box: OtherInbox) -> list[tuple[Path, int]]:

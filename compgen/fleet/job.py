@@ -226,11 +226,15 @@ class Policy:
 
 @dataclass(frozen=True)
 class OtherInbox:
-    """The inbox of another machine of the job file, for files that came for both."""
+    """The inbox of another machine of the job file, for files that came for both.
+
+    ``held`` are size and SHA-256 of what was found in it, for a process that does not see it; None: it is looked into.
+    """
 
     name: str
     inbox: Path
     patterns: tuple[str, ...]
+    held: frozenset[tuple[int, str]] | None = None
 
 
 @dataclass(frozen=True)
@@ -240,7 +244,9 @@ class MachineJob:
     ``measured_with`` says what was active while the machine was measured: the tables that were active then ("active")
     or none ("bare"); a measurement file may say otherwise for itself. ``tolerances`` are those of the drift, mm or rad,
     by error or "volume". ``others`` are the machines whose
-    inbox is the same, or holds a file of this one's as well (:func:`compgen.fleet.inbox.with_twins`).
+    inbox is the same, or holds a file of this one's as well (:func:`compgen.fleet.inbox.with_twins`). Where
+    the files that the settings name are copies (:class:`compgen.fleet.runner.Parcel`), ``settings`` is the hash of the
+    settings, and ``original`` the machine file.
     """
 
     name: str
@@ -263,12 +269,16 @@ class MachineJob:
     identify: Mapping[str, Any] = field(default_factory=dict)
     tolerances: Mapping[str, float] = field(default_factory=dict)
     others: tuple[OtherInbox, ...] = field(default=(), compare=False, repr=False)
+    settings: str = field(default="", compare=False, repr=False)
+    original: Path | None = field(default=None, compare=False, repr=False)
 
     def settings_sha256(self, known: Container[str] = ()) -> str:
         """Return the SHA-256 of everything but the measurement that a result depends on; InputError for a wrong machine.
 
         Where it is one of ``known``, something was processed with these settings, and the machine file is not checked.
         """
+        if self.settings:
+            return self.settings
         machine: Path | None = Path(self.machine)
         if not (known and Path(self.machine).is_file() and len(Path(self.machine).parts) > 1):
             machine = load_machine(self.machine).source

@@ -10,7 +10,7 @@ import re
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -460,7 +460,7 @@ NOT_OF_A_CONTROL = (
 LOOKED_BACK = 20
 #: How temporary folders begin; their names say nothing to a reader.
 FOLDER = "compgen-recal-"
-_TEMPORARY = re.compile(rf"\S*{FOLDER}[^/\\]+[/\\]measurement[/\\]")
+_TEMPORARY = re.compile(rf"\S*{FOLDER}[^/\\]+[/\\](?:measurement|settings)[/\\]")
 
 
 @dataclass(frozen=True)
@@ -490,12 +490,14 @@ def process(
     started = time.monotonic()
     settings = job.settings_sha256()
     machine = load_machine(job.machine)
+    if job.original is not None:  # as manifest and messages name it
+        machine = replace(machine, source=job.original, copy=machine.source)
     tables = store.tables(record)
     now = store.now()
     with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
-        paths = _write_files(Path(folder) / "measurement", store.contents_of(measurement))
+        paths = write_files(Path(folder) / "measurement", store.contents_of(measurement))
         past = Past(store.decisions(record), tables, store.measurements(record), store.events(record))
         measured = _active_then(job, measurement, past, said)
         was_active = None if measured is None else _tables_read(store, machine, measured, job.controllers[0])
@@ -545,7 +547,7 @@ def without_folder(message: str) -> str:
     return _TEMPORARY.sub("", message)
 
 
-def _write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
+def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
     """Write files into a temporary folder and return their paths."""
     paths = []
     for name, content in contents.items():
@@ -650,9 +652,9 @@ def _result(
     """Return the fields of a :class:`NewResult` that come from the chain."""
     judgement.figures["tables"] = {item.verification.controller: list(item.export.files) for item in outcome.results}
     covariance = folder / COVARIANCE
-    assert machine.source is not None
+    assert machine.file is not None
     return {
-        "machine_text": read_bytes(machine.source),
+        "machine_text": read_bytes(machine.file),
         "errors_text": read_bytes(folder / "identified.errors.csv"),
         "covariance": read_bytes(covariance) if covariance.is_file() else None,
         "fitted_text": read_bytes(folder / "fitted.errors.csv"),

@@ -7,27 +7,42 @@ process (:func:`run_jobs`), or in processes of this machine or on a cluster (:fu
 from __future__ import annotations
 
 import errno
+import sys
 import time
-from collections.abc import Callable, Container, Iterable, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 
+from compgen.data.files import FOLDERS, read_bytes, working_folder
+from compgen.data.machine import load_machine
 from compgen.data.messages import visible
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import claims, inbox, logs
 from compgen.fleet.claims import ChangedMeanwhileError, Claim, ClaimLostError, keep_failure, keep_result
 from compgen.fleet.database import StoreError, plain, sqlite_path
 from compgen.fleet.job import Job, MachineJob
-from compgen.fleet.process import process, without_folder
+from compgen.fleet.process import FOLDER, process, without_folder, write_files
 from compgen.fleet.publish import check_folder, is_published, notify, publish, untold
 from compgen.fleet.records import HELD_BACK, OPEN, MachineRecord, MeasurementRecord, TableRecord, active_of
 from compgen.fleet.store import Clock, Store, open_store
 from compgen.kinematics.kernel_switch import one_thread
-from compgen.kinematics.parallel import Packed, Processes, Stop, StoppedError, Workers, limited, spread, stopping
+from compgen.kinematics.parallel import (
+    ClusterError,
+    LostError,
+    Packed,
+    Processes,
+    Stop,
+    StoppedError,
+    Workers,
+    limited,
+    spread,
+    stopping,
+)
 from compgen.plugins import WithPlugins, with_plugins
 
 #: Causes that may pass by themselves, so that a measurement is tried again instead of being given up: a full disk or one
@@ -143,13 +158,20 @@ def run_machine(
     return _passed(lambda: closing(open_store(url, clock=clock)), job, stop)
 
 
-def _passed(opened: Callable[[], AbstractContextManager[Store]], job: MachineJob, stop: StopCheck) -> MachineOutcome:
+def _passed(
+    opened: Callable[[], AbstractContextManager[Store]],
+    job: MachineJob,
+    stop: StopCheck,
+    elsewhere: Callable[[MachineJob], MachineOutcome] | None = None,
+) -> MachineOutcome:
     started = time.monotonic()
     if stop():
         return MachineOutcome(job.name, "stopped", ("not looked at: stopped",))
     try:
-        with opened() as store, one_thread():
-            outcome = _Pass(store, job, store.add_machine(job.name), stop).run()
+        with opened() as store:
+            outcome = _Pass(store, job, store.add_machine(job.name), stop, elsewhere).run()
+    except (LostError, StoppedError, ClusterError):  # of workers elsewhere
+        raise
     except CompgenError as error:
         lost = isinstance(error, StoreError)
         outcome = MachineOutcome(job.name, "failed", (plain(str(error)),), again=passes(error), unreachable=lost)
@@ -164,10 +186,17 @@ def _passed(opened: Callable[[], AbstractContextManager[Store]], job: MachineJob
 
 
 class _Pass:
-    """One pass over one machine; collects messages as it goes."""
+    """One pass over one machine; collects messages as it goes. ``elsewhere`` processes in place of this process."""
 
-    def __init__(self, store: Store, job: MachineJob, machine: MachineRecord, stop: StopCheck) -> None:
-        self.store, self.job, self.machine, self.stop = store, job, machine, stop
+    def __init__(
+        self,
+        store: Store,
+        job: MachineJob,
+        machine: MachineRecord,
+        stop: StopCheck,
+        elsewhere: Callable[[MachineJob], MachineOutcome] | None = None,
+    ) -> None:
+        self.store, self.job, self.machine, self.stop, self.elsewhere = store, job, machine, stop, elsewhere
         self.messages: list[str] = []
         self.processed: list[str] = []
         self.present: set[str] = set()
@@ -200,7 +229,10 @@ class _Pass:
         for item in received:
             self.store.add_measurement(self.machine, inbox.measurement_of(*item))
         settings = self.job.settings_sha256()  # a machine file that is missing ends here; what came in is kept
-        self._process_all(settings)
+        if self.elsewhere is None:
+            self.process_all(settings)
+        elif self._waiting(settings):
+            self._add(self.elsewhere(replace(self.job, settings=settings)))
         active = publish(self.store, self.machine, self.job.out)
         failures = notify(self.store, self.machine, self.job.notify)
         self.messages += failures
@@ -237,17 +269,27 @@ class _Pass:
         done = self.store.identified(self.machine) | {i.measurement_id for i in attempts if i.outcome == "failed"}
         return [item for item in self.store.measurements(self.machine) if item.id not in done and item.id not in seen]
 
-    def _process_all(self, settings: str) -> None:
+    def process_all(self, settings: str) -> None:
         """Process what waits; where another runner has a measurement, the later ones are left to it as well."""
         seen: set[int] = set()
-        while waiting := self._waiting(settings, seen):
-            for measurement in waiting:
-                if self.stop():
-                    self.messages.append("stopped; the rest is processed by the next run")
-                    return
-                seen.add(measurement.id)
+        waiting = self._waiting(settings)
+        while waiting:
+            measurement = waiting[0]
+            if self.stop():
+                self.messages.append("stopped; the rest is processed by the next run")
+                break
+            seen.add(measurement.id)
+            with one_thread():  # the same bytes however many processors there are
                 if not self._process(measurement, settings):
-                    return
+                    break
+            waiting = waiting[1:] or self._waiting(settings, seen)
+
+    def _add(self, done: MachineOutcome) -> None:
+        """Take over what other workers say of the measurements that they processed."""
+        self.messages += done.messages
+        self.processed += done.processed
+        self.failed = self.failed or done.state == "failed"
+        self.internal, self.again = self.internal or done.internal, self.again or done.again
 
     def _process(self, measurement: MeasurementRecord, settings: str) -> bool:
         """Process one measurement; return whether the next one may follow."""
@@ -355,6 +397,83 @@ def pass_of(url: str) -> WithPlugins:
     return with_plugins(Pass(url, logs.form()))
 
 
+class Elsewhere:
+    """Workers that share nothing with this computer but the store: they process, everything else is done here.
+
+    Inboxes are read, tables published and decisions told by this process. A worker gets the settings of a machine with
+    the files that they name.
+    """
+
+    same_files = True
+
+    def __init__(self, workers: Workers, url: str) -> None:
+        self._workers, self._store, self.size = workers, open_store(url), workers.size
+        self._function = Packed(with_plugins(StoredPass(url, logs.form())))
+
+    def call(self, function: Packed, item: Packed, stop: Stop) -> MachineOutcome:
+        """Make the pass over a machine; ``function`` is that of workers with the same files."""
+
+        def elsewhere(job: MachineJob) -> MachineOutcome:
+            found: MachineOutcome = self._workers.call(self._function, Packed(Parcel.of(job)), stop)
+            return found
+
+        if stop():
+            raise StoppedError("not begun: stopped")
+        return _passed(lambda: nullcontext(self._store), item.value(), stop, elsewhere)
+
+    def close(self) -> None:
+        """Close the store; the workers go on."""
+        self._store.close()
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """The settings of a machine for a computer without its files: ``files`` are those that they name, by what they are."""
+
+    job: MachineJob
+    files: Mapping[str, Mapping[str, bytes]]
+
+    @classmethod
+    def of(cls, job: MachineJob) -> Parcel:
+        """Pack the machine file, the instrument file, the user's templates, and what lies in the inboxes of others."""
+        source, folder = load_machine(job.machine).source, job.templates
+        assert source is not None
+        files = {"machine": {source.name: read_bytes(source)}}
+        if job.instrument is not None:
+            files["instrument"] = {job.instrument.name: read_bytes(job.instrument)}
+        if folder is not None:
+            paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+            files["templates"] = {path.relative_to(folder).as_posix(): read_bytes(path) for path in paths}
+        every = range(sys.maxsize)
+        others = tuple(
+            replace(item, inbox=item.inbox.resolve(), held=inbox.found_in(item, every)) for item in job.others
+        )
+        return cls(replace(job, inbox=job.inbox.resolve(), others=others, original=source), files)
+
+    def unpacked(self, folder: Path) -> MachineJob:
+        """Write the files below a folder and return the settings that name them there."""
+        places: dict[str, Any] = {}
+        for kind, contents in self.files.items():
+            paths = write_files(folder / kind, contents)
+            places[kind] = folder / kind if kind == "templates" else paths[0]
+        return replace(self.job, **{**places, "machine": str(places["machine"])})
+
+
+@dataclass(frozen=True)
+class StoredPass(Pass):
+    """Processes what the store holds of a machine, and nothing else."""
+
+    def __call__(self, parcel: Parcel) -> MachineOutcome:  # type: ignore[override]
+        """Process what waits; the outcome says what came of that alone."""
+        logs.configure(self.log)
+        with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, closing(open_store(self.url)) as store:
+            job = parcel.unpacked(folder / "settings")
+            made = _Pass(store, job, store.machine(job.name), stopping)
+            made.process_all(job.settings)
+        state, said, done = "failed" if made.failed else "ok", tuple(made.messages), tuple(made.processed)
+        return MachineOutcome(job.name, state, said, done, internal=made.internal, again=made.again)
+
+
 def open_fleet(url: str, workers: int, cluster: str | None, *, copied: bool = False) -> Workers:
     """Return what works on the machines of the store ``url``: a cluster, or processes of this computer.
 
@@ -438,7 +557,9 @@ def run_with(fleet: Workers, job: Job, names: Sequence[str] = (), *, stop: Stop 
                 left = claims.unfinished(store)
                 names = {machine.name for machine in store.machines() if machine.id in left}
             ordered = sorted(jobs, key=lambda item: item.name in names)
-        found = {item.machine: item for item in spread(fleet, pass_of(job.store), ordered, lost=_lost, stop=stop)}
+        with ExitStack() as left:
+            made = fleet if fleet.same_files else left.enter_context(closing(Elsewhere(fleet, job.store)))
+            found = {item.machine: item for item in spread(made, pass_of(job.store), ordered, lost=_lost, stop=stop)}
         return [found[item.name] for item in jobs]
 
     return run_jobs(job, names, mapper=mapper)
@@ -456,9 +577,14 @@ def _lost(job: MachineJob, error: CompgenError) -> MachineOutcome:
 def work_of(fleet: Workers) -> Callable[[MachineJob, str, Stop], MachineOutcome]:
     """Return the work of a :class:`compgen.fleet.watch.Watch` whose passes are made by ``fleet``."""
 
+    @lru_cache(maxsize=1)
+    def workers(url: str) -> Workers:
+        return fleet if fleet.same_files else Elsewhere(fleet, url)
+
     def work(job: MachineJob, url: str, stop: Stop) -> MachineOutcome:
         try:
-            found: MachineOutcome = fleet.call(Packed(pass_of(url)), Packed(job), stop)
+            made = workers(url)
+            found: MachineOutcome = made.call(Packed(pass_of(url)), Packed(job), stop)
             return found
         except CompgenError as error:  # lost, stopped, or a worker that cannot be used
             return _lost(job, error)

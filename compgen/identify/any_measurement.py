@@ -215,8 +215,8 @@ def evidence_files(
 ) -> dict[str, str | bytes]:
     """Return ``machine.toml``, the machine file byte by byte, and ``residuals.csv``."""
     files: dict[str, str | bytes] = {"residuals.csv": format_residuals(machine, measurement, result)}
-    if machine.source is not None and machine.source.is_file():
-        files["machine.toml"] = machine.source.read_bytes()
+    if machine.file is not None and machine.file.is_file():
+        files["machine.toml"] = machine.file.read_bytes()
     return files
 
 

@@ -98,9 +98,13 @@ class Answer:
 
 
 class Workers(Protocol):
-    """Something that works on ``size`` items at a time; :meth:`call` may be called by as many threads."""
+    """Something that works on ``size`` items at a time; :meth:`call` may be called by as many threads.
+
+    ``same_files`` says whether it sees the files of this process by the same paths.
+    """
 
     size: int
+    same_files: bool
 
     def call(self, function: Packed, item: Packed, stop: Stop) -> Any:
         """Return ``function(item)``; LostError if the processes that worked on it ended, StoppedError if none did."""
@@ -228,6 +232,8 @@ class Processes:
         has no threads at work.
     died : told of each process that ended over an item: the item, its number, and whether :func:`limited` ended it.
     """
+
+    same_files = True
 
     def __init__(
         self, count: int, *, copied: bool = False, died: Callable[[Any, int, bool], None] = lambda *_: None
@@ -409,6 +415,8 @@ class Cluster:
     ClusterError
         if the scheduler does not answer within a few seconds, or the cluster cannot be used.
     """
+
+    same_files = False
 
     def __init__(self, address: str, *, same_host: str = "") -> None:
         if importlib.util.find_spec("distributed") is None:

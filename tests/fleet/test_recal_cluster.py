@@ -1,5 +1,6 @@
 """Many machines in processes or on a Dask cluster: the same bytes as one after another; killed, stopped, refused."""
 
+import importlib.util
 import json
 import os
 import shutil
@@ -36,6 +37,9 @@ from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.parallel import LostError, Packed, Processes, RemoteError, StoppedError, spread
 from compgen.kinematics.volume_grid import volume_grid
 
+_SPEC = importlib.util.spec_from_file_location("compgen_postgres", Path(__file__).resolve().parents[1] / "postgres.py")
+postgres = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(postgres)
 KILL = "__import__('os').kill(__import__('os').getpid(), 9)"
 #: An expression that kills its process the first time that it is evaluated, and is 7 the second time.
 ONCE = "7 if __import__('os').path.exists({0!r}) else open({0!r}, 'w').close() or " + KILL
@@ -131,7 +135,7 @@ def contents(folder):
 
 def rows_of(url):
     """All rows of the store in words: numbers of rows that it refers to are replaced by what stands there."""
-    engine = sa.create_engine(url)
+    engine = sa.create_engine(url.replace("postgresql://", "postgresql+psycopg://"))
     with engine.connect() as connection:
         tables = {table.name: connection.execute(sa.select(table)).mappings().all() for table in database.ALL}
     engine.dispose()
@@ -171,6 +175,113 @@ def made_by(folder, run):
     job = read_job(folder / "recal.toml")
     outcomes = [(item.machine, item.state, item.messages, item.processed) for item in run(job).outcomes]
     return outcomes, contents(folder), rows_of(job.store)
+
+
+# --- workers on other computers: a network and a file system of their own -------------------------------------------
+
+
+class Apart:
+    """Two workers, each in a network name space and with a /tmp of its own, and a scheduler and a store here."""
+
+    def __init__(self, folder):
+        number = os.getpid() % 200 + 20
+        self.network, self.host = f"10.{number}.0.0/16", f"10.{number}.1.1"
+        self.names = [f"compgen{os.getpid()}-{k}" for k in (1, 2)]
+        self.processes = []
+        try:
+            for k, name in enumerate(self.names, start=1):
+                here, inside, net = f"cg{number}h{k}", f"cg{number}w{k}", f"10.{number}.{k}"
+                self.do("ip", "netns", "add", name)
+                self.do("ip", "link", "add", here, "type", "veth", "peer", "name", inside, "netns", name)
+                self.do("ip", "addr", "add", f"{net}.1/24", "dev", here)
+                self.do("ip", "link", "set", here, "up")
+                self.do("ip", "-n", name, "addr", "add", f"{net}.2/24", "dev", inside)
+                for device in (inside, "lo"):
+                    self.do("ip", "-n", name, "link", "set", device, "up")
+                self.do("ip", "-n", name, "route", "add", "default", "via", f"{net}.1")
+            self.do("unshare", "--mount", "true")
+            self.server = postgres.Server(self.network)
+            self.processes.append(self.started([sys.executable, "-c", SCHEDULE.format(self.host)], folder))
+            self.address = self.processes[0].stdout.readline().strip()
+            for name in self.names:
+                worker = f"{sys.executable} -m distributed.cli.dask_worker {self.address} --nthreads 1 --no-dashboard"
+                alone = f"mount -t tmpfs none /dev/shm && mount -t tmpfs none /tmp && cd /tmp && exec {worker}"
+                command = ["ip", "netns", "exec", name, "unshare", "--mount", "sh", "-c", alone]
+                self.processes.append(self.started(command, "/"))
+        except BaseException:
+            self.close()
+            raise
+
+    def do(self, *words):
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        if done.returncode:
+            self.close()
+            pytest.skip(f"network name spaces are not permitted here: {' '.join(words)}: {done.stderr.strip()}")
+
+    def started(self, command, folder):
+        options = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+        return subprocess.Popen(command, cwd=folder, **options)
+
+    def close(self):
+        for process in reversed(self.processes):
+            process.terminate()
+            process.wait(PATIENCE_S)
+            process.stdout.close()
+        if hasattr(self, "server"):
+            self.server.close()
+        for name in self.names:
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+#: A scheduler that workers of other computers reach, until it is ended.
+SCHEDULE = """
+import asyncio
+from distributed import Scheduler
+
+async def serve():
+    async with Scheduler(host="{}", port=0, dashboard=False) as made:
+        print(made.address, flush=True)
+        await made.finished()
+
+asyncio.run(serve())
+"""
+
+
+@pytest.fixture
+def apart(tmp_path_factory):
+    pytest.importorskip("distributed")
+    if os.name != "posix" or os.getuid() != 0 or not shutil.which("ip") or not shutil.which("unshare"):
+        pytest.skip("network name spaces need root, ip and unshare")
+    if postgres.folder_of_programs() is None:
+        pytest.skip("PostgreSQL (initdb, postgres) is not installed")
+    with closing(Apart(tmp_path_factory.mktemp("apart"))) as made:
+        yield made
+
+
+def test_workers_that_share_nothing_but_the_store_give_the_same_bytes(factory, apart):
+    """Neither inbox nor machine file nor output folder can be seen by a worker."""
+    plain = (factory / "recal.toml").read_text()
+
+    def made_on(workers):
+        name = apart.server.database().partition("?")[0].rpartition("/")[2]
+        (factory / "recal.toml").write_text(f'store = "postgresql://tester@{apart.host}/{name}"\n{plain}')
+        return made_by(factory, workers)
+
+    with closing(cluster.Cluster(apart.address)) as there:
+        until = time.monotonic() + PATIENCE_S
+        while len(seen := there._client.run(os.path.exists, str(factory / "recal.toml"))) < 2:
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        assert list(seen.values()) == [False, False]
+        local = made_on(run_jobs)
+        assert [item[1] for item in local[0]] == ["ok", "ok", "ok", "failed"]
+        assert made_on(lambda job: fleet.run_with(there, job)) == local
+        again = fleet.run_with(there, read_job(factory / "recal.toml"))
+        assert [item.processed for item in again.outcomes] == [()] * 4
+        shutil.copy(factory / "inbox" / "a" / "1.deviations.csv", factory / "inbox" / "b" / "9.deviations.csv")
+        local = made_on(lambda job: run_jobs(job, ["a"]))
+        assert "the same file also came for b (its inbox)" in local[0][0][2][0]
+        assert made_on(lambda job: fleet.run_with(there, job, ["a"])) == local
 
 
 # --- the same results ----------------------------------------------------------------------------------------------
