@@ -81,17 +81,11 @@ def job_option(command: Command) -> Command:
         logs.configure(log)  # type: ignore[arg-type]
         return command(*args, job=read_job(job_file), **options)
 
-    return _job_options(wrapper)  # type: ignore[no-any-return]
-
-
-def _job_options(command: Any) -> Any:
     form = click.Choice(["auto", "json", "text"])
     text = "Form of the logs on stderr; auto: words on a terminal, else one JSON object per line."
-    logged = click.option("--log", default="auto", show_default=True, type=form, help=text)(command)
-    file = click.option(
-        "--job", "job_file", default=JOB, show_default=True, type=PATH, metavar="FILE", help="Job file."
-    )
-    return file(logged)
+    logged: Any = click.option("--log", default="auto", show_default=True, type=form, help=text)(wrapper)
+    file: Any = {"default": JOB, "show_default": True, "type": PATH, "metavar": "FILE", "help": "Job file."}
+    return click.option("--job", "job_file", **file)(logged)  # type: ignore[no-any-return]
 
 
 notify_option = click.option(
@@ -194,21 +188,14 @@ def watch_command(
         left.callback(fleet.close)
         options: dict[str, Any] = {"work": work_of(fleet), "threads": fleet.size}
         if metrics_port is not None:
-            options["on_outcome"] = _counted(job, metrics_port, left)
+            from compgen.fleet.dashboard.metrics import WatchMetrics, start_metrics
+            from compgen.fleet.store import open_store
+
+            metrics = WatchMetrics(left.enter_context(contextlib.closing(open_store(job.store))))
+            left.callback(start_metrics(metrics.text, metrics_port)[1])
+            options["on_outcome"] = metrics.count
         Watch(job.path, poll_s=poll_s, notify=_words(command), **options).run()
     return 0
-
-
-def _counted(job: Job, port: int, left: contextlib.ExitStack) -> Callable[[Any], None]:
-    """Show metrics until ``left`` is; return what counts an outcome."""
-    from compgen.fleet.dashboard.metrics import WatchMetrics, start_metrics
-    from compgen.fleet.store import open_store
-
-    store = open_store(job.store)
-    left.callback(store.close)
-    metrics = WatchMetrics(store)
-    left.callback(start_metrics(metrics.text, port)[1])
-    return metrics.count
 
 
 @recal_command.command("status")
@@ -812,7 +799,14 @@ def serve_command(
     except ImportError as error:
         raise _missing(error) from error
     url = _store_url(store, job)
-    token = None if metrics_token_file is None else _token(metrics_token_file)
+    token = None
+    if metrics_token_file is not None:
+        try:
+            token = metrics_token_file.read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"cannot be read: {error}", file=metrics_token_file) from error
+        if len(token) < 16 or not token.isascii():
+            raise InputError("expected a token of at least 16 ASCII characters", file=metrics_token_file)
     file = users if users is not None else default_users(url)
     logs.configure(log)  # type: ignore[arg-type]  # one of the choices
     run(DashboardSettings(url, host, port, names, decide, private, behind_tls, file, job, token))
@@ -835,16 +829,6 @@ def _store_url(store: str | None, job: Path | None) -> str:
             f"{shown(given)} is not the store of {job}, which is {shown(url)}; leave --store out", field="--store"
         )
     return url
-
-
-def _token(path: Path) -> str:
-    try:
-        token = path.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot be read: {error}", file=path) from error
-    if len(token) < 16 or not token.isascii():
-        raise InputError("expected a token of at least 16 ASCII characters", file=path)
-    return token
 
 
 def _users(users: Path | None, store: str | None) -> Users:

@@ -400,17 +400,13 @@ def _gauge_projector(machine: Machine, error: Sequence[str], position_mm: FloatA
     index = [ERROR_INDEX[name] for name in error]
     shapes = directions[:, index, 0] + directions[:, index, 1] * np.nan_to_num(position_mm)
     gauge = shapes.T  # (k, directions)
-    weight = np.array([_weight(name, counts[name]) for name in error])
+    # every curve counts alike however many nodes it has, an angle by its lever, a squareness not at all
+    reach = {name: 1.0 if error_named(name).kind == "linear" else LEVER_MM for name in counts}
+    part = {name: reach[name] / float(np.sqrt(count)) for name, count in counts.items()}
+    weight = np.array([0.0 if name in SQUARENESS_NAMES else part[name] for name in error])
     gauge = gauge / np.maximum(np.linalg.norm(weight[:, None] * gauge, axis=0), 1e-300)
     amounts = np.linalg.pinv(weight[:, None] * gauge, rcond=1e-10) * weight
     return np.asarray(np.eye(len(error)) - gauge @ amounts)
-
-
-def _weight(name: str, count: int) -> float:
-    kind = error_named(name).kind
-    if kind == "squareness":
-        return 0.0
-    return (1.0 if kind == "linear" else LEVER_MM) / float(np.sqrt(count))
 
 
 def _figures(

@@ -108,7 +108,11 @@ def take(
         last = _last(connection, measurement.id)
         identified = sa.select(results.c.id).where(results.c.measurement_id == measurement.id)
         done = not again and connection.execute(identified).first() is not None
-        if done or (last is not None and last.owner != owner and _counts(last, now)):
+        counts = last is not None and last.owner != owner and last.kind != "release"
+        if last is not None and counts and _alive(str(last.owner)) is not False:
+            # until its time is over; a clock that went back prolongs it at most by its own length
+            done = done or bool(now < last.until and last.at - now < last.until - last.at)
+        if done:
             return None
         return _add(connection, measurement.id, 1 if last is None else last.sequence + 1, "take", owner, now, lease_s)
 
@@ -226,13 +230,6 @@ def _last(connection: sa.Connection, measurement_id: int) -> sa.Row[tuple[object
     return connection.execute(query.order_by(table.c.sequence.desc()).limit(1)).first()
 
 
-def _counts(last: sa.Row[tuple[object, ...]], now: datetime) -> bool:
-    """Whether the last claim of a chain still counts; a clock that went back prolongs it at most by its own length."""
-    if last.kind == "release" or _alive(str(last.owner)) is False:
-        return False
-    return bool(now < last.until and last.at - now < last.until - last.at)
-
-
 def _alive(owner: str) -> bool | None:
     """Whether the process runs; None if it belongs to another host or this system cannot tell."""
     host, space, pid, start = owner.rsplit("/", 3)
@@ -310,25 +307,21 @@ def keep_result(
     try:
         table_id = store.write(action)
     except ClaimLostError:
-        stored = _stored_result(store, claim, new.revision)
+        # the store may have kept the result and gone away before it said so
+        kept, tried = database.identifications, database.attempts
+        query = (
+            sa.select(database.tables.c.id)
+            .join(kept, kept.c.id == database.tables.c.identification_id)
+            .join(tried, tried.c.measurement_id == kept.c.measurement_id)
+            .where(kept.c.measurement_id == claim.measurement_id, kept.c.revision == new.revision)
+            .where(tried.c.outcome == "done", tried.c.owner == claim.owner)
+        )
+        stored = store.read(lambda connection: connection.execute(query).scalar())
         if stored is None:
             raise
         table_id = stored
     forget(store, claim)
     return next(table for table in store.tables(machine) if table.id == table_id)
-
-
-def _stored_result(store: Store, claim: Claim, revision: int) -> int | None:
-    """Return the tables that this claim led to: the store may have kept a result and gone away before it said so."""
-    kept, tried = database.identifications, database.attempts
-    query = (
-        sa.select(database.tables.c.id)
-        .join(kept, kept.c.id == database.tables.c.identification_id)
-        .join(tried, tried.c.measurement_id == kept.c.measurement_id)
-        .where(kept.c.measurement_id == claim.measurement_id, kept.c.revision == revision)
-        .where(tried.c.outcome == "done", tried.c.owner == claim.owner)
-    )
-    return store.read(lambda connection: connection.execute(query).scalar())
 
 
 def _decide(store: Store, connection: sa.Connection, machine: MachineRecord, table_id: int, new: NewResult) -> None:
@@ -351,10 +344,15 @@ def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, cla
     machine_sha, errors_sha, covariance_sha, fitted_sha = (
         next(digests) if part is not None else None for part in parts
     )
+    files = database.machine_versions
+    same = sa.select(files.c.id).where(files.c.machine_id == machine.id, files.c.sha256 == machine_sha)
+    machine_version_id = connection.execute(same).scalar()
+    if machine_version_id is None:
+        machine_version_id = _added(connection, files, {"machine_id": machine.id, "sha256": machine_sha, "at": now})
     identification = {
         "machine_id": machine.id,
         "measurement_id": claim.measurement_id,
-        "machine_version_id": _machine_version(connection, machine, str(machine_sha), now),
+        "machine_version_id": machine_version_id,
         "active_table_id": new.active_table_id,
         "errors_sha256": errors_sha,
         "covariance_sha256": covariance_sha,
@@ -384,14 +382,6 @@ def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, cla
     attempt = {"outcome": "done", "message": "", "settings_sha256": new.settings_sha256, "seconds": new.seconds}
     _add_attempt(store, connection, machine, claim, attempt)
     return table_id
-
-
-def _machine_version(connection: sa.Connection, machine: MachineRecord, sha256: str, now: datetime) -> int:
-    table = database.machine_versions
-    query = sa.select(table.c.id).where(table.c.machine_id == machine.id, table.c.sha256 == sha256)
-    known = connection.execute(query).scalar()
-    new = {"machine_id": machine.id, "sha256": sha256, "at": now}
-    return _added(connection, table, new) if known is None else int(known)
 
 
 def keep_failure(

@@ -256,6 +256,10 @@ REACHABLE = {
 UPGRADE_LOCK = 7305211
 
 
+#: What waiting does not help with: a wrong name or password, a full disk, a damaged file.
+LASTING = ("authentication", "does not exist", "no such table", "no such column", "disk is full", "readonly")
+
+
 class StoreError(CompgenError):
     """The store cannot be reached, or is not one; nothing was changed."""
 
@@ -364,7 +368,8 @@ def retried(action: Callable[[], Result], url: str, wait: Callable[[float], None
             raise StoreError(f"the store {shown(url)} is damaged: {error}; restore a backup") from error
         except (sa.exc.DBAPIError, sa.exc.TimeoutError) as error:
             waited = time.monotonic() - started >= BUSY_S
-            if pause is None or waited or not _may_pass(error):
+            may_pass = isinstance(error, sa.exc.OperationalError | sa.exc.InterfaceError)
+            if pause is None or waited or not may_pass or any(word in str(error).lower() for word in LASTING):
                 raise StoreError(f"the store {shown(url)} cannot be used: {first_line(error)}") from error
             wait(pause)
     raise AssertionError("unreachable")
@@ -374,15 +379,6 @@ def first_line(error: Exception) -> str:
     """Return what the database says, without the statement."""
     lines = str(getattr(error, "orig", error)).strip().splitlines()
     return lines[0] if lines else type(error).__name__
-
-
-def _may_pass(error: sa.exc.SQLAlchemyError) -> bool:
-    """Whether waiting may help: not for a wrong name, password, a full disk or a damaged file."""
-    if not isinstance(error, sa.exc.OperationalError | sa.exc.InterfaceError):
-        return False
-    text = str(error).lower()
-    lasting = ("authentication", "does not exist", "no such table", "no such column", "disk is full", "readonly")
-    return not any(word in text for word in lasting)
 
 
 def upgrade(engine: sa.Engine) -> int:
@@ -400,7 +396,13 @@ def upgrade(engine: sa.Engine) -> int:
         if connection.dialect.name == "postgresql":
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(UPGRADE_LOCK)))
         if _revision(connection) != HEAD:
-            _migrate(connection)
+            from alembic import command  # late: only a store that is new or old needs it
+            from alembic.config import Config
+
+            config = Config()
+            config.set_main_option("script_location", str(Path(__file__).with_name("migrations")))
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
         number = _number(connection)
         if number is None:
             number = 1 + secrets.randbelow(2**31 - 1)
@@ -426,16 +428,6 @@ def _revision(connection: sa.Connection) -> str | None:
             f"the store has schema {found}, which only unreleased versions of compgen wrote; begin a new one"
         )
     return None if found is None else str(found)
-
-
-def _migrate(connection: sa.Connection) -> None:
-    from alembic import command  # late: only a store that is new or old needs it
-    from alembic.config import Config
-
-    config = Config()
-    config.set_main_option("script_location", str(Path(__file__).with_name("migrations")))
-    config.attributes["connection"] = connection
-    command.upgrade(config, "head")
 
 
 def put_blobs(connection: sa.Connection, contents: Iterable[bytes]) -> list[str]:

@@ -217,8 +217,16 @@ def _opened_folder(folder: Path, *, real: bool) -> Iterator[int | None]:
 def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime) -> NewMeasurement:
     """Return a measurement from the contents of its files."""
     comments: dict[str, str] = {}
-    for content in contents.values():
-        comments = {**_comments(content), **comments}
+    for (
+        content
+    ) in contents.values():  # the comments `# key = value` that count, cut at a sensible length; the first file wins
+        said: dict[str, str] = {}
+        for line in content.splitlines():
+            key, equals, value = line.strip().partition(b"=")
+            field = key[1:].strip().decode("utf-8", "replace") if key.startswith(b"#") else ""
+            if equals and field in (*TIME_KEYS, ACTIVE_KEY):
+                said[field] = value.decode("utf-8", "replace").strip()[:LONGEST_COMMENT]
+        comments = {**said, **comments}
     times = [found for key in TIME_KEYS if (found := _time(comments.get(key, ""))) is not None]
     temperatures: dict[str, dict[str, float]] = {}
     for content in contents.values():
@@ -232,17 +240,6 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
         active_table=comments.get(ACTIVE_KEY) or None,
         temperatures_c=temperatures,
     )
-
-
-def _comments(content: bytes) -> dict[str, str]:
-    """Return the comments ``# key = value`` of a file that this module looks at, cut at a sensible length."""
-    found = {}
-    for line in content.splitlines():
-        key, equals, value = line.strip().partition(b"=")
-        name = key[1:].strip().decode("utf-8", "replace") if key.startswith(b"#") else ""
-        if equals and name in (*TIME_KEYS, ACTIVE_KEY):
-            found[name] = value.decode("utf-8", "replace").strip()[:LONGEST_COMMENT]
-    return found
 
 
 def _time(text: str) -> tuple[datetime, str] | None:

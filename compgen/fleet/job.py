@@ -436,10 +436,13 @@ def _options(keys: _Keys, folder: Path, name: str) -> dict[str, Any]:
     policy = keys.section("policy")
     options["policy"] = Policy(**policy.fields(Policy))
     policy.finish()
-    return options | {
-        "identify": _identify(keys.section("identify")),
-        "tolerances": _tolerances(keys.section("tolerances")),
-    }
+    tolerances = keys.section("tolerances")
+    units = {f"{name}_{error_named(name).unit}": (name, error_named(name).si_per_unit) for name in ERROR_NAMES}
+    units["volume_um"] = ("volume", MM_PER_UM)
+    given = {key: tolerances.take(key, toml_files.positive, None) for key in units}
+    tolerances.finish()
+    limits = {units[key][0]: size * units[key][1] for key, size in given.items() if size is not None}
+    return options | {"identify": _identify(keys.section("identify")), "tolerances": limits}
 
 
 def _schedule(keys: _Keys) -> Schedule | None:
@@ -460,14 +463,6 @@ def _identify(keys: _Keys) -> dict[str, Any]:
     found["small_deviations"] = keys.take("small_deviations", toml_files.flag, False) or None  # so that the hash stays
     keys.finish()
     return {name: value for name, value in found.items() if value is not None}
-
-
-def _tolerances(keys: _Keys) -> dict[str, float]:
-    units = {f"{name}_{error_named(name).unit}": (name, error_named(name).si_per_unit) for name in ERROR_NAMES}
-    units["volume_um"] = ("volume", MM_PER_UM)
-    given = {units[key][0]: (keys.take(key, toml_files.positive, None), units[key][1]) for key in units}
-    keys.finish()
-    return {name: size * unit for name, (size, unit) in given.items() if size is not None}
 
 
 # --- what is made from a job ---------------------------------------------------------------------------------------

@@ -517,7 +517,12 @@ def process(
             limits=SafetyLimits(job.policy.max_step_um),
             allow_misfit=True,  # a misfit that refuses the tables of `run` holds them back here: judge_misfit
         )
-        active = _active_now(store, machine, tables)
+        on = active_of(tables)
+        active = None
+        if on is not None:
+            read = {control: _tables_read(store, machine, on, control) for control in on.controllers}
+            known = {control: found for control, found in read.items() if found is not None}
+            active = ActiveState(on.version, known, store.identification(on.identification_id))
         judgement = _judged(store, job, machine, measurement, (outcome, active, now))
         judge_order(judgement, store, measurement, tables)
         taken = None if measured is None else measured.version
@@ -539,7 +544,7 @@ def process(
         settings_sha256=settings,
         seconds=time.monotonic() - started,
     )
-    return Processed(kept, None if (current := active_of(tables)) is None else current.id)
+    return Processed(kept, None if on is None else on.id)
 
 
 def without_folder(message: str) -> str:
@@ -588,15 +593,6 @@ def _tables_read(store: Store, machine: Machine, table: TableRecord, control: st
     names = table.summary.get("tables", {}).get(control, [])
     files = {file.name: file.content for file in store.table_files(table) if file.controller == control}
     return parse_tables(machine, {name: files[name] for name in names}, control) if names else None
-
-
-def _active_now(store: Store, machine: Machine, tables: Sequence[TableRecord]) -> ActiveState | None:
-    table = active_of(tables)
-    if table is None:
-        return None
-    read = {control: _tables_read(store, machine, table, control) for control in table.controllers}
-    known = {control: tables for control, tables in read.items() if tables is not None}
-    return ActiveState(table.version, known, store.identification(table.identification_id))
 
 
 # --- judgement -----------------------------------------------------------------------------------------------------

@@ -228,8 +228,13 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
     unknown = [name for name in seen.versions if name not in known]
     if unknown:
         raise InputError(f"holds {', '.join(unknown)}, which this store never made active; {then}", file=folder)
-    ledger = _read_ledger(seen.ledger_text)
-    if ledger is None:  # of an older program: by the contents
+    try:
+        ledger = json.loads(seen.ledger_text or "")
+    except ValueError:
+        ledger = None
+    kinds = {"machine": str, "decisions": int, "sha256": str}
+    if not isinstance(ledger, dict) or not all(isinstance(ledger.get(key), kind) for key, kind in kinds.items()):
+        # missing, damaged or of an older program: by the contents
         for name in seen.versions:
             if _is_of_others(folder / name, _about(store, machine, known[name])):
                 raise InputError(
@@ -251,17 +256,6 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
         )
     if count and history[count - 1] != ledger["sha256"]:
         raise InputError(f"follows other decisions and tables than those of this store; {then}", file=folder)
-
-
-def _read_ledger(text: str | None) -> dict[str, Any] | None:
-    """Return what the ledger says, None for one that is missing or damaged."""
-    try:
-        found = json.loads(text or "")
-    except ValueError:
-        return None
-    kinds = {"machine": str, "decisions": int, "sha256": str}
-    whole = isinstance(found, dict) and all(isinstance(found.get(key), kind) for key, kind in kinds.items())
-    return found if whole else None
 
 
 def _is_of_others(folder: Path, about: Mapping[str, Any]) -> bool:
@@ -505,7 +499,11 @@ def _send(command: Sequence[str], message: dict[str, Any]) -> str:
     and dropped but for the beginning of stderr, and a command that takes too long is ended with its children.
     """
     try:
-        process = _started(command, (json.dumps(message) + "\n").encode())
+        with tempfile.TemporaryFile() as stream:  # it may read as slowly as it likes, or not at all
+            stream.write((json.dumps(message) + "\n").encode())
+            stream.seek(0)
+            pipes: Any = {"stdin": stream, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+            process = subprocess.Popen(list(command), **pipes, start_new_session=True)
     except (OSError, ValueError) as error:
         return f"{command[0]}: {error}"
     said = _Said(process.stderr)
@@ -514,30 +512,15 @@ def _send(command: Sequence[str], message: dict[str, Any]) -> str:
     except subprocess.TimeoutExpired:
         return f"{command[0]} did not end within {TIMEOUT_S:g} s and was stopped"
     finally:
-        _end(process)
+        if process.poll() is None:  # with its children
+            with contextlib.suppress(OSError):
+                if os.name == "posix":
+                    os.killpg(process.pid, signal.SIGKILL)
+                else:
+                    process.kill()
+            process.wait()
         text = said.text()
     return "" if code == 0 else f"{command[0]} ended with {code}: {text}"
-
-
-def _started(command: Sequence[str], given: bytes) -> subprocess.Popen[bytes]:
-    """Start the command with ``given`` on stdin, from a file: it may read as slowly as it likes, or not at all."""
-    with tempfile.TemporaryFile() as stream:
-        stream.write(given)
-        stream.seek(0)
-        return subprocess.Popen(
-            list(command), stdin=stream, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
-        )
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a command that still runs, with its children."""
-    if process.poll() is None:
-        with contextlib.suppress(OSError):
-            if os.name == "posix":
-                os.killpg(process.pid, signal.SIGKILL)
-            else:
-                process.kill()
-        process.wait()
 
 
 class _Said:

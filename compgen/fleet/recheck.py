@@ -127,7 +127,11 @@ def shortest_recheck(
         found = information(chosen)
         return found > 0.0 and power_of(request.size, found**-0.5, request.confidence) >= request.power
 
-    chosen = _pruned(_greedy(len(candidates), information, reached, request), reached)
+    chosen = _greedy(len(candidates), information, reached, request)
+    for k in reversed(chosen.copy()):  # points without which the power is still reached, the latest first
+        fewer = [each for each in chosen if each != k]
+        if fewer and reached(fewer):
+            chosen = fewer
     u = information(chosen) ** -0.5
     return Recheck(
         request=request,
@@ -227,16 +231,6 @@ def _greedy(
         rest = [k for k in range(count) if k not in chosen]
         chosen.append(max(rest, key=lambda k: information([*chosen, k])))
     return chosen
-
-
-def _pruned(chosen: Sequence[int], reached: Callable[[Sequence[int]], bool]) -> list[int]:
-    """Drop points without which the power is still reached, the earliest added last."""
-    kept = list(chosen)
-    for k in reversed(list(chosen)):
-        fewer = [each for each in kept if each != k]
-        if fewer and reached(fewer):
-            kept = fewer
-    return kept
 
 
 def format_recheck_points(recheck: Recheck) -> str:

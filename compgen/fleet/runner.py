@@ -232,7 +232,11 @@ class _Pass:
         if self.elsewhere is None:
             self.process_all(settings)
         elif self._waiting(settings):
-            self._add(self.elsewhere(replace(self.job, settings=settings)))
+            done = self.elsewhere(replace(self.job, settings=settings))
+            self.messages += done.messages
+            self.processed += done.processed
+            self.failed = self.failed or done.state == "failed"
+            self.internal, self.again = self.internal or done.internal, self.again or done.again
         active = publish(self.store, self.machine, self.job.out)
         failures = notify(self.store, self.machine, self.job.notify)
         self.messages += failures
@@ -283,13 +287,6 @@ class _Pass:
                 if not self._process(measurement, settings):
                     break
             waiting = waiting[1:] or self._waiting(settings, seen)
-
-    def _add(self, done: MachineOutcome) -> None:
-        """Take over what other workers say of the measurements that they processed."""
-        self.messages += done.messages
-        self.processed += done.processed
-        self.failed = self.failed or done.state == "failed"
-        self.internal, self.again = self.internal or done.internal, self.again or done.again
 
     def _process(self, measurement: MeasurementRecord, settings: str) -> bool:
         """Process one measurement; return whether the next one may follow."""
@@ -426,7 +423,7 @@ class Elsewhere:
         self._store.close()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Parcel:
     """The settings of a machine for a computer without its files: ``files`` are those that they name, by what they are."""
 
@@ -459,7 +456,7 @@ class Parcel:
         return replace(self.job, **{**places, "machine": str(places["machine"])})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StoredPass(Pass):
     """Processes what the store holds of a machine, and nothing else."""
 
@@ -557,8 +554,8 @@ def run_with(fleet: Workers, job: Job, names: Sequence[str] = (), *, stop: Stop 
                 left = claims.unfinished(store)
                 names = {machine.name for machine in store.machines() if machine.id in left}
             ordered = sorted(jobs, key=lambda item: item.name in names)
-        with ExitStack() as left:
-            made = fleet if fleet.same_files else left.enter_context(closing(Elsewhere(fleet, job.store)))
+        with ExitStack() as opened:
+            made = fleet if fleet.same_files else opened.enter_context(closing(Elsewhere(fleet, job.store)))
             found = {item.machine: item for item in spread(made, pass_of(job.store), ordered, lost=_lost, stop=stop)}
         return [found[item.name] for item in jobs]
 

@@ -278,7 +278,11 @@ def _queries() -> dict[str, sa.Select[Any]]:
     machines, measured, attempts = database.machines, database.measurements, database.attempts
     last = sa.select(sa.func.max(attempts.c.id)).group_by(attempts.c.machine_id)
     time = sa.func.max(measured.c.measured_at, type_=database.UtcTime()).label("last")
-    state = _last_decisions().subquery()
+    tables, decisions = database.tables, database.decisions
+    # machine, version and kind of the last decision about each set of tables
+    said = _newest_decisions(decisions.c.table_id.is_not(None), [decisions.c.machine_id, decisions.c.table_id])
+    about = sa.select(tables.c.machine_id, tables.c.version, decisions.c.kind)
+    state = about.select_from(said.join(tables, tables.c.id == decisions.c.table_id)).subquery()
     top = sa.select(database.tables.c.machine_id, sa.func.max(database.tables.c.version).label("version"))
     newest = top.group_by(database.tables.c.machine_id).subquery()
     is_newest = sa.and_(newest.c.machine_id == state.c.machine_id, newest.c.version == state.c.version)
@@ -304,14 +308,6 @@ def _newest_decisions(which: sa.ColumnElement[bool], by: Sequence[sa.Column[int]
     found = last.where(which).group_by(*by).subquery()
     same = sa.and_(decisions.c.machine_id == found.c.machine_id, decisions.c.sequence == found.c.sequence)
     return found.join(decisions, same)
-
-
-def _last_decisions() -> sa.Select[Any]:
-    """Machine, version and kind of the last decision about each set of tables."""
-    tables, decisions = database.tables, database.decisions
-    newest = _newest_decisions(decisions.c.table_id.is_not(None), [decisions.c.machine_id, decisions.c.table_id])
-    query = sa.select(tables.c.machine_id, tables.c.version, decisions.c.kind)
-    return query.select_from(newest.join(tables, tables.c.id == decisions.c.table_id))
 
 
 def _active(newest: sa.Subquery) -> sa.Select[Any]:

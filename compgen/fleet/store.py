@@ -587,7 +587,12 @@ def backup(url: str, path: Path) -> dict[str, int]:
         with closing(open_store(url)) as source, closing(open_store(f"sqlite:///{temporary}")) as target:
             counts = _copy(source, target)
             retried(lambda: _end_log(target), target.url)
-        _publish(temporary, path)
+        try:  # never over another file that came meanwhile, where the file system can promise that
+            os.link(temporary, path)
+        except OSError as error:
+            if error.errno not in NO_LINKS or path.exists():
+                raise
+            temporary.rename(path)
         return counts
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror or error}", file=path) from error
@@ -601,16 +606,6 @@ def _end_log(store: Store) -> None:
     with store.engine.connect() as connection:
         connection.exec_driver_sql("COMMIT")
         connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
-
-
-def _publish(temporary: Path, path: Path) -> None:
-    """Give the file its name; never over another one that came meanwhile, where the file system can promise that."""
-    try:
-        os.link(temporary, path)
-    except OSError as error:
-        if error.errno not in NO_LINKS or path.exists():
-            raise
-        temporary.rename(path)
 
 
 def restore(path: Path, url: str) -> dict[str, int]:

@@ -26,6 +26,7 @@ from compgen.data.machine import read_machine
 from compgen.errors import CompgenWarning, InputError
 from compgen.fleet import database
 from compgen.fleet import runner as fleet
+from compgen.fleet.database import StoreError
 from compgen.fleet.job import read_job
 from compgen.fleet.runner import run_jobs
 from compgen.fleet.store import open_store
@@ -568,12 +569,18 @@ def test_a_password_stands_in_no_log_no_key_and_no_text(factory, there, capfd, m
         client, "submit", lambda *args, **options: keys.append(options["key"]) or real(*args, **options)
     )
     outcome = fleet.work_of(there)(job, url, lambda: False)
-    broken = real(cluster.perform_there, None, Packed(fleet.pass_of(url)), Packed(job))
+    there_too = there.call(Packed(fleet.pass_of(url)), Packed(job), lambda: False)
+    with pytest.raises(StoreError) as away:
+        there.call(Packed(fleet.StoredPass(url, "json")), Packed(fleet.Parcel.of(job)), lambda: False)
+    broken = real(cluster.perform_there, None, Packed(fleet.StoredPass(url, "json")), Packed(fleet.Parcel.of(job)))
     assert isinstance(broken.exception(), AttributeError)  # Dask shows the arguments of such a task
     logs = str(client.get_worker_logs()) + str(client.get_scheduler_logs())
     assert outcome.state == "failed" and "ada:***@127.0.0.1" in outcome.messages[0]
     assert "Compute Failed" in logs
-    assert keys and "hush" not in logs + "".join(capfd.readouterr()) + "".join(keys) + str(outcome)
+    assert there_too.state == "failed" and "ada:***@127.0.0.1" in there_too.messages[0]
+    assert "ada:***@127.0.0.1" in str(away.value)
+    seen = "".join(capfd.readouterr()) + str(outcome) + str(there_too) + repr(fleet.StoredPass(url, "json"))
+    assert len(keys) == 2 and "hush" not in logs + seen + "".join(keys)
 
 
 def test_workers_and_cluster_together_are_wrong_usage(factory, capsys):

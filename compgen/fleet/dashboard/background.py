@@ -31,7 +31,6 @@ from compgen.fleet.job import Job, read_job
 from compgen.fleet.recheck import Recheck, RequestedChange, shortest_recheck
 from compgen.fleet.records import IdentificationRecord, MachineRecord
 from compgen.fleet.store import Store, counting
-from compgen.fleet.trend import DriftStep
 from compgen.plan import PlannedStations
 
 #: Results that stay in memory, and questions that may wait for their turn.
@@ -322,18 +321,17 @@ def trend_rows(drift: Drift) -> Sequence[TrendRow]:
             expanded=COVERAGE * u * month,
             adjusted=item.adjusted,
             per_kelvin=None if kelvin is None else (kelvin[0] * scale, COVERAGE * kelvin[1] * scale),
-            steps=[_step_words(step, scale, drift.times) for step in item.trend.steps],
+            steps=[
+                f"{step.size * scale:+.2f} before {drift.times[step.after][:10]} "
+                f"(p {'< 0.001' if step.p_value < 1e-3 else f'{step.p_value:.3f}'})"
+                for step in item.trend.steps
+            ],
             tolerance=None if item.tolerance is None else item.tolerance * scale,
             forecast="" if item.forecast is None else item.forecast.words(item.figure.name),
             significant=item.p_value < level,
         )
         found.append(row)
     return found
-
-
-def _step_words(step: DriftStep, scale: float, times: Sequence[str]) -> str:
-    chance = "< 0.001" if step.p_value < 1e-3 else f"{step.p_value:.3f}"
-    return f"{step.size * scale:+.2f} before {times[step.after][:10]} (p {chance})"
 
 
 def drift_charts(drift: Drift) -> Sequence[Chart]:

@@ -86,7 +86,10 @@ def make_server(settings: DashboardSettings) -> Any:
 def run(settings: DashboardSettings) -> None:
     """Serve until SIGTERM or SIGINT; requests that are being answered are finished."""
     server = make_server(settings)
-    _log_server()
+    logger = logging.getLogger("waitress")
+    logger.setLevel(logging.WARNING)
+    logger.propagate = False
+    logger.handlers = [_Logged()]
     signal.signal(signal.SIGTERM, _stop)
     host, port = getattr(server, "effective_listen", [(None, None)])[0]  # the first of several
     host, port = (server.effective_host, server.effective_port) if host is None else (host, port)
@@ -105,13 +108,6 @@ class _Logged(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Log one message."""
         logs.warning("server", problem=record.getMessage())
-
-
-def _log_server() -> None:
-    logger = logging.getLogger("waitress")
-    logger.setLevel(logging.WARNING)
-    logger.propagate = False
-    logger.handlers = [_Logged()]
 
 
 def _stop(_number: int, _frame: FrameType | None) -> None:
