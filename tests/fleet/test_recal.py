@@ -515,7 +515,7 @@ def test_a_folder_that_becomes_a_link_between_listing_and_reading_is_not_followe
     shutil.rmtree(nested)
     nested.symlink_to(elsewhere)
     with pytest.raises(compgen.InputError, match="it is a link"):
-        inbox.load(plant.job().machine("mill"), group)
+        inbox.read_files(plant.job().machine("mill"), group)
 
 
 def test_the_size_of_all_files_of_a_measurement_is_limited_before_they_are_read(plant):
