@@ -273,7 +273,7 @@ def export(
     described = _described(files)
     violations = control.violations(tables)
     preflight = render(card, "preflight.md.j2", {**common, **own, "files": described}, templates)
-    source = machine.source if machine.source and machine.source.is_file() else None
+    copy = machine.file if machine.file and machine.file.is_file() else None
     manifest = {
         "program": f"compgen {common['version']}",
         "controller": controller,
@@ -288,7 +288,7 @@ def export(
             "reference_point_mm": list(machine.reference_point_mm),
             **machine.emphasis.summary(),
             "file": str(machine.source) if machine.source else None,
-            "sha256": sha256_of(source.read_bytes()) if source else None,
+            "sha256": sha256_of(copy.read_bytes()) if copy else None,
         },
         "inputs": [{"name": name, "sha256": digest} for name, digest in common["input_hashes"].items()],
         "errors_sha256": common["errors_sha256"],
