@@ -7,7 +7,7 @@ while it is read. Units that a file does not state are weighed by the data (:fun
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -47,6 +47,13 @@ SUFFIXES = {
     "capture": ".capture.csv",
 }
 Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture
+_WRITERS: dict[type, Callable[[Any], str]] = {
+    AxisRuns: format_axis_runs,
+    Lengths: format_lengths,
+    Deviations: format_deviations,
+    ErrorTable: format_errors,
+    Capture: format_capture,
+}
 
 
 @dataclass(frozen=True)
@@ -176,7 +183,7 @@ class Imported:
 
     def files(self) -> dict[str, str]:
         """Return the texts of the contract files by name."""
-        found = {self.file_name: _text_of(self.data)}
+        found = {self.file_name: _WRITERS[type(self.data)](self.data)}
         if self.reversal is not None:
             found[f"{self.path.stem}.reversal.csv"] = format_reversal(self.reversal)
         if self.beside is not None:
@@ -193,18 +200,6 @@ class Imported:
             "doubts": list(self.doubts),
             "notes": list(self.notes),
         }
-
-
-def _text_of(data: Data) -> str:
-    if isinstance(data, AxisRuns):
-        return format_axis_runs(data)
-    if isinstance(data, Lengths):
-        return format_lengths(data)
-    if isinstance(data, Deviations):
-        return format_deviations(data)
-    if isinstance(data, Capture):
-        return format_capture(data)
-    return format_errors(data)
 
 
 # Unit and sign as hypotheses that the data speak for or against.

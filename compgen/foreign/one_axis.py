@@ -139,6 +139,24 @@ def cycles(direction: IntArray, one_way: IntArray) -> IntArray:
     return result
 
 
+def earlier_rows(keys: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return for each row the first one with the same key, and how often it came so far (1: the first time), (rows,)."""
+    rows = (
+        np.ascontiguousarray(keys)
+        .view([("", keys.dtype)] * keys.shape[1])
+        .ravel()
+        .view(f"V{keys.itemsize * keys.shape[1]}")
+    )
+    _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
+    order = np.argsort(inverse.ravel(), kind="stable")
+    group = inverse.ravel()[order]
+    starts = np.flatnonzero(np.concatenate([[True], group[1:] != group[:-1]]))
+    position_in_group = np.arange(len(group)) - np.repeat(starts, np.diff([*starts, len(group)]))
+    count = np.empty(len(group), dtype=np.int64)
+    count[order] = position_in_group + 1
+    return first[inverse.ravel()].astype(np.int64), count
+
+
 def check_error(error: str, axis: str | None, *, angular: bool) -> str:
     """Return the error that the user named; InputError if it is none of this axis or has another unit."""
     if error not in CURVE_NAMES:

@@ -29,7 +29,7 @@ from compgen.foreign.column_names import (
 )
 from compgen.foreign.covariates import RowData, directions_of, labels_of, row_data_of
 from compgen.foreign.findings import USUAL_URAD, TableFindings, slope_of, usual_deviation_mm
-from compgen.foreign.one_axis import IntArray, OneAxis, axis_in, cycles, motion, remarks
+from compgen.foreign.one_axis import IntArray, OneAxis, axis_in, cycles, earlier_rows, motion, remarks
 from compgen.foreign.source import parse_number, shown
 from compgen.identify.single_axes import SAME_TARGET_MM
 
@@ -412,7 +412,9 @@ def _directions(
             "were swapped: confirm with --directions motion, or keep them with --directions labels"
         )
     findings.understood.setdefault("directions_from", "the labels" if chosen != "motion" else "the order of the rows")
-    return label, run if run.any() else cycles(label, _repeats(target, label))
+    return label, run if run.any() else cycles(
+        label, earlier_rows(np.column_stack([np.round(target / SAME_TARGET_MM) + 0.0, label]))[1]
+    )
 
 
 def _alternate(target: FloatArray, run: IntArray, value: FloatArray) -> bool:
@@ -443,17 +445,6 @@ def _sweeps(target: FloatArray, run: IntArray | None = None) -> IntArray:
         seen.add(key)
         last = own
         result.append(number)
-    return np.array(result, dtype=np.int64)
-
-
-def _repeats(target: FloatArray, label: IntArray) -> IntArray:
-    """How often the same target with the same label came before, plus one."""
-    keys = zip(np.round(target / SAME_TARGET_MM).astype(np.int64).tolist(), label.tolist(), strict=True)
-    count: dict[tuple[int, int], int] = {}
-    result = []
-    for key in keys:
-        count[key] = count.get(key, 0) + 1
-        result.append(count[key])
     return np.array(result, dtype=np.int64)
 
 

@@ -44,7 +44,7 @@ from compgen.foreign.findings import (
     slope_of,
     usual_deviation_mm,
 )
-from compgen.foreign.one_axis import OneAxis, check_error, errors_of
+from compgen.foreign.one_axis import OneAxis, check_error, earlier_rows, errors_of
 from compgen.foreign.source import parse_number, shown
 from compgen.foreign.table_axis import axis_readings
 from compgen.identify.single_axes import POSITIONING, two_way_mean
@@ -319,7 +319,7 @@ def _numbered(
     InputError
         if three or more rows repeat earlier ones, and each of them to the last digit: they were pasted twice.
     """
-    first, count = _earlier(_keys(names, position, row_data))
+    first, count = earlier_rows(_keys(names, position, row_data))
     again = np.flatnonzero(count > 1)
     if not again.size:
         return row_data.labels
@@ -341,24 +341,6 @@ def _keys(names: Sequence[Sequence[str]], position: FloatArray, row_data: RowDat
     times = [row_data.covariates[key] for key in ("time_s", "approach") if key in row_data.covariates]
     vectors = [part for part in (position, row_data.tool_mm, row_data.approach) if part is not None]
     return np.column_stack([*numbered, *times, *row_data.labels.values(), *vectors]) + 0.0
-
-
-def _earlier(keys: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return for each row the first one with the same key, and how often it came so far (1: the first time), (rows,)."""
-    rows = (
-        np.ascontiguousarray(keys)
-        .view([("", keys.dtype)] * keys.shape[1])
-        .ravel()
-        .view(f"V{keys.itemsize * keys.shape[1]}")
-    )
-    _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
-    order = np.argsort(inverse.ravel(), kind="stable")
-    group = inverse.ravel()[order]
-    starts = np.flatnonzero(np.concatenate([[True], group[1:] != group[:-1]]))
-    position_in_group = np.arange(len(group)) - np.repeat(starts, np.diff([*starts, len(group)]))
-    count = np.empty(len(group), dtype=np.int64)
-    count[order] = position_in_group + 1
-    return first[inverse.ravel()].astype(np.int64), count
 
 
 def deviations_of(findings: TableFindings) -> Deviations:

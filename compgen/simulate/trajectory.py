@@ -268,15 +268,14 @@ def _times(moves: FloatArray, trajectory: Trajectory) -> FloatArray:
 LEAD_IN = 0.05
 
 
-def _conditions(value: Any) -> tuple[float, ...]:
-    items = tuple(toml_files.not_negative(item) for item in toml_files.numbers(value))
-    if not items or len(set(items)) != len(items):
-        raise ValueError("a list of different numbers that are not negative is expected")
-    return items
+def _different(check: Callable[[Any], float]) -> Callable[[Any], tuple[float, ...]]:
+    def conditions(value: Any) -> tuple[float, ...]:
+        items = tuple(toml_files.not_negative(item) for item in toml_files.numbers(value))
+        if not items or len(set(items)) != len(items):
+            raise ValueError("a list of different numbers that are not negative is expected")
+        return tuple(check(item) for item in items)
 
-
-def _feeds(value: Any) -> tuple[float, ...]:
-    return tuple(toml_files.positive(item) for item in _conditions(value))
+    return conditions
 
 
 @dataclass(frozen=True)
@@ -292,8 +291,8 @@ class Session:
     """
 
     repeats: int = setting(toml_files.whole(1, 1000), 1)
-    loads_kg: tuple[float, ...] = setting(_conditions, ())
-    feeds_mm_min: tuple[float, ...] = setting(_feeds, ())
+    loads_kg: tuple[float, ...] = setting(_different(toml_files.not_negative), ())
+    feeds_mm_min: tuple[float, ...] = setting(_different(toml_files.positive), ())
     shuffled: bool = setting(toml_files.word_for({"as-listed": False, "random": True}), False, key="order")
     jitter: float = setting(toml_files.share(0.5, "the line's length"), 0.0)
 
