@@ -100,12 +100,12 @@ def term_over(nodes, start):
 
 def test_a_start_goes_straight_on_at_a_node_far_beyond_the_travel_only():
     """Far: less than half of the interval lies within the travel; its value lies on the line of the next two nodes."""
-    nodes, start = [0.0, 100.0, 200.0, 300.0], [5.0, 1.0, 3.0, 9.0]
-    # travel from 80 to 210: 20 of the first 100 mm and 10 of the last 100 mm lie within
-    assert continued(term_over(nodes, start), (80.0, 210.0)).start == pytest.approx([-1.0, 1.0, 3.0, 5.0])
+    nodes, start = [0.0, 100.0, 200.0, 300.0, 400.0], [5.0, 1.0, 3.0, 9.0, 2.0]
+    # travel from 80 to 310: 20 of the first 100 mm and 10 of the last 100 mm lie within
+    assert continued(term_over(nodes, start), (80.0, 310.0)).start == pytest.approx([-1.0, 1.0, 3.0, 9.0, 15.0])
     # 50 mm are half of it: both ends stay
-    assert continued(term_over(nodes, start), (50.0, 250.0)).start == pytest.approx(start)
-    assert continued(term_over(nodes, start), (50.0, 249.0)).start == pytest.approx([5.0, 1.0, 3.0, 5.0])
+    assert continued(term_over(nodes, start), (50.0, 350.0)).start == pytest.approx(start)
+    assert continued(term_over(nodes, start), (50.0, 349.0)).start == pytest.approx([5.0, 1.0, 3.0, 9.0, 15.0])
     # uneven nodes: the slope is that of the inner interval
     uneven = continued(term_over([0.0, 100.0, 150.0, 200.0], [0.0, 1.0, 2.0, 2.0]), (90.0, 200.0))
     assert uneven.start == pytest.approx([-1.0, 1.0, 2.0, 2.0])

@@ -88,3 +88,9 @@ def test_the_limit_at_a_point_by_hand(sign, miss_um, bent_um, u_um, resolution_u
     found = point_reasons(position, correction, best, bent_um * UM, np.full(3, u_um * UM), resolution_um * UM)
     due = f"correction Y at X 10 Y 11 Z 12 mm: {10.0 + sign * miss_um:+.2f} um in the table, +10.00 um needed"
     assert found == ([due] if named else [])
+
+
+def test_a_correction_that_rounds_to_zero_is_shown_without_a_minus_sign():
+    best, correction = np.full((1, 3), -0.001 * UM), np.full((1, 3), 5.0 * UM)
+    (x, *_) = point_reasons(np.zeros((1, 3)), correction, best, 0.0, np.zeros(3), 0.0)
+    assert x.endswith("+5.00 um in the table, +0.00 um needed")
