@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import fdtrc, ndtri
 
 from compgen.data.csv_files import FloatArray
 from compgen.diagnose.base_fit import BaseFit, legendre
@@ -107,16 +108,13 @@ def evidence_of(design: Design, chosen: Chosen, noise: Noise, ratio: float, layo
 
 def _lack_of_fit(left: float, freedom: int, noise: Noise) -> float:
     """Deviate of the F-test of what the set leaves, against the pure error of the repeats."""
-    from scipy.stats import f as f_distribution
-    from scipy.stats import norm
-
     if noise.freedom <= 0 or freedom <= noise.freedom:
         return float("nan")
     ratio = (left - noise.quadratic) / (freedom - noise.freedom) / (noise.quadratic / noise.freedom)
     if ratio <= 0:
         return -10.0
-    p = float(f_distribution.sf(ratio, freedom - noise.freedom, noise.freedom))
-    return float(norm.isf(p)) if p > 0 else 40.0
+    p = float(fdtrc(freedom - noise.freedom, noise.freedom, ratio))
+    return float(-ndtri(p)) if p > 0 else 40.0
 
 
 def _directed(design: Design, chosen: Chosen) -> tuple[Remaining, ...]:
@@ -170,8 +168,6 @@ def homogeneity(design: Design, chosen: Chosen, member: int, layout: Measurement
     Its contribution is multiplied by stations, quarters of the time, load, directions and position; a true effect
     leaves nothing for these products to explain, a wrong name that takes up part of something else does.
     """
-    from scipy.stats import f as f_distribution
-
     effect = design.groups[member].effect
     assert effect is not None
     shape = contribution(design, chosen, member)[2]
@@ -200,7 +196,7 @@ def homogeneity(design: Design, chosen: Chosen, member: int, layout: Measurement
     k = extra.shape[1]
     freedom = max(design.freedom - basis.shape[1] - k, 1)
     left = float(residual @ residual) - gained
-    return float(f_distribution.sf(gained / k / max(left / freedom, 1e-300), k, freedom)), gained
+    return float(fdtrc(k, freedom, gained / k / max(left / freedom, 1e-300))), gained
 
 
 # The diagnosis of one measurement up to the chosen set: base fit, noise, groups, search, evidence.

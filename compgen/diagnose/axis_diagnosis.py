@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, fdtrc, stdtr
 
 from compgen.accuracy import positioning_test, run_statistics
 from compgen.data.axis_runs import AxisRuns
@@ -505,7 +505,7 @@ def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffec
     window = np.arange(item.first, item.last + 1) if lost else np.zeros(0, dtype=np.int64)
     return AxisEffect(
         item.name, "tentative" if reasons else "confirmed", _text(session, item, parameters, alias), parameters, alias,
-        float(gains[member]), float(stats.chi2.sf(gains[member], item.columns.shape[1])), tuple(reasons), shift, window,
+        float(gains[member]), float(chdtrc(item.columns.shape[1], gains[member])), tuple(reasons), shift, window,
         False, item.effect, own, p,
     )  # fmt: skip
 
@@ -540,7 +540,7 @@ def _uneven(changes: _Changes, member: int, shift: FloatArray) -> tuple[float, f
     wald = float(value @ np.linalg.pinv(covariance, rcond=1e-8, hermitian=True) @ value) / count
     own = (extra - columns @ np.linalg.lstsq(columns, extra, rcond=None)[0]) @ value
     share = float(np.sum((own - own.mean()) ** 2) / max(np.sum((shift - shift.mean()) ** 2), 1e-18))
-    return float(stats.f.sf(wald, count, changes.freedom - count)), share
+    return float(fdtrc(count, changes.freedom - count, wald)), share
 
 
 def _fading(session: AxisSession, item: Candidate) -> list[FloatArray]:
@@ -665,7 +665,7 @@ class _Reversal:
         return value, np.asarray(covariance), float(left @ inverse @ left)
 
     def _p(self, chi2: float, count: int) -> float:
-        return float(stats.f.sf(chi2 / count, count, self.freedom)) if count > 0 else 1.0
+        return float(fdtrc(count, self.freedom, chi2 / count)) if count > 0 else 1.0
 
     def found(self, only: Sequence[str], add: Sequence[str], source: str) -> tuple[list[AxisEffect], list[AxisUnknown]]:
         """Backlash and lost motion, and a reversal that follows no law."""
@@ -712,7 +712,7 @@ class _Reversal:
         """Whether there is a backlash: a mean reversal that is not that of one which begins at zero at an end."""
         if irregular:  # then the scatter from target to target is the noise of the mean
             spread = self.half.std(ddof=1) / np.sqrt(len(self.half))
-            p = 2.0 * float(stats.t.sf(abs(self.half.mean()) / max(spread, 1e-12), len(self.half) - 1))
+            p = 2.0 * float(stdtr(len(self.half) - 1, -abs(self.half.mean()) / max(spread, 1e-12)))
             if p > 0.02:
                 return False
         if not varies:
@@ -766,7 +766,7 @@ class _Reversal:
         nothing = np.zeros(0, dtype=np.int64)
         return AxisEffect(
             name, "tentative" if reasons else "confirmed", text, parameters, ((name, 1.0),), gain,
-            float(stats.chi2.sf(gain, 1)), reasons, shift, nothing, True, catalogue()[name], values,
+            float(chdtrc(1, gain)), reasons, shift, nothing, True, catalogue()[name], values,
         )  # fmt: skip
 
 
@@ -886,7 +886,7 @@ def _compared(changes: _Changes, errors: ErrorTable) -> dict[str, Any]:
     middle = np.eye(len(curve)) - 1.0 / len(curve)
     difference = middle @ difference
     chi2 = float(difference @ np.linalg.pinv(middle @ covariance @ middle, rcond=1e-8, hermitian=True) @ difference)
-    p = float(stats.chi2.sf(chi2, len(curve) - 1))
+    p = float(chdtrc(len(curve) - 1, chi2))
     largest = float(difference[np.argmax(np.abs(difference))])
     entry = {"error": name, "largest": largest / MM_PER_UM, "unit": "um", "chi2": chi2}
     return {"rms_um": float(np.sqrt(np.mean(difference**2))) / MM_PER_UM, "changes": [entry] if p < 1e-3 else []}

@@ -251,10 +251,11 @@ def least_norm(design: FloatArray, target: FloatArray) -> FloatArray:
     """Least-squares solution with scaled columns; directions without information get zero."""
     scale = np.linalg.norm(design, axis=0)
     scale[scale == 0.0] = 1.0
-    q, r = np.linalg.qr(design / scale)
-    u, singular, vt = np.linalg.svd(r, full_matrices=False)
+    count = design.shape[1]
+    both = np.linalg.qr(np.column_stack([design / scale, target]), mode="r")  # the last column is Q' target
+    u, singular, vt = np.linalg.svd(both[:count, :count], full_matrices=False)
     kept = singular > LEAST_SINGULAR * singular[0]
-    return np.asarray((vt[kept].T @ ((u[:, kept].T @ (q.T @ target)) / singular[kept])) / scale)
+    return np.asarray((vt[kept].T @ ((u[:, kept].T @ both[:count, count]) / singular[kept])) / scale)
 
 
 def fit_base(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
@@ -251,13 +252,12 @@ def gross_readings(analysis: Analysis) -> IntArray:
 
 def _apart(layout: MeasurementLayout, left: FloatArray) -> FloatArray:
     """Distance from the median of the neighbours in time at the same channel, in standard deviations, (n,)."""
-    from scipy.ndimage import median_filter  # imported here: slow to load
-
     apart = np.zeros_like(left)
     for channel in np.unique(layout.channel):
         rows = np.flatnonzero(layout.channel == channel)
         rows = rows[np.argsort(layout.stop[rows], kind="stable")]
-        apart[rows] = left[rows] - median_filter(left[rows], NEIGHBOURS, mode="nearest")
+        around = sliding_window_view(np.pad(left[rows], NEIGHBOURS // 2, mode="edge"), NEIGHBOURS)
+        apart[rows] = left[rows] - np.median(around, axis=1)
     moved = np.abs(apart[apart != 0.0])
     if len(moved) < NEIGHBOURS * NEIGHBOURS:
         return np.zeros(len(left))

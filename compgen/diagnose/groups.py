@@ -466,12 +466,13 @@ def fit_smooth(observed: Observed) -> BaseFit:
 def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
     """Return for every axis the wider basis with the largest evidence, if one explains more than chance: a first look."""
     found: list[Wider] = []
+    base = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))[0]
     for axis in range(3 if fit.basis.errors else 0):
         best, least = None, -np.inf
         for basis in wider_bases(fit.basis, axis, fit.observed.poses.position_mm, len(fit.observed)):
             # Derivative of the readings by the curves of a wider basis, at the present fit.
             columns = error_columns(fit.observed, basis, _extended(fit, basis))
-            gain, added = _gain(fit, columns)
+            gain, added = _gain(fit, base, columns)
             evidence = gain - added * (1.0 + np.log(max(gain / max(added, 1), 1.0)))
             if added and gain > added + CHANCE * np.sqrt(2.0 * added) and evidence > least:
                 best, least = (basis, columns), evidence
@@ -488,12 +489,14 @@ def widened(fit: BaseFit, taken: Sequence[Wider]) -> BaseFit:
     return fit_base(fit.observed, basis, start=_extended(fit, basis))
 
 
-def _gain(fit: BaseFit, extra: FloatArray) -> tuple[float, int]:
-    """chi-square that columns gain in addition to the base model, in its residual variance, and how many are new."""
+def _gain(fit: BaseFit, base: FloatArray, extra: FloatArray) -> tuple[float, int]:
+    """chi-square that columns gain in addition to the base model, in its residual variance, and how many are new.
+
+    ``base`` is an orthonormal basis of its Jacobian.
+    """
     extra = extra / np.maximum(np.linalg.norm(extra, axis=0), 1e-300)
-    q = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))[0]
-    left = extra - q @ (q.T @ extra)
-    left -= q @ (q.T @ left)
+    left = extra - base @ (base.T @ extra)
+    left -= base @ (base.T @ left)
     square, vectors = np.linalg.eigh(left.T @ left)
     kept = square > LEAST_SQUARE
     new = left @ (vectors[:, kept] / np.sqrt(square[kept]))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.special import fdtrc
 
 from compgen.data.csv_files import FloatArray
 from compgen.diagnose.base_fit import BaseFit
@@ -535,8 +536,6 @@ def plain_covariates(names: tuple[str, ...]) -> set[str]:
 
 def prune(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
     """Drop the least significant member as long as its corrected p-value is too large."""
-    from scipy.stats import f as f_distribution  # imported here: slow to load
-
     members = list(chosen.members)
     while members:
         left = design.total - explained(design, members)
@@ -548,7 +547,7 @@ def prune(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
             k = max(design.size(member), 1)
             gain = gain_of(design, [g for g in members if g != member], member)
             ratio = gain / k / max(left / max(freedom, 1), 1e-300)
-            p = float(f_distribution.sf(ratio, k, design.count / 2)) * rules.trials * design.groups[member].scans
+            p = float(fdtrc(k, design.count / 2, ratio)) * rules.trials * design.groups[member].scans
             if p > largest:
                 worst, largest = member, p
         if largest <= LARGEST_P:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.special import chdtrc
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Bars, Drawable, Overview, Panel
@@ -317,23 +318,22 @@ def _invisible(analysis: Analysis) -> tuple[str, ...]:
             best[group.name] = max(best.get(group.name, 0.0), float(design.visible[g]))
     of_base = {f"squareness_{name[1:]}" for name in SQUARENESS_NAMES if name in analysis.fit.basis.errors}
     hidden = [name for name, share in best.items() if share < INVISIBLE]
-    lacking = [name for name in analysis.missing if _applies(analysis, name)]
-    return tuple(name for name in (*hidden, *lacking) if name not in of_base)
-
-
-def _applies(analysis: Analysis, name: str) -> bool:
-    """Whether an effect without columns would have some if more had been logged or varied."""
-    if name.startswith("lever_"):
-        return name.removeprefix("lever_") not in analysis.fit.basis.errors
     readings = analysis.fit.readings
-    for covariate in catalogue(readings.stations)[name].card.covariates:
-        logged = readings.covariates.get(covariate)
-        known = covariate in readings.covariates or covariate.startswith(("temp_", "feed", "load", "time"))
-        if known and (logged is None or np.isnan(logged).any() or np.ptp(logged) == 0.0):
-            return True
-        if covariate.startswith("approach") and readings.approach is None:
-            return True
-    return False
+    cards = {name: effect.card for name, effect in catalogue(readings.stations).items()}
+    lacking = []
+    for name in analysis.missing:  # those that would have columns if more had been logged or varied
+        if name.startswith("lever_"):
+            if name.removeprefix("lever_") not in analysis.fit.basis.errors:
+                lacking.append(name)
+            continue
+        for covariate in cards[name].covariates:
+            logged = readings.covariates.get(covariate)
+            known = covariate in readings.covariates or covariate.startswith(("temp_", "feed", "load", "time"))
+            constant = known and (logged is None or np.isnan(logged).any() or np.ptp(logged) == 0.0)
+            if constant or (covariate.startswith("approach") and readings.approach is None):
+                lacking.append(name)
+                break
+    return tuple(name for name in (*hidden, *lacking) if name not in of_base)
 
 
 # Which further measurement would decide: for alias sets, for near relatives, and for what this plan never shows.
@@ -428,8 +428,6 @@ def compared(observed: Observed, analysis: Analysis, errors: ErrorTable) -> Agai
 
 def _changes(fit: BaseFit, design: Design, residual: FloatArray) -> tuple[dict[str, Any], ...]:
     """Errors whose curve, fitted to the difference, is significant in addition to all others; strongest first."""
-    from scipy.stats import chi2 as chi2_distribution  # imported here: slow to load
-
     white = design.whiten(fit.jacobian)
     target = design.whiten(residual)
     solution = least_norm(white, target)
@@ -443,7 +441,7 @@ def _changes(fit: BaseFit, design: Design, residual: FloatArray) -> tuple[dict[s
         own = white[:, place] - others @ (others.T @ white[:, place])
         basis = orthonormal(own, least=1e-6)
         chi2 = float(np.sum((basis.T @ target) ** 2)) / factor
-        p = float(chi2_distribution.sf(chi2, basis.shape[1])) * len(parts)
+        p = float(chdtrc(basis.shape[1], chi2)) * len(parts)
         if p < SIGNIFICANT:
             found.append(_change(part, solution[place], chi2, p))
     return tuple(sorted(found, key=lambda item: -item["chi2"]))

@@ -209,26 +209,22 @@ def velocity_mm_s(readings: Readings) -> FloatArray | None:
     keys = np.column_stack([0 * row if run is None else run, component])
     _, sequence = np.unique(keys, axis=0, return_inverse=True)
     order = np.lexsort((row, row if time_s is None else time_s, sequence.ravel()))
+    ordered = sequence.ravel()[order]
+    steps = np.diff(readings.position_mm[order], axis=0)
+    moving = np.flatnonzero((np.abs(steps).max(axis=1, initial=0.0) > REST_MM) & (np.diff(ordered) == 0))
     motion = np.zeros((len(readings), 3))
-    ends = np.flatnonzero(np.diff(sequence.ravel()[order], append=-1)) + 1
-    for part in np.split(order, ends[:-1]):
-        motion[part] = _within(readings.position_mm[part])
+    if len(moving):
+        # the last motion before a reading, which one repeated at a stop keeps; before the first motion of a run that one
+        last = np.searchsorted(moving, row, side="left") - 1
+        before = (last >= 0) & (ordered[moving[np.maximum(last, 0)]] == ordered)
+        taken = moving[np.minimum(np.where(before, last, last + 1), len(moving) - 1)]
+        motion[order] = np.where((ordered[taken] == ordered)[:, None], steps[taken], 0.0)
     length = np.linalg.norm(motion, axis=1, keepdims=True)
     cosine = np.divide(motion, length, out=np.zeros_like(motion), where=length > REST_MM)
     if readings.approach is not None:
         known = readings.approach != 0
         cosine = np.where(known, np.abs(cosine) * readings.approach, cosine)
     return np.asarray(cosine * feed[:, None] / SECONDS_PER_MIN)
-
-
-def _within(position_mm: FloatArray) -> FloatArray:
-    """Last motion at the stops (m, 3) of one run in order; a reading repeated at a stop keeps the motion to it."""
-    steps = np.diff(position_mm, axis=0)
-    moving = np.flatnonzero(np.abs(steps).max(axis=1, initial=0.0) > REST_MM)
-    if not len(moving):
-        return np.zeros_like(position_mm)
-    last = np.searchsorted(moving, np.arange(len(position_mm)), side="left") - 1
-    return np.asarray(steps[moving[np.maximum(last, 0)]])
 
 
 # Legendre polynomials over the travel of an axis: the shapes of effects that vary with position.
