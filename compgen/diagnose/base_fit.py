@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
-from compgen.diagnose.observed import Observed
+from compgen.diagnose.observed import Observed, Poses
 from compgen.effects import Effect, Readings
 from compgen.errors import InputError
 from compgen.kinematics.curves import hat_matrix, spline_matrix
@@ -334,9 +335,7 @@ def _linearise(
     changes = [_columns(effect, readings) for effect in effects]
     counts[:] = [change.shape[1] for change in changes]
     jacobian = np.empty((len(observed), size + len(placement) + sum(counts)))
-    jacobian[:, :size] = direction[:, [0]] * moved[0][poses.of]
-    for k in (1, 2):
-        jacobian[:, :size] += direction[:, [k]] * moved[k][poses.of]
+    jacobian[:, :size] = along(direction, poses) @ moved.reshape(-1, size)
     jacobian[:, size:] = np.hstack([placing, *changes])
     if changes and len(unknowns) == jacobian.shape[1]:
         model = model + np.hstack(changes) @ unknowns[-sum(counts) :]
@@ -350,7 +349,8 @@ def _columns(effect: Effect, readings: Readings) -> FloatArray:
     return change
 
 
-def error_columns(observed: Observed, basis: CurveBasis, unknowns: FloatArray) -> FloatArray:
-    """Derivative of the readings by the coefficients of the curves alone, (n, k), at ``unknowns``."""
-    parts = basis.parts(observed.poses.position_mm)
-    return _linearise(observed, parts, unknowns, (), []).jacobian[:, : size_of(parts)]
+def along(direction: FloatArray, poses: Poses) -> csr_array:
+    """Sparse matrix (n, 3 m) that takes the three components of all poses to the readings along ``direction`` (n, 3)."""
+    count, size = len(direction), len(poses.position_mm)
+    rows, columns = np.tile(np.arange(count), 3), np.concatenate([poses.of + k * size for k in range(3)])
+    return csr_array((direction.T.ravel(), (rows, columns)), shape=(count, 3 * size))

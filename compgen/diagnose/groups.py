@@ -16,17 +16,21 @@ from compgen.diagnose.base_fit import (
     DEGREE,
     BaseFit,
     CurveBasis,
-    error_columns,
+    Part,
+    along,
     first_basis,
     fit_base,
     legendre,
     size_of,
+    tip_columns,
+    values_of,
     wider_bases,
 )
 from compgen.diagnose.layout import IntArray, MeasurementLayout
 from compgen.diagnose.observed import Observed
 from compgen.effects import Effect, Readings, catalogue
 from compgen.errors import CompgenWarning
+from compgen.kinematics.exact_chain import exact_columns
 
 # Groups of columns that a diagnosis chooses among: effects of the catalogue and smooth terms without a name.
 
@@ -465,16 +469,27 @@ def fit_smooth(observed: Observed) -> BaseFit:
 
 def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
     """Return for every axis the wider basis with the largest evidence, if one explains more than chance: a first look."""
-    found: list[Wider] = []
+    if not fit.basis.errors:
+        return ()
+    poses, machine = fit.observed.poses, fit.observed.machine
+    old = fit.basis.parts(poses.position_mm)
+    errors = values_of(old, fit.unknowns, len(poses.position_mm))
+    by_errors = exact_columns(machine, errors, poses.position_mm, poses.tool_mm)[1]
+    readings = along(fit.readings.direction, poses)
     base = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))[0]
-    for axis in range(3 if fit.basis.errors else 0):
+    found: list[Wider] = []
+    for axis in range(3):
         best, least = None, -np.inf
-        for basis in wider_bases(fit.basis, axis, fit.observed.poses.position_mm, len(fit.observed)):
-            # Derivative of the readings by the curves of a wider basis, at the present fit.
-            columns = error_columns(fit.observed, basis, _extended(fit, basis))
-            gain, added = _gain(fit, base, columns)
-            evidence = gain - added * (1.0 + np.log(max(gain / max(added, 1), 1.0)))
-            if added and gain > added + CHANCE * np.sqrt(2.0 * added) and evidence > least:
+        for basis in wider_bases(fit.basis, axis, poses.position_mm, len(fit.observed)):
+            # Derivative of the readings by what the wider curves have more than those of the fit, at the fit.
+            added: list[Part] = []
+            for before, after in zip(old, basis.parts(poses.position_mm), strict=True):
+                more = after.basis[:, before.basis.shape[1] :]
+                added.append(Part(after.name, slice(size_of(added), size_of(added) + more.shape[1]), more))
+            columns = np.asarray(readings @ tip_columns(added, by_errors).reshape(-1, size_of(added)))
+            gain, count = _gain(fit, base, columns)
+            evidence = gain - count * (1.0 + np.log(max(gain / max(count, 1), 1.0)))
+            if count and gain > count + CHANCE * np.sqrt(2.0 * count) and evidence > least:
                 best, least = (basis, columns), evidence
         if best is not None:
             found.append(Wider(axis, best[0], Group(f"wider curves of {AXES[axis]}", "base", Placed(best[1]))))

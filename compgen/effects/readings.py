@@ -163,8 +163,11 @@ def run_of(readings: Readings) -> NDArray[np.int64] | None:
     present = [readings.labels[name] for name in RUN_LABELS if name in readings.labels]
     if not present:
         return None
-    _, run = np.unique(np.column_stack(present), axis=0, return_inverse=True)
-    return run.ravel().astype(np.int64)
+    run = np.zeros(len(readings), dtype=np.int64)
+    for label in present:  # one label after the other: many times faster than np.unique of rows, with the same numbers
+        own = np.unique(label, return_inverse=True)[1]
+        run = np.unique(run * (int(own.max(initial=0)) + 1) + own, return_inverse=True)[1].astype(np.int64)
+    return run
 
 
 def step_times_s(readings: Readings, rows: NDArray[np.bool_] | None = None) -> list[float]:
