@@ -95,43 +95,33 @@ def evidence_of(design: Design, chosen: Chosen, noise: Noise, ratio: float, layo
     named = [g for g in chosen.members if design.groups[g].tier == "named"]
     chi2 = {g: gain_of(design, [m for m in chosen.members if m != g], g) for g in chosen.members}
     even = {g: homogeneity(design, chosen, g, layout) for g in named}
+    # deviate of the F-test of what the set leaves, against the pure error of the repeats
+    freedom, z = design.freedom - size, float("nan")
+    if 0 < noise.freedom < freedom:
+        error = noise.quadratic / noise.freedom
+        f_ratio = (left - noise.quadratic) / (freedom - noise.freedom) / error
+        p = float(fdtrc(freedom - noise.freedom, noise.freedom, f_ratio)) if f_ratio > 0 else 1.0
+        z = -10.0 if f_ratio <= 0 else float(-ndtri(p)) if p > 0 else 40.0
+    # generic groups with more evidence left than chance gives
+    generic = [
+        g for g, group in enumerate(design.groups)
+        if group.tier == "generic" and g not in chosen.members and design.size(g)
+    ]  # fmt: skip
+    directed = []
+    for g, gained in zip(generic, gains(design, remainder_of(design, chosen.members), generic), strict=True):
+        k = design.size(g)
+        evidence = float(gained - k - k * np.log(max(gained / k, 1.0)))
+        if evidence > (DIRECTED_SLOW if design.groups[g].slow else DIRECTED):
+            directed.append(Remaining(g, evidence))
     return Evidence(
-        _lack_of_fit(left, design.freedom - size, noise),
-        _directed(design, chosen),
+        z,
+        tuple(sorted(directed, key=lambda item: -item.evidence)),
         ratio,
         {g: p for g, (p, _) in even.items()},
         {g: gained for g, (_, gained) in even.items()},
         chi2,
-        left - (design.freedom - size),
+        left - freedom,
     )
-
-
-def _lack_of_fit(left: float, freedom: int, noise: Noise) -> float:
-    """Deviate of the F-test of what the set leaves, against the pure error of the repeats."""
-    if noise.freedom <= 0 or freedom <= noise.freedom:
-        return float("nan")
-    ratio = (left - noise.quadratic) / (freedom - noise.freedom) / (noise.quadratic / noise.freedom)
-    if ratio <= 0:
-        return -10.0
-    p = float(fdtrc(freedom - noise.freedom, noise.freedom, ratio))
-    return float(-ndtri(p)) if p > 0 else 40.0
-
-
-def _directed(design: Design, chosen: Chosen) -> tuple[Remaining, ...]:
-    """Generic groups with more evidence left than chance gives."""
-    wanted = [
-        g
-        for g, group in enumerate(design.groups)
-        if group.tier == "generic" and g not in chosen.members and design.size(g)
-    ]
-    gained = gains(design, remainder_of(design, chosen.members), wanted)
-    found = []
-    for g, chi2 in zip(wanted, gained, strict=True):
-        k = design.size(g)
-        evidence = float(chi2 - k - k * np.log(max(chi2 / k, 1.0)))
-        if evidence > (DIRECTED_SLOW if design.groups[g].slow else DIRECTED):
-            found.append(Remaining(g, evidence))
-    return tuple(sorted(found, key=lambda item: -item.evidence))
 
 
 def contribution(design: Design, chosen: Chosen, member: int) -> tuple[FloatArray, FloatArray, FloatArray]:

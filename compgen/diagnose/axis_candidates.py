@@ -32,7 +32,11 @@ BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
 
 def candidates_of(session: AxisSession, only: Sequence[str] = ()) -> list[Candidate]:
     """Return everything that is compared; ``only`` limits the names."""
-    found = [*_slow(session), *_disturbed(session), *_steps(session), *_logged(session)]
+    warm = catalogue()["warmup_drift"]
+    slow = [_candidate(session, warm.at(tau), WARMUP_SCANS) for tau in warm.positions(session.readings)]
+    slow.append(_candidate(session, catalogue()["linear_drift"], LINEAR_SCANS))
+    drifts = [item for item in slow if item is not None]
+    found = [*drifts, *_disturbed(session), *_steps(session), *_logged(session)]
     found = [c for c in found if not only or c.name in only]
     return [*found, *_generic(session)]
 
@@ -70,28 +74,16 @@ def _candidate(session: AxisSession, effect: Effect, scans: float, text: str = "
     )
 
 
-def _slow(session: AxisSession) -> list[Candidate]:
-    known = catalogue()
-    warm = known["warmup_drift"]
-    found = [_candidate(session, warm.at(tau), WARMUP_SCANS) for tau in warm.positions(session.readings)]
-    found.append(_candidate(session, known["linear_drift"], LINEAR_SCANS))
-    return [item for item in found if item is not None]
-
-
 def _steps(session: AxisSession) -> list[Candidate]:
     if not session.in_runs:
         return []
     step = catalogue()["step_between_runs"]
     at = (np.flatnonzero(np.diff(session.leg)) + 1).tolist()
-    found = [
-        _candidate(session, step.at(float(k)), _runs(session), f"step before {session.window(k, _leg_end(session, k))}")
-        for k in at
-    ]
+    found = []
+    for k in at:
+        end = int(np.flatnonzero(session.leg == session.leg[k])[-1])
+        found.append(_candidate(session, step.at(float(k)), _runs(session), f"step before {session.window(k, end)}"))
     return [item for item in found if item is not None]
-
-
-def _leg_end(session: AxisSession, first: int) -> int:
-    return int(np.flatnonzero(session.leg == session.leg[first])[-1])
 
 
 def _runs(session: AxisSession) -> float:
@@ -211,7 +203,8 @@ def _generic(session: AxisSession) -> list[Candidate]:
         add("every way of every run has a level of its own", ("run", "approach"), legs[:, 1:])
     inside = [k for k in range(1, len(session)) if session.leg[k] == session.leg[k - 1]]
     for k in inside:
-        add(f"jump within {_way(session, k)}, before {session.place(k)}", ("time",), _from(session, k), len(inside))
+        way_text = f"run {session.run[k]} {'up' if session.direction[k] > 0 else 'down'}"
+        add(f"jump within {way_text}, before {session.place(k)}", ("time",), _from(session, k), len(inside))
     number = np.arange(len(session), dtype=np.float64)
     onsets = range(1, len(session) - 1, max(1, len(session) // MOST_ONSETS))
     for k in onsets:
@@ -233,10 +226,6 @@ def _products(first: FloatArray, second: FloatArray) -> FloatArray:
 
 def _from(session: AxisSession, k: int) -> FloatArray:
     return (np.arange(len(session)) >= k).astype(np.float64)
-
-
-def _way(session: AxisSession, k: int) -> str:
-    return f"run {session.run[k]} {'up' if session.direction[k] > 0 else 'down'}"
 
 
 def _indicators(number: IntArray) -> FloatArray:

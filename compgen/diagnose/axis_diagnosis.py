@@ -38,6 +38,7 @@ Show = Callable[[str], None]
 WARM_UP_NOTE = (
     "a warm-up of the machine and one of the sensor look alike: only a stationary drift test tells them apart"
 )
+NO_REPEATS = "no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"
 #: Figures that are shown: reversal, its mean, systematic deviations, repeatability and accuracy, um.
 SHOWN = ("B", "M", "E", "R", "A")
 #: Readings beside the means of the targets, and beside those of the cells, below which nothing is said.
@@ -192,7 +193,13 @@ def findings_of(
     if u_um is not None and not u_um > 0:
         raise InputError(f"an uncertainty of {u_um:g} um was given; it must be above zero")
     found = []
-    for session in sessions_of(machine, _without_known(machine, runs, order), order):
+    value, active = runs.deviation_mm.copy(), active_effects(machine)
+    for session in sessions_of(machine, runs, order) if active else ():
+        for item in active:  # what the machine file says already is taken off
+            change = item.change_mm(session.readings)
+            if change is not None:
+                value[session.row] -= change
+    for session in sessions_of(machine, replace(runs, deviation_mm=value), order):
         freedom = len(session) - len(session.targets_mm)
         if freedom < LEAST_FREEDOM:
             raise InputError(
@@ -203,19 +210,6 @@ def findings_of(
         with one_thread():
             found.append(_findings(session, most, only, add, u_um, against))
     return found
-
-
-def _without_known(machine: Machine, runs: AxisRuns, order: Order) -> AxisRuns:
-    """Take off what the effects of the machine file say."""
-    value = runs.deviation_mm.copy()
-    active = active_effects(machine)
-    if active:
-        for session in sessions_of(machine, runs, order):
-            for item in active:
-                change = item.change_mm(session.readings)
-                if change is not None:
-                    value[session.row] -= change
-    return replace(runs, deviation_mm=value)
 
 
 def _findings(
@@ -248,7 +242,12 @@ def _findings(
     if repeated and not unknown:
         unknown += _restless(changes)
     static, irregular = reversal.found(names, add, source)
-    static = [_beside_unknown(item, unknown) for item in static]
+    # a reversal is doubtful where it changes with time, and a small one where anything else has no name
+    if any({"time", "approach"} <= set(other.covariates) for other in unknown):
+        static = [_doubted(item, "the reversal changes with time") for item in static]
+    elif unknown:
+        least = LEAST_BESIDE_RUNS if any("run" in other.covariates for other in unknown) else LEAST_BESIDE
+        static = [_doubted(i, "small beside what has no name") if i.gain < least else i for i in static]
     unknown += irregular
     effects = [*sorted(effects, key=lambda item: -item.gain), *static]
     if unknown:
@@ -260,11 +259,15 @@ def _findings(
     removed, left_out, taken, figures, notes = _taken_off(session, effects)
     effects = [item if item.name in taken else replace(item, remains="") for item in effects]
     before, after = _residuals(session, grid, effects)
+    alone: dict[str, float] = {}  # what each name explains by itself
+    for candidate, gain in zip(search.candidates, search.criteria([])[0] if repeated else (), strict=True):
+        if candidate.tier == "named" and not candidate.free:
+            alone[candidate.name] = max(alone.get(candidate.name, 0.0), float(gain))
     return AxisFindings(
         session, tuple(effects), tuple(unknown), invisible_of(session),
         changes.sigma_mm if repeated else reversal.sigma_mm, changes.phi if repeated else 0.0, source,
         removed, left_out, taken, figures, before, after, _held_out(session, effects, left_out),
-        _suspects(search) if repeated else (), tuple(notes),
+        tuple(sorted(alone.items(), key=lambda item: -item[1])), tuple(notes),
         None if against is None else _compared(changes, against),
     )  # fmt: skip
 
@@ -340,16 +343,6 @@ def _levels_off(means: FloatArray, drift: FloatArray, u_mm: float) -> bool:
         and (second - first).max() <= turn
         and np.ptp(left) <= LEAST_FOLLOWED * np.ptp(up.mean(axis=0))
     )
-
-
-def _beside_unknown(item: AxisEffect, unknown: Sequence[AxisUnknown]) -> AxisEffect:
-    """A reversal is doubtful where it changes with time, and a small one where anything else has no name."""
-    if any({"time", "approach"} <= set(other.covariates) for other in unknown):
-        return _doubted(item, "the reversal changes with time")
-    least = LEAST_BESIDE_RUNS if any("run" in other.covariates for other in unknown) else LEAST_BESIDE
-    if unknown and item.gain < least:
-        return _doubted(item, "small beside what has no name")
-    return item
 
 
 def _added(search: Search, members: list[int], add: Sequence[str]) -> list[int]:
@@ -863,16 +856,6 @@ def _held_out(session: AxisSession, effects: Sequence[AxisEffect], left_out: Int
     return float(np.sqrt(total[0])), float(np.sqrt(total[1]))
 
 
-def _suspects(search: Search) -> tuple[tuple[str, float], ...]:
-    """Names by what each explains by itself."""
-    gains = search.criteria([])[0]
-    best: dict[str, float] = {}
-    for candidate, gain in zip(search.candidates, gains, strict=True):
-        if candidate.tier == "named" and not candidate.free:
-            best[candidate.name] = max(best.get(candidate.name, 0.0), float(gain))
-    return tuple(sorted(best.items(), key=lambda item: -item[1]))
-
-
 def _compared(changes: _Changes, errors: ErrorTable) -> dict[str, Any]:
     """The mean curve against predicted errors: RMS of the difference without its mean, and whether it is more than noise."""
     session = changes.session
@@ -928,6 +911,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
             for item in part.unknown
         ]
         against = [part.against for part in self.axes if part.against is not None]
+        assumed = [part.session.letter for part in self.axes if part.noise_source == "assumed"]
         found = {
             "verdict": self.word,
             "effects": effects,
@@ -936,7 +920,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
             "secondary": [],
             "gap": self._gap(),
             "advice": self._advice(),
-            "reasons": self._reasons(),
+            "reasons": [f"{', '.join(assumed)}: {NO_REPEATS}"] if assumed else [],
             "notes": self._notes(),
             "noise": {part.session.letter: _noise_dict(part) for part in self.axes}
             if several
@@ -993,14 +977,6 @@ class AxisDiagnosis(DisplayedDiagnosis):
                 shown.setdefault(catalogue()[name].card.breaker, []).append(name)
             found += [f"{how}: would show {', '.join(names)}, which these runs cannot" for how, names in shown.items()]
         return list(dict.fromkeys(found))
-
-    def _reasons(self) -> list[str]:
-        assumed = [part.session.letter for part in self.axes if part.noise_source == "assumed"]
-        if not assumed:
-            return []
-        return [
-            f"{', '.join(assumed)}: no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"
-        ]
 
     def _notes(self) -> list[str]:
         found = []

@@ -379,7 +379,9 @@ class Search:
         results = []
 
         def keep(members: list[int]) -> None:
-            results.append((self._worth(members), members, dict(self._lambda)))
+            # criterion of the set, less what several names at once are unlikely
+            named = sum(self.candidates[k].tier == "named" for k in members)
+            results.append((self.total(members) - MORE_NAMES * max(named - 1, 0), members, dict(self._lambda)))
 
         keep(self._grown(self._grown([], self._named, most), everything, most))
         keep(self._grown([], everything, most))
@@ -403,11 +405,6 @@ class Search:
         gains = self.criteria([])[0]
         found = [k for k, c in enumerate(self.candidates) if c.name in OF_RUNS and c.columns.shape[1] == 1]
         return sorted(found, key=lambda k: -gains[k])[:most]
-
-    def _worth(self, members: Sequence[int]) -> float:
-        """Criterion of a set, less what several names at once are unlikely."""
-        named = sum(self.candidates[k].tier == "named" for k in members)
-        return self.total(members) - MORE_NAMES * max(named - 1, 0)
 
     def _grown(self, members: list[int], allowed: NDArray[np.bool_], most: int) -> list[int]:
         """Forward steps, and after each of them every member is exchanged if another suits better beside the rest."""

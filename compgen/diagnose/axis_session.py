@@ -152,22 +152,30 @@ class AxisSession:
 
 def sessions_of(machine: Machine, runs: AxisRuns, order: Order = "auto") -> list[AxisSession]:
     """Return the readings of every axis by itself, in the order of time."""
-    return [_session(machine, runs, axis, order) for axis in runs.axes]
-
-
-def _session(machine: Machine, runs: AxisRuns, axis: int, order: Order) -> AxisSession:
-    rows = np.flatnonzero(runs.axis == axis)
-    sequence, time, source = _in_time(runs, rows, order)
-    rows = rows[sequence]
-    position, direction, run = runs.position_mm[rows], runs.direction[rows], runs.run[rows]
-    _, target = np.unique(np.round(position / SAME_TARGET_MM), return_inverse=True)
-    _, cell = np.unique(2 * target.ravel() + (direction > 0), return_inverse=True)
-    leg = np.cumsum(np.concatenate([[False], (np.diff(run) != 0) | (np.diff(direction) != 0)]))
-    return AxisSession(
-        machine, axis, rows, position, direction, run, runs.deviation_mm[rows], target.ravel(), cell.ravel(),
-        leg.astype(np.int64), _cycles(run, direction, leg), time, source == "time", source,
-        _readings(machine, runs, axis, rows, np.arange(len(rows), dtype=np.float64), timed=source == "time"),
-    )  # fmt: skip
+    found = []
+    for axis in runs.axes:
+        rows = np.flatnonzero(runs.axis == axis)
+        sequence, time, source = _in_time(runs, rows, order)
+        rows = rows[sequence]
+        position, direction, run = runs.position_mm[rows], runs.direction[rows], runs.run[rows]
+        _, target = np.unique(np.round(position / SAME_TARGET_MM), return_inverse=True)
+        _, cell = np.unique(2 * target.ravel() + (direction > 0), return_inverse=True)
+        changed = np.diff(run) != 0
+        leg = np.cumsum(np.concatenate([[False], changed | (np.diff(direction) != 0)])).astype(np.int64)
+        # a run there and back by its label, or two ways where every way has a number of its own
+        cycle = np.cumsum(np.concatenate([[False], changed])).astype(np.int64)
+        single = all(len(np.unique(direction[cycle == k])) == 1 for k in range(int(cycle.max()) + 1))
+        if single and len(np.unique(direction)) == 2:
+            cycle = leg // 2
+        number = np.arange(len(rows), dtype=np.float64)
+        readings = _readings(machine, runs, axis, rows, number, timed=source == "time")
+        found.append(
+            AxisSession(
+                machine, axis, rows, position, direction, run, runs.deviation_mm[rows], target.ravel(), cell.ravel(),
+                leg, cycle, time, source == "time", source, readings,
+            )
+        )  # fmt: skip
+    return found
 
 
 def _in_time(runs: AxisRuns, rows: IntArray, order: Order) -> tuple[IntArray, FloatArray, str]:
@@ -201,15 +209,6 @@ def _in_time(runs: AxisRuns, rows: IntArray, order: Order) -> tuple[IntArray, Fl
             (source if distinct else "label"),
         )
     return np.lexsort(keys["up-down"]), number, "up-down"
-
-
-def _cycles(run: IntArray, direction: IntArray, leg: IntArray) -> IntArray:
-    """Number of the run there and back of each reading: by its label, or two ways where every way has a number of its own."""
-    changed = np.concatenate([[False], np.diff(run) != 0])
-    cycle = np.cumsum(changed).astype(np.int64)
-    single = all(len(np.unique(direction[cycle == k])) == 1 for k in range(int(cycle.max()) + 1))
-    both = len(np.unique(direction)) == 2
-    return (leg // 2).astype(np.int64) if single and both else cycle
 
 
 def _readings(

@@ -75,28 +75,26 @@ class CurveBasis:
         build = spline_matrix if self.machine.curves == "cubic" else hat_matrix
         return np.hstack([columns, build(item.nodes_mm, position_mm)])
 
-    def _zeroed(self, axis: int, position_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Bases of an axis zero at the reference point, and zero at both ends of the span, each (m, k)."""
-        start, end = self._span(axis)
-        fixed = np.array([np.clip(self.machine.reference_point_mm[axis], start, end), start, end])
-        whole = self.of_axis(axis, np.concatenate([fixed, position_mm]))
-        reference, low, high, columns = whole[0], whole[1], whole[2], whole[3:]
-        share = ((position_mm - start) / (end - start))[:, None]
-        return columns - reference, (columns - (1.0 - share) * low - share * high)[:, 1:]
-
     def parts(self, position_mm: FloatArray) -> list[Part]:
         """Name, place in the vector of unknowns and basis (m, k) of every error at positions (m, 3)."""
-        bases = [self._zeroed(axis, position_mm[:, axis]) for axis in range(3)]
+        bases = []  # of each axis: zero at the reference point, and zero at both ends of the span
+        for axis in range(3):
+            start, end = self._span(axis)
+            fixed = np.array([np.clip(self.machine.reference_point_mm[axis], start, end), start, end])
+            whole = self.of_axis(axis, np.concatenate([fixed, position_mm[:, axis]]))
+            reference, low, high, columns = whole[0], whole[1], whole[2], whole[3:]
+            share = ((position_mm[:, axis] - start) / (end - start))[:, None]
+            bases.append((columns - reference, (columns - (1.0 - share) * low - share * high)[:, 1:]))
         parts: list[Part] = []
-        start = 0
+        at = 0
         for name in self.errors:
             if name in SQUARENESS_NAMES:
                 part = np.ones((len(position_mm), 1))
             else:
                 error = error_named(name)
                 part = bases[error.axis][1 if error.is_straightness else 0]
-            parts.append(Part(name, slice(start, start + part.shape[1]), part))
-            start += part.shape[1]
+            parts.append(Part(name, slice(at, at + part.shape[1]), part))
+            at += part.shape[1]
         return parts
 
 
@@ -253,7 +251,8 @@ def least_norm(design: FloatArray, target: FloatArray) -> FloatArray:
     scale = np.linalg.norm(design, axis=0)
     scale[scale == 0.0] = 1.0
     count = design.shape[1]
-    both = np.linalg.qr(np.column_stack([design / scale, target]), mode="r")  # the last column is Q' target
+    # the last column of R is Q' target
+    both = np.asarray(np.linalg.qr(np.column_stack([design / scale, target]), mode="r"))
     u, singular, vt = np.linalg.svd(both[:count, :count], full_matrices=False)
     kept = singular > LEAST_SINGULAR * singular[0]
     return np.asarray((vt[kept].T @ ((u[:, kept].T @ both[:count, count]) / singular[kept])) / scale)
@@ -284,7 +283,9 @@ def fit_base(
     counts: list[int] = [0] * len(effects)
     now = _linearise(observed, parts, unknowns, effects, counts)
     unknowns = np.concatenate([unknowns, np.zeros(sum(counts))])
-    hold = _hold(parts)
+    # weight that holds each coefficient of the curves near zero: accuracy of a reading over its likely size
+    likely = [LIKELY if error_named(name).kind == "linear" else LIKELY_RAD for name in names_of(parts)]
+    hold = READING_MM / np.array(likely)
     for _ in range(steps):
         residual = observed.value_mm - now.model
         design, target = now.jacobian, residual
@@ -302,14 +303,6 @@ def fit_base(
     taken = tuple(zip(effects, counts, strict=True))
     residual = observed.value_mm - now.model
     return BaseFit(observed, basis, unknowns, residual, now.jacobian, tuple(names), now.readings, taken)
-
-
-def _hold(parts: Sequence[Part]) -> FloatArray:
-    """Weight that holds each coefficient of the curves near zero, (k,): accuracy of a reading over its likely size."""
-    found = np.empty(size_of(parts))
-    for part in parts:
-        found[part.place] = READING_MM / (LIKELY if error_named(part.name).kind == "linear" else LIKELY_RAD)
-    return found
 
 
 def _step(design: FloatArray, target: FloatArray, unknowns: FloatArray, hold: FloatArray) -> FloatArray:

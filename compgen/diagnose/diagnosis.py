@@ -61,7 +61,7 @@ def refit(analysis: Analysis, members: Sequence[int]) -> Refit:
     """Fit base model and members together with the noise model as weight."""
     design = analysis.design
     members = [g for g in members if design.size(g)]
-    effects = [_effect_of(design, g) for g in members]
+    effects = [design.groups[g].effect or FixedColumns(design.groups[g], design.maps[g]) for g in members]
     fit = fit_base(
         analysis.fit.observed,
         analysis.fit.basis,
@@ -71,11 +71,6 @@ def refit(analysis: Analysis, members: Sequence[int]) -> Refit:
         steps=3,
     )
     return Refit(fit, _parameters(design, fit, members))
-
-
-def _effect_of(design: Design, group: int) -> Effect:
-    item = design.groups[group]
-    return item.effect if item.effect is not None else FixedColumns(item, design.maps[group])
 
 
 def _parameters(design: Design, fit: BaseFit, members: Sequence[int]) -> dict[int, tuple[Fitted, ...]]:
@@ -195,7 +190,11 @@ def gap_of(
     before, after = everything.fitted(False), everything.fitted(True)
     some = _Problem(columns, _hstack(predicting, count), fit.residual_mm, weight)
     layout = fit.observed.layout
-    lines = _line_folds(layout.condition[layout.stop])
+    # whole conditions, so that both repeats of a line are left out together
+    kinds, lines = int(layout.condition.max()) + 1, None
+    if kinds >= 2 * FOLDS:
+        order = np.random.default_rng(0).permutation(kinds)
+        lines = np.asarray((order % FOLDS)[layout.condition[layout.stop]], dtype=np.int64)
     stations = layout.channel if len(fit.readings.stations) > LEAST_STATIONS else None
     return Gap(
         _rms_pair(before, after),
@@ -211,15 +210,6 @@ def gap_of(
 
 def _hstack(columns: Sequence[FloatArray], count: int) -> FloatArray:
     return np.hstack(columns) if columns else np.zeros((count, 0))
-
-
-def _line_folds(condition: IntArray) -> IntArray | None:
-    """Fold of every reading: whole conditions, so that both repeats of a line are left out together."""
-    kinds = int(condition.max()) + 1
-    if kinds < 2 * FOLDS:
-        return None
-    order = np.random.default_rng(0).permutation(kinds)
-    return np.asarray((order % FOLDS)[condition], dtype=np.int64)
 
 
 def _time_folds(fit: BaseFit) -> IntArray | None:
@@ -360,7 +350,7 @@ class Diagnosis(DisplayedDiagnosis):
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``diagnosis.json``."""
-        verdict, analysis = self.verdict, self.analysis
+        verdict, analysis, against = self.verdict, self.analysis, self.against_rms_mm
         cards = self._cards
         effects = [self._named(item) for item in verdict.named] + [
             {**_classed(item), "what_to_do": what_to_do(cards[item.name])} for item in self.classed
@@ -392,7 +382,7 @@ class Diagnosis(DisplayedDiagnosis):
                 "unknowns": analysis.fit.base_size,
                 "groups": len({group.name for group in analysis.design.groups}),
             },
-            **self._against(),
+            **({} if against is None else {"against": {"rms_um": against / MM_PER_UM, "changes": list(self.changes)}}),
         }
 
     @cached_property
@@ -421,11 +411,6 @@ class Diagnosis(DisplayedDiagnosis):
             "shape_exact": item.shape_exact,
             "reasons": list(item.reasons),
         }
-
-    def _against(self) -> dict[str, Any]:
-        if self.against_rms_mm is None:
-            return {}
-        return {"against": {"rms_um": self.against_rms_mm / MM_PER_UM, "changes": list(self.changes)}}
 
     def _noise(self) -> dict[str, Any]:
         noise = self.analysis.noise

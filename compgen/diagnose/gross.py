@@ -74,9 +74,10 @@ def _mappings(machine: Machine, lengths: Lengths) -> Iterator[tuple[str, Lengths
         for signs in product((1.0, -1.0), repeat=3):
             turn = np.zeros((3, 3))
             turn[range(3), order] = signs
-            moved = _fitted_to_travel(machine, lengths.position_mm @ turn.T)
-            if moved is None:
-                continue
+            moved = lengths.position_mm @ turn.T
+            room = 0.05 * (machine.upper_mm - machine.lower_mm)
+            if not ((moved >= machine.lower_mm - room) & (moved <= machine.upper_mm + room)).all():
+                continue  # beyond the travel of the machine
             plain = bool(np.array_equal(turn, np.eye(3)))
             parts = [f"{AXES[k]} is {'-' if signs[k] < 0 else ''}{AXES[order[k]]} of the file" for k in range(3)]
             what = "" if plain else ", ".join(p for k, p in enumerate(parts) if order[k] != k or signs[k] < 0)
@@ -96,14 +97,6 @@ def _mappings(machine: Machine, lengths: Lengths) -> Iterator[tuple[str, Lengths
 
 def _joined(first: str, second: str) -> str:
     return f"{first}; {second}" if first else second
-
-
-def _fitted_to_travel(machine: Machine, position_mm: FloatArray) -> FloatArray | None:
-    """Positions if they lie in the travel of the machine (to 5 %); those of a flipped axis are tried as they are."""
-    low, high = machine.lower_mm, machine.upper_mm
-    room = 0.05 * (high - low)
-    inside = (position_mm >= low - room) & (position_mm <= high + room)
-    return position_mm if inside.all() else None
 
 
 def _some(lengths: Lengths) -> Lengths:
@@ -230,7 +223,8 @@ ON_GRID, COARSE = 0.999, 1.0
 
 def classes_of(analysis: Analysis, removed: int = 0) -> list[Classed]:
     """Return the classes of noise that the readings show beyond doubt; ``removed`` gross readings were left out."""
-    found = _outliers(removed)
+    text = f"{removed} reading(s) lie more than {GROSS:g} standard deviations from their neighbours; they were left out"
+    found = [Classed("outliers", {"count": float(removed)}, 1.0, text)] if removed else []
     return [*found, *_trend(analysis, leftover(analysis.design, analysis.chosen)), *_quantised(analysis)]
 
 
@@ -349,13 +343,6 @@ def disturbed_class(bursts: Sequence[Burst], *, left_out: bool) -> list[Classed]
         )
         for b in bursts
     ]
-
-
-def _outliers(removed: int) -> list[Classed]:
-    if not removed:
-        return []
-    text = f"{removed} reading(s) lie more than {GROSS:g} standard deviations from their neighbours; they were left out"
-    return [Classed("outliers", {"count": float(removed)}, 1.0, text)]
 
 
 def _trend(analysis: Analysis, residual: FloatArray) -> list[Classed]:

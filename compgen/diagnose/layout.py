@@ -139,23 +139,17 @@ def _stops(readings: Readings, channel: IntArray, seconds: FloatArray | None) ->
         if readings.approach is not None:
             columns += list(readings.approach.T)
     code = _codes(columns)
-    code = _split_doubles(code, channel)
-    _, index, inverse = np.unique(code, return_index=True, return_inverse=True)
-    rank = np.empty(len(index), dtype=np.int64)
-    rank[np.argsort(index)] = np.arange(len(index))
-    return rank[inverse.ravel()]
-
-
-def _split_doubles(code: IntArray, channel: IntArray) -> IntArray:
-    """Give the k-th reading of a channel within one code a code of its own."""
+    # the k-th reading of a channel within one code gets a code of its own
     order = np.lexsort((channel, code))
     same = (np.diff(code[order]) == 0) & (np.diff(channel[order]) == 0)
     nth = np.zeros(len(code), dtype=np.int64)
     for k in np.flatnonzero(same) + 1:
         nth[k] = nth[k - 1] + 1
-    result = np.empty_like(code)
-    result[order] = code[order] * (nth.max() + 1) + nth
-    return result
+    code[order] = code[order] * (nth.max() + 1) + nth
+    _, index, inverse = np.unique(code, return_index=True, return_inverse=True)
+    rank = np.empty(len(index), dtype=np.int64)
+    rank[np.argsort(index)] = np.arange(len(index))
+    return rank[inverse.ravel()]
 
 
 def _runs(readings: Readings, first: IntArray) -> IntArray:

@@ -174,9 +174,9 @@ class Reml:
                 right += np.einsum("cdq,cd->q", weighted, part.data[mine])
                 quadratic += float(np.sum(part.data[mine] * data))
                 solved.append((part, channels if times or not split else 0, inverse, weighted, data))
-        beta, between = right, normal
+        beta, between = right, np.zeros_like(normal)
         if self.fixed:
-            between = np.linalg.inv(normal)
+            between[:] = np.linalg.inv(normal)
             beta = between @ right
             quadratic -= float(right @ beta)
             logdet += float(np.linalg.slogdet(normal)[1])

@@ -436,7 +436,8 @@ def _best_additions(design: Design, rules: Rules, members: Sequence[int], most: 
         allowed = allowed_with(design, rules, members)
         gained = gains(design, remainder_of(design, members), allowed)
         merit = gained - penalties(design, rules, allowed, gained)
-        first = np.argsort(-merit)[: 4 * max(ADDITIONS, most)]
+        # of exact aliases the first of the catalogue, whatever the rounding
+        first = np.argsort(-np.round(merit, 6), kind="stable")[: 4 * max(ADDITIONS, most)]
         design.kept[key] = [(allowed[k], float(merit[k])) for k in first]
     best: dict[str, int] = {}
     for g, merit in design.kept[key][: 4 * most]:
@@ -503,7 +504,14 @@ def with_names(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
     """Put names in place of generic groups that hold the same law with more freedom: a shape that is not quite exact."""
     for generic in [g for g in chosen.members if design.groups[g].tier == "generic"]:
         rest = [g for g in chosen.members if g != generic]
-        related = [g for g in allowed_with(design, rules, rest) if _related(design, generic, g)]
+        group, related = design.groups[generic], []
+        own = plain_covariates(group.covariates) - {"x", "y", "z"}
+        for g in allowed_with(design, rules, rest):
+            # a name for what depends on the covariates of the generic group; offsets of lines contain them all
+            item = design.groups[g]
+            same = not group.predicts or (own and own <= plain_covariates(item.covariates))
+            if item.tier == "named" and same:
+                related.append(g)
         if not related:
             continue
         gained = gains(design, remainder_of(design, rest), related)
@@ -511,16 +519,6 @@ def with_names(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
         if gained[best] > SAME_LAW * gain_of(design, rest, generic):
             chosen = evaluate(design, rules, [*rest, related[best]])
     return chosen
-
-
-def _related(design: Design, generic: int, group: int) -> bool:
-    """Whether a group is a name for what depends on the covariates of a generic one; offsets of lines hold them all."""
-    if design.groups[group].tier != "named":
-        return False
-    if not design.groups[generic].predicts:
-        return True
-    own = plain_covariates(design.groups[generic].covariates) - {"x", "y", "z"}
-    return bool(own) and own <= plain_covariates(design.groups[group].covariates)
 
 
 def plain_covariates(names: tuple[str, ...]) -> set[str]:

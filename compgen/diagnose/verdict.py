@@ -17,7 +17,6 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_named
 from compgen.diagnose.analysis import HOMOGENEITY_P, Analysis, contribution
 from compgen.diagnose.base_fit import BaseFit, Part, least_norm, size_of
-from compgen.diagnose.groups import Group
 from compgen.diagnose.observed import Observed
 from compgen.diagnose.search import (
     Alternative,
@@ -50,11 +49,17 @@ class DisplayedDiagnosis(Drawable):
     def overview(self) -> Overview:
         """The verdict, and each name with its grade and parameters."""
         found = self.to_dict()
-        rows = tuple((x["name"], x["grade"], _parameters_text(x["parameters"])) for x in found["effects"])
+        rows = []
+        for effect in found["effects"]:
+            texts = [
+                f"{name} = {item['value']:.4g}" + ("" if item["u"] is None else f" +- {item['u']:.2g}")
+                for name, item in effect["parameters"].items()
+            ]
+            rows.append((effect["name"], effect["grade"], ", ".join(texts)))
         names = f": {', '.join(name for name, _, _ in rows)}" if rows else ""
         title = f"{self.machine.name}: {found['verdict'].replace('_', ' ')}{names}"
         notes = (*(item["text"] for item in found["unknown"]), *found["reasons"])
-        return Overview(title, ("effect", "grade", "parameters"), rows, notes)
+        return Overview(title, ("effect", "grade", "parameters"), tuple(rows), notes)
 
     def panels(self) -> Sequence[Panel]:
         """Root mean square of the residuals before and after, of the readings used and of those left out."""
@@ -63,15 +68,6 @@ class DisplayedDiagnosis(Drawable):
         before = Bars("before", tuple(shown), tuple(pair["before_rms_um"] for pair in shown.values()))
         after = Bars("after", tuple(shown), tuple(pair["after_rms_um"] for pair in shown.values()))
         return [Panel("residuals of the readings used and left out", "rms (um)", bars=(before, after))]
-
-
-def _parameters_text(parameters: dict[str, dict[str, float | None]]) -> str:
-    """Parameters with their uncertainty in one line."""
-    texts = []
-    for name, item in parameters.items():
-        known = "" if item["u"] is None else f" +- {item['u']:.2g}"
-        texts.append(f"{name} = {item['value']:.4g}{known}")
-    return ", ".join(texts)
 
 
 #: Names of which less than this is left without the base model are never confirmed.
@@ -166,7 +162,10 @@ def verdict_of(analysis: Analysis) -> Verdict:
         ]
     word: Word = "named" if firm else "unknown" if unknown or graded else "none"
     if word == "unknown" and not unknown:
-        unknown = [_resembling(analysis, graded[0])]
+        first = graded[0]
+        text = f"resembles {first.name} but {first.reasons[0] if first.reasons else 'is not certain'}"
+        covariates = tuple(sorted(plain_covariates(design.groups[first.group].covariates)))
+        unknown = [Unknown(covariates, "", float("nan"), text, None, first.name)]
     if unknown:
         graded = [replace(item, grade="beside_unknown") if item.grade == "confirmed" else item for item in graded]
     reasons = [] if repeats else ["no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"]
@@ -264,7 +263,11 @@ def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: li
         design.groups[g].tier == "generic" for g in analysis.chosen.members
     )
     shaped = shaped and not directed and evidence.excess < SHAPE_SHARE * strongest
-    found = [_of_group(analysis, g) for g in sorted(generic, key=lambda g: -evidence.chi2[g])]
+    found = []
+    for g in sorted(generic, key=lambda g: -evidence.chi2[g]):
+        group, shape = design.groups[g], contribution(design, analysis.chosen, g)[2]
+        rms_mm, nearest = float(np.sqrt(np.mean(shape**2))), _nearest(analysis, g, evidence.chi2[g])
+        found.append(Unknown(group.covariates, group.direction, rms_mm, group.name, g, nearest))
     if jumps:
         at = design.groups[jumps[0]].position
         found.append(Unknown(("time",), "length", float("nan"), f"common jump of several stations at {at:g} s"))
@@ -278,13 +281,6 @@ def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: li
     if evidence.changes_between_runs:
         found.append(Unknown(("run",), "", float("nan"), "not repeatable from run to run"))
     return found
-
-
-def _of_group(analysis: Analysis, g: int) -> Unknown:
-    group: Group = analysis.design.groups[g]
-    shape = contribution(analysis.design, analysis.chosen, g)[2]
-    nearest = _nearest(analysis, g, analysis.evidence.chi2[g])
-    return Unknown(group.covariates, group.direction, float(np.sqrt(np.mean(shape**2))), group.name, g, nearest)
 
 
 def _nearest(analysis: Analysis, generic: int, chi2: float) -> str:
@@ -301,12 +297,6 @@ def _nearest(analysis: Analysis, generic: int, chi2: float) -> str:
     own = gains(design, remainder_of(design, rest), named)
     best = int(np.argmax(own))
     return design.groups[named[best]].name if own[best] > RESEMBLES * chi2 else ""
-
-
-def _resembling(analysis: Analysis, item: Named) -> Unknown:
-    group = analysis.design.groups[item.group]
-    text = f"resembles {item.name} but {item.reasons[0] if item.reasons else 'is not certain'}"
-    return Unknown(tuple(sorted(plain_covariates(group.covariates))), "", float("nan"), text, None, item.name)
 
 
 def _invisible(analysis: Analysis) -> tuple[str, ...]:
