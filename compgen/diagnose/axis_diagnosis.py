@@ -259,15 +259,11 @@ def _findings(
     removed, left_out, taken, figures, notes = _taken_off(session, effects)
     effects = [item if item.name in taken else replace(item, remains="") for item in effects]
     before, after = _residuals(session, grid, effects)
-    alone: dict[str, float] = {}  # what each name explains by itself
-    for candidate, gain in zip(search.candidates, search.criteria([])[0] if repeated else (), strict=True):
-        if candidate.tier == "named" and not candidate.free:
-            alone[candidate.name] = max(alone.get(candidate.name, 0.0), float(gain))
     return AxisFindings(
         session, tuple(effects), tuple(unknown), invisible_of(session),
         changes.sigma_mm if repeated else reversal.sigma_mm, changes.phi if repeated else 0.0, source,
         removed, left_out, taken, figures, before, after, _held_out(session, effects, left_out),
-        tuple(sorted(alone.items(), key=lambda item: -item[1])), tuple(notes),
+        _suspects(search) if repeated else (), tuple(notes),
         None if against is None else _compared(changes, against),
     )  # fmt: skip
 
@@ -523,7 +519,17 @@ def _uneven(changes: _Changes, member: int, shift: FloatArray) -> tuple[float, f
     half = np.where(session.time > np.median(session.time), 1.0, -1.0)
     unit = shift / max(float(np.abs(shift).max()), 1e-12)
     columns = np.hstack([changes.grid.cells, changes.columns])
-    extra = np.column_stack([unit * session.s, unit * session.direction, unit * half, *_fading(session, item)])
+    fading, number = [], np.arange(len(session), dtype=np.float64)
+    # what a step or a disturbance would do that fades, beside the column of its name
+    if item.name == "step_between_runs":
+        since = number - item.effect.settings["at"] if item.effect is not None else number
+        fading = [np.where(since >= 0.0, np.exp(-np.maximum(since, 0.0) / (FADES * len(session))), 0.0)]
+    elif item.name in LEFT_OUT and item.last - item.first >= LEAST_WINDOW - 1:
+        inside, after = (number >= item.first) & (number <= item.last), number > item.last
+        length = item.last - item.first + 1.0
+        slope = np.where(inside, (number - 0.5 * (item.first + item.last)) / length, 0.0)
+        fading = [slope, np.where(after, np.exp(-np.maximum(number - item.last, 0.0) / length), 0.0)]
+    extra = np.column_stack([unit * session.s, unit * session.direction, unit * half, *fading])
     beside = extra - columns @ np.linalg.lstsq(columns, extra, rcond=None)[0]
     extra = extra[:, np.linalg.norm(beside, axis=0) > 0.05 * np.linalg.norm(extra, axis=0)]
     count = extra.shape[1]
@@ -534,20 +540,6 @@ def _uneven(changes: _Changes, member: int, shift: FloatArray) -> tuple[float, f
     own = (extra - columns @ np.linalg.lstsq(columns, extra, rcond=None)[0]) @ value
     share = float(np.sum((own - own.mean()) ** 2) / max(np.sum((shift - shift.mean()) ** 2), 1e-18))
     return float(fdtrc(count, changes.freedom - count, wald)), share
-
-
-def _fading(session: AxisSession, item: Candidate) -> list[FloatArray]:
-    """What a step or a disturbance would do that fades: columns (n,) beside the one of its name."""
-    number = np.arange(len(session), dtype=np.float64)
-    if item.name == "step_between_runs":
-        since = number - item.effect.settings["at"] if item.effect is not None else number
-        return [np.where(since >= 0.0, np.exp(-np.maximum(since, 0.0) / (FADES * len(session))), 0.0)]
-    if item.name not in LEFT_OUT or item.last - item.first < LEAST_WINDOW - 1:
-        return []
-    inside, after = (number >= item.first) & (number <= item.last), number > item.last
-    length = item.last - item.first + 1.0
-    slope = np.where(inside, (number - 0.5 * (item.first + item.last)) / length, 0.0)
-    return [slope, np.where(after, np.exp(-np.maximum(number - item.last, 0.0) / length), 0.0)]
 
 
 def _text(
@@ -791,7 +783,12 @@ def _taken_off(
     kept_effects = list(wanted)
     notes: list[str] = []
     while True:
-        left_out = _left_out(session, kept_effects)
+        left_out: IntArray = np.zeros(0, dtype=np.int64)
+        for item in kept_effects:  # no readings of a cell that would keep fewer than two
+            trial = np.union1d(left_out, item.left_out).astype(np.int64)
+            rest = np.bincount(np.delete(session.cell, trial), minlength=int(session.cell.max()) + 1)
+            if not len(item.left_out) or rest.min() >= 2:
+                left_out = trial
         removed = np.zeros(len(session))
         for item in kept_effects:
             if not len(item.left_out) or not np.isin(item.left_out, left_out).all():
@@ -807,17 +804,6 @@ def _taken_off(
         )
     figures = {key: {"before": before[key], "after": after.get(key, before[key])} for key in before}
     return removed, left_out, tuple(item.name for item in kept_effects), figures, notes
-
-
-def _left_out(session: AxisSession, effects: Sequence[AxisEffect]) -> IntArray:
-    """Readings that are left out; none of a cell that would keep fewer than two."""
-    chosen: IntArray = np.zeros(0, dtype=np.int64)
-    for item in effects:
-        trial = np.union1d(chosen, item.left_out).astype(np.int64)
-        rest = np.bincount(np.delete(session.cell, trial), minlength=int(session.cell.max()) + 1)
-        if not len(item.left_out) or rest.min() >= 2:
-            chosen = trial
-    return chosen
 
 
 def _residuals(session: AxisSession, grid: NoiseGrid, effects: Sequence[AxisEffect]) -> tuple[FloatArray, FloatArray]:
@@ -854,6 +840,16 @@ def _held_out(session: AxisSession, effects: Sequence[AxisEffect], left_out: Int
         squares.append((for_both[0], for_both[1]))
     total = np.sum(squares, axis=0) / len(kept)
     return float(np.sqrt(total[0])), float(np.sqrt(total[1]))
+
+
+def _suspects(search: Search) -> tuple[tuple[str, float], ...]:
+    """Names by what each explains by itself."""
+    gains = search.criteria([])[0]
+    best: dict[str, float] = {}
+    for candidate, gain in zip(search.candidates, gains, strict=True):
+        if candidate.tier == "named" and not candidate.free:
+            best[candidate.name] = max(best.get(candidate.name, 0.0), float(gain))
+    return tuple(sorted(best.items(), key=lambda item: -item[1]))
 
 
 def _compared(changes: _Changes, errors: ErrorTable) -> dict[str, Any]:

@@ -172,11 +172,24 @@ def _base(observed: Observed) -> BaseFit:
 def _analysed(
     measurement: Lengths | Deviations, observed: Observed, fit: BaseFit, options: DiagnoseOptions, show: Show
 ) -> Analysis:
+    # standard uncertainty of every reading, if it was stated
+    sigma_mm: FloatArray | None = None
+    if options.u_um is not None:
+        if not options.u_um > 0:
+            raise InputError(f"an uncertainty of {options.u_um:g} um was given; it must be above zero")
+        sigma_mm = np.full(len(observed), options.u_um * MM_PER_UM)
+    elif isinstance(observed, ObservedLengths) and "u_length_um" in observed.lengths.covariates:
+        sigma_mm = observed.lengths.covariates["u_length_um"] * MM_PER_UM
+    elif isinstance(observed, ObservedDeviations) and isinstance(measurement, Deviations):
+        if measurement.u_mm is not None:
+            sigma_mm = measurement.u_mm[observed.place, observed.component]
+    if sigma_mm is not None and np.isnan(sigma_mm).any():
+        sigma_mm = None
     return analyse(
         fit,
         most_named=options.max_effects,
         only=(*options.effects, *options.add) if options.effects else (),
-        sigma_mm=_sigma_mm(measurement, observed, options),
+        sigma_mm=sigma_mm,
         show=show,
     )
 
@@ -186,23 +199,6 @@ def observed_of(machine: Machine, measurement: Lengths | Deviations) -> Observed
     if isinstance(measurement, Lengths):
         return ObservedLengths(machine, measurement)
     return ObservedDeviations(machine, measurement)
-
-
-def _sigma_mm(measurement: Lengths | Deviations, observed: Observed, options: DiagnoseOptions) -> FloatArray | None:
-    """Standard uncertainty of every reading if it was stated."""
-    if options.u_um is not None:
-        if not options.u_um > 0:
-            raise InputError(f"an uncertainty of {options.u_um:g} um was given; it must be above zero")
-        return np.full(len(observed), options.u_um * MM_PER_UM)
-    if isinstance(observed, ObservedLengths):
-        own = observed.lengths.covariates.get("u_length_um")
-        return None if own is None or np.isnan(own).any() else own * MM_PER_UM
-    if not isinstance(observed, ObservedDeviations) or not isinstance(measurement, Deviations):
-        return None
-    if measurement.u_mm is None:
-        return None
-    u = measurement.u_mm[observed.place, observed.component]
-    return None if np.isnan(u).any() else np.asarray(u)
 
 
 def _completed(

@@ -225,7 +225,17 @@ def classes_of(analysis: Analysis, removed: int = 0) -> list[Classed]:
     """Return the classes of noise that the readings show beyond doubt; ``removed`` gross readings were left out."""
     text = f"{removed} reading(s) lie more than {GROSS:g} standard deviations from their neighbours; they were left out"
     found = [Classed("outliers", {"count": float(removed)}, 1.0, text)] if removed else []
-    return [*found, *_trend(analysis, leftover(analysis.design, analysis.chosen)), *_quantised(analysis)]
+    found += _trend(analysis, leftover(analysis.design, analysis.chosen))
+    # readings that all lie on a grid whose step is as large as the noise
+    values = analysis.fit.observed.value_mm
+    apart = np.diff(np.unique(np.round(values, 7)))
+    step = float(apart.min()) if apart.size else 0.0
+    if apart.size and step >= COARSE * float(np.sqrt(analysis.noise.variances.white)):
+        off = np.abs(values / step - np.round(values / step))
+        if float(np.mean(off < 0.01)) >= ON_GRID:
+            text = f"readings are multiples of {step / MM_PER_UM:g} um, as coarse as the noise"
+            found.append(Classed("quantisation", {"step_um": step / MM_PER_UM}, 1.0, text))
+    return found
 
 
 def gross_readings(analysis: Analysis) -> IntArray:
@@ -360,20 +370,3 @@ def _trend(analysis: Analysis, residual: FloatArray) -> list[Classed]:
         return []
     text = f"the variance of the noise {'grows' if slope > 0 else 'falls'} with time"
     return [Classed("variance_trend", {"slope_per_sd": slope, "z": z}, 1.0, text)]
-
-
-def _quantised(analysis: Analysis) -> list[Classed]:
-    """Readings that all lie on a grid whose step is as large as the noise."""
-    values = analysis.fit.observed.value_mm
-    sigma = float(np.sqrt(analysis.noise.variances.white))
-    apart = np.diff(np.unique(np.round(values, 7)))
-    if not apart.size:
-        return []
-    step = float(apart.min())
-    if step < COARSE * sigma:
-        return []
-    off = np.abs(values / step - np.round(values / step))
-    if float(np.mean(off < 0.01)) < ON_GRID:
-        return []
-    text = f"readings are multiples of {step / MM_PER_UM:g} um, as coarse as the noise"
-    return [Classed("quantisation", {"step_um": step / MM_PER_UM}, 1.0, text)]

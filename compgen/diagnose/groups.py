@@ -274,10 +274,9 @@ def _static_terms(c: Covariates) -> Iterator[Term]:
     yield "x with y with z", ("x", "y", "z"), triple, False, True
 
 
-def _direction_terms(c: Covariates) -> Iterator[Term]:
-    if c.approach is None:
-        return
-    for a, letter in enumerate("xyz"):
+def _condition_terms(c: Covariates) -> Iterator[Term]:
+    for a, letter in enumerate("xyz" if c.approach is not None else ""):
+        assert c.approach is not None
         sign = c.approach[:, [a]]
         if not np.any(sign) or np.all(sign == sign[0]):
             continue
@@ -296,9 +295,6 @@ def _direction_terms(c: Covariates) -> Iterator[Term]:
         others = [b for b in range(3) if b > a]
         if others:
             yield f"directions of {letter} and others", (name,), sign * c.approach[:, others], False, True
-
-
-def _load_terms(c: Covariates) -> Iterator[Term]:
     for what, values in (("feed", c.feed), ("load", c.load)):
         if values is None:
             continue
@@ -335,8 +331,7 @@ def _line_terms(c: Covariates) -> Iterator[Term]:
 
 TERMS: Sequence[Callable[[Covariates], Iterator[Term]]] = (
     _static_terms,
-    _direction_terms,
-    _load_terms,
+    _condition_terms,
     _slow_terms,
     _line_terms,
 )

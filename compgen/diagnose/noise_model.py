@@ -325,7 +325,19 @@ def noise_of(
     """
     layout = fit.observed.layout
     if not has_repeats(layout):
-        return _without_repeats(fit, fixed, sigma_mm)
+        # from the residuals of the base model and of the groups ``fixed``: an assumption, not a measurement
+        residual, count = fit.residual_mm, len(fit.residual_mm)
+        design = np.hstack([fit.jacobian, _unit_columns(fixed, count)])
+        q = np.linalg.qr(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300))[0]
+        residual = residual - q @ (q.T @ residual)
+        residual = residual * np.sqrt(count / max(count - design.shape[1], 1))
+        scale = np.ones(count) if sigma_mm is None else sigma_mm / np.sqrt(np.mean(sigma_mm**2))
+        problem = reml_problem(layout, residual / scale, np.zeros((count, 0)), repeats=False, runs=False)
+        variances, quadratic, criterion, _ = fit_reml(problem, steps=20)
+        if sigma_mm is None:
+            return Noise(variances, scale, quadratic, 0, criterion, "assumed", spacing_of(layout))
+        variances = Variances(float(np.mean(sigma_mm**2)), variances.own, variances.common)
+        return Noise(variances, scale, quadratic, 0, criterion, "given", spacing_of(layout))
     scale = before.scale if before is not None else noise_scale(fit)
     residual = fit.residual_mm / scale
     problem = reml_problem(layout, residual, _unit_columns(fixed, len(residual)) / scale[:, None])
@@ -339,26 +351,6 @@ def _unit_columns(groups: Sequence[Group], count: int) -> FloatArray:
         return np.zeros((count, 0))
     columns = np.hstack([group.columns for group in groups])
     return np.asarray(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
-
-
-def _without_repeats(fit: BaseFit, fixed: Sequence[Group], sigma_mm: FloatArray | None) -> Noise:
-    """Noise from the residuals of the base model and of the groups ``fixed``: an assumption, not a measurement."""
-    residual = fit.residual_mm
-    columns = _unit_columns(fixed, len(residual))
-    design = np.hstack([fit.jacobian, columns])
-    q = np.linalg.qr(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300))[0]
-    residual = residual - q @ (q.T @ residual)
-    freedom = max(len(residual) - design.shape[1], 1)
-    residual = residual * np.sqrt(len(residual) / freedom)
-    scale = np.ones(len(residual)) if sigma_mm is None else sigma_mm / np.sqrt(np.mean(sigma_mm**2))
-    problem = reml_problem(
-        fit.observed.layout, residual / scale, np.zeros((len(residual), 0)), repeats=False, runs=False
-    )
-    variances, quadratic, criterion, _ = fit_reml(problem, steps=20)
-    source = "assumed" if sigma_mm is None else "given"
-    if sigma_mm is not None:
-        variances = Variances(float(np.mean(sigma_mm**2)), variances.own, variances.common)
-    return Noise(variances, scale, quadratic, 0, criterion, source, spacing_of(fit.observed.layout))
 
 
 def run_ratio(fit: BaseFit, fixed: Sequence[Group], noise: Noise, enough: float = 0.0) -> float:

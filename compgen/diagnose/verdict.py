@@ -228,8 +228,13 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
         reasons.append("small compared with what has no name")
     if name in NEVER_CONFIRMED or visible < LEAST_VISIBLE:
         reasons.append(f"the plan shows {100 * visible:.1f} % of it only: any misfit could be reshaped into it")
-    if excess := _beyond_plausible(analysis, group):
-        reasons.append(excess)
+    if (effect := design.groups[group].effect) is not None:
+        values, covariance, _ = contribution(design, analysis.chosen, group)
+        for parameter, value, u in zip(effect.card.parameters, values, np.sqrt(np.diag(covariance)), strict=False):
+            size = (abs(value) - 2 * u) / parameter.si_per_unit
+            if parameter.plausible > 0 and size > 3 * parameter.plausible:
+                reasons.append(f"its size, {parameter.name} = {value / parameter.si_per_unit:.3g}, is not plausible")
+                break
     if analysis.noise.source == "assumed":
         reasons.append("the noise is assumed, not measured")
     others = tuple(alternatives(design, analysis.rules, analysis.chosen, group))
@@ -239,20 +244,6 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
         first, group, "tentative" if reasons else "confirmed", others[0].weight if others else weight, others, visible,
         chi2, p, tuple(reasons), not inexact,
     )  # fmt: skip
-
-
-def _beyond_plausible(analysis: Analysis, group: int) -> str:
-    """Say that a fitted parameter is far larger than on any machine."""
-    item = analysis.design.groups[group]
-    if item.effect is None:
-        return ""
-    values, covariance, _ = contribution(analysis.design, analysis.chosen, group)
-    u = np.sqrt(np.diag(covariance))
-    for parameter, value, own in zip(item.effect.card.parameters, values, u, strict=False):
-        size = (abs(value) - 2 * own) / parameter.si_per_unit
-        if parameter.plausible > 0 and size > 3 * parameter.plausible:
-            return f"its size, {parameter.name} = {value / parameter.si_per_unit:.3g}, is not plausible"
-    return ""
 
 
 def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: list[int]) -> list[Unknown]:
