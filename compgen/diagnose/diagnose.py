@@ -140,14 +140,14 @@ def diagnose(
                 f"{len(observed)} readings with {fit.jacobian.shape[1]} unknowns leave {freedom} degrees of freedom; "
                 "a diagnosis needs at least 20: measure more lines"
             )
-        analysis = _analysed(measurement, observed, fit, chosen, show)
+        analysis = _analysed(observed, fit, chosen, show)
         before = analysis.fit if before is fit else before
         gross = gross_readings(analysis)
         if len(gross):
             show(f"leaving out {len(gross)} gross readings")
             observed = observed.part(np.setdiff1d(np.arange(len(observed)), gross))
             plain = before is analysis.fit
-            analysis = _analysed(measurement, observed, _base(observed), chosen, show)
+            analysis = _analysed(observed, _base(observed), chosen, show)
             before = analysis.fit if plain else before
         bursts = disturbed_readings(analysis)
         classed += disturbed_class(bursts, left_out=chosen.leave_out_disturbed)
@@ -155,7 +155,7 @@ def diagnose(
             show("leaving out disturbed readings")
             loud = np.concatenate([burst.rows for burst in bursts])
             observed = observed.part(np.setdiff1d(np.arange(len(observed)), loud))
-            analysis = _analysed(measurement, observed, _base(observed), chosen, show)
+            analysis = _analysed(observed, _base(observed), chosen, show)
         return _completed(machine, analysis, chosen, show, before, classed, len(gross))
 
 
@@ -169,9 +169,7 @@ def _base(observed: Observed) -> BaseFit:
     return fit_smooth(observed.minus(np.sum(present, axis=0)))
 
 
-def _analysed(
-    measurement: Lengths | Deviations, observed: Observed, fit: BaseFit, options: DiagnoseOptions, show: Show
-) -> Analysis:
+def _analysed(observed: Observed, fit: BaseFit, options: DiagnoseOptions, show: Show) -> Analysis:
     # standard uncertainty of every reading, if it was stated
     sigma_mm: FloatArray | None = None
     if options.u_um is not None:
@@ -180,9 +178,8 @@ def _analysed(
         sigma_mm = np.full(len(observed), options.u_um * MM_PER_UM)
     elif isinstance(observed, ObservedLengths) and "u_length_um" in observed.lengths.covariates:
         sigma_mm = observed.lengths.covariates["u_length_um"] * MM_PER_UM
-    elif isinstance(observed, ObservedDeviations) and isinstance(measurement, Deviations):
-        if measurement.u_mm is not None:
-            sigma_mm = measurement.u_mm[observed.place, observed.component]
+    elif isinstance(observed, ObservedDeviations) and observed.deviations.u_mm is not None:
+        sigma_mm = observed.deviations.u_mm[observed.place, observed.component]
     if sigma_mm is not None and np.isnan(sigma_mm).any():
         sigma_mm = None
     return analyse(
