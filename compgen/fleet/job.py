@@ -494,6 +494,39 @@ def add_machine(path: Path, name: str, keys: Mapping[str, Any]) -> MachineJob:
 HOURLY = Every(60)
 UNIT_NAME = "compgen-recal"
 
+#: The files of systemd.
+SERVICE = """[Unit]
+Description=compgen recalibration of {names}
+After=network-online.target
+
+[Service]
+Type=oneshot
+{command}
+"""
+WATCH = """# in place of the timers: one process that keeps the schedules of the job file itself
+[Unit]
+Description=compgen recalibration, watching
+After=network-online.target
+
+[Service]
+{command}
+Restart=on-failure
+TimeoutStopSec=15min
+
+[Install]
+WantedBy=multi-user.target
+"""
+TIMER = """[Unit]
+Description=when {names} is recalibrated
+
+[Timer]
+{lines}
+Unit={unit}.service
+
+[Install]
+WantedBy=timers.target
+"""
+
 
 def units(job: Job, program: str) -> Mapping[str, str]:
     """Return the files by which a scheduler of the system drives ``volcomp recal run``: texts by name.
@@ -510,43 +543,18 @@ def units(job: Job, program: str) -> Mapping[str, str]:
         whole = len(groups) == 1
         unit = UNIT_NAME if whole else f"{UNIT_NAME}-{number}"
         words = [program, "recal", "run", *([] if whole else names), "--job", str(job.path)]
-        files[f"{unit}.service"] = _service(job, words, names)
-        files[f"{unit}.timer"] = _timer(schedule, unit, names)
+        files[f"{unit}.service"] = SERVICE.format(names=_first_names(names), command=_command_lines(job, words))
+        lines_of_timer = [*systemd_lines(schedule), *([] if isinstance(schedule, Every) else ["Persistent=true"])]
+        files[f"{unit}.timer"] = TIMER.format(names=_first_names(names), lines="\n".join(lines_of_timer), unit=unit)
         command, expression = shlex.join(words).replace("%", r"\%"), cron_expression(schedule)
         if expression is None:
             minutes = schedule.minutes if isinstance(schedule, Every) else 0
             expression = f"# every {minutes} minutes cannot be expressed by cron; use {unit}.timer:"
         lines.append(f"{expression} {command}")
     files["crontab"] = "\n".join(lines) + "\n"
-    files[f"{UNIT_NAME}-watch.service"] = _watch(job, program)
+    watch = [program, "recal", "watch", "--job", str(job.path)]
+    files[f"{UNIT_NAME}-watch.service"] = WATCH.format(command=_command_lines(job, watch))
     return files
-
-
-def _service(job: Job, words: Sequence[str], names: Sequence[str]) -> str:
-    return f"""[Unit]
-Description=compgen recalibration of {_first_names(names)}
-After=network-online.target
-
-[Service]
-Type=oneshot
-{_command_lines(job, words)}
-"""
-
-
-def _watch(job: Job, program: str) -> str:
-    return f"""# in place of the timers: one process that keeps the schedules of the job file itself
-[Unit]
-Description=compgen recalibration, watching
-After=network-online.target
-
-[Service]
-{_command_lines(job, [program, "recal", "watch", "--job", str(job.path)])}
-Restart=on-failure
-TimeoutStopSec=15min
-
-[Install]
-WantedBy=multi-user.target
-"""
 
 
 def _command_lines(job: Job, words: Sequence[str]) -> str:
@@ -556,21 +564,6 @@ def _command_lines(job: Job, words: Sequence[str]) -> str:
         text = _escaped(word).replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
         command.append(f'"{text}"' if any(char in word for char in " \t'\";") else text)
     return f"WorkingDirectory={_escaped(str(job.path.parent))}\nExecStart={' '.join(command)}"
-
-
-def _timer(schedule: Schedule, unit: str, names: list[str]) -> str:
-    lines = "\n".join(systemd_lines(schedule))
-    persistent = "" if isinstance(schedule, Every) else "Persistent=true\n"
-    return f"""[Unit]
-Description=when {_first_names(names)} is recalibrated
-
-[Timer]
-{lines}
-{persistent}Unit={unit}.service
-
-[Install]
-WantedBy=timers.target
-"""
 
 
 def _first_names(names: Sequence[str]) -> str:
