@@ -13,12 +13,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.data.lengths import Lengths
+from compgen.data.lengths import MOST_WHOLE, Lengths
 from compgen.data.records import COVARIATE_COLUMNS, LABEL_COLUMNS, POSITION_COLUMNS
 from compgen.errors import InputError
 
-#: Archives of so many readings are read whole, and are then what text files are.
-MOST_WHOLE = 200_000
 #: Readings of which an identification from an archive keeps the residuals, and with which it looks for disturbances.
 SAMPLE = 20_000
 #: Readings that are in memory at a time.

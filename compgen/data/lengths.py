@@ -24,6 +24,9 @@ from compgen.data.records import (
     within,
 )
 
+#: Archives of so many readings are read whole, and are then what text files are.
+MOST_WHOLE = 200_000
+
 __all__ = [
     "POSITION_COLUMNS",
     "Lengths",

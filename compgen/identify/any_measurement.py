@@ -14,7 +14,7 @@ import numpy as np
 
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.error_table import ErrorTable
-from compgen.data.lengths import Lengths, read_lengths
+from compgen.data.lengths import MOST_WHOLE, Lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import ARCHIVE, detect_format
@@ -65,7 +65,7 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
         for lengths together with deviations, six-DOF readings without an instrument file, or one without such readings.
     """
     if len(paths) == 1 and instrument is None and str(paths[0]).lower().endswith(ARCHIVE):
-        from compgen.data.length_archive import MOST_WHOLE, open_archive
+        from compgen.data.length_archive import open_archive
 
         archive = open_archive(paths[0])
         if len(archive) > MOST_WHOLE:

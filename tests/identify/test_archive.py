@@ -17,6 +17,7 @@ from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify import (
     IdentifyOptions,
     SystematicInputs,
+    any_measurement,
     identify,
     identify_measurement,
     read_measurement,
@@ -68,7 +69,7 @@ def streamed(monkeypatch):
     """Archives of more than a few readings are not read whole, and chunks end in the middle of a stop."""
     monkeypatch.setattr(length_archive, "CHUNK", 7001)
     monkeypatch.setattr(streamed_lengths, "CHUNK", 7001)
-    monkeypatch.setattr(length_archive, "MOST_WHOLE", 1000)
+    monkeypatch.setattr(any_measurement, "MOST_WHOLE", 1000)
     monkeypatch.setattr(length_archive, "SAMPLE", 4000)
 
 
@@ -293,7 +294,7 @@ def test_readings_on_the_fly_are_simulated_and_identified_as_a_user_does(tmp_pat
     assert made["readings"] == len(archive) > 10_000 and made["stations"] == ["LT1", "LT2", "LT3", "LT4"]
     step = np.linalg.norm(np.diff(archive.taken(slice(0, 400)).position_mm[::4], axis=0), axis=1)
     assert np.median(step) == pytest.approx(3000.0 / 60.0 / 5.0)
-    monkeypatch.setattr(length_archive, "MOST_WHOLE", 1000)
+    monkeypatch.setattr(any_measurement, "MOST_WHOLE", 1000)
     assert run_command(cli, ["identify", "zha-gantry", str(path), "--out", str(tmp_path / "found"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["readings"] == found["readings_used"] == len(archive)
