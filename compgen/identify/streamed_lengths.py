@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.length_archive import CHUNK, MOST_WHOLE, LengthArchive
-from compgen.data.lengths import Lengths
+from compgen.data.length_archive import CHUNK, LengthArchive
+from compgen.data.lengths import MOST_WHOLE, Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.data.records import POSITION_COLUMNS
