@@ -113,6 +113,15 @@ def test_another_tool_is_served_by_the_curves(make_errors):
     np.testing.assert_allclose(added(tables, position, tool=tool), due, atol=1e-15)
 
 
+def test_the_same_tool_turned_round_is_another_tool(make_errors):
+    """The field holds for the tool offset of the machine file only, not for minus that offset."""
+    tables = parsed(dict(compgen.export(PLAIN, make_errors(PLAIN), NAME).files))
+    position = np.array([[100.0, 200.0, -300.0], [-250.0, 600.0, 50.0]])
+    turned = -np.array(PLAIN.tool_offset_mm)
+    due = -volumetric_error(PLAIN, tables.curves, position, turned)
+    assert added(tables, position, tool=turned) == pytest.approx(due, abs=1e-12)
+
+
 def test_the_curves_file_is_an_errors_file(make_errors, tmp_path):
     errors = make_errors(PLAIN)
     (tmp_path / "n.errors.csv").write_text(compgen.export(PLAIN, errors, NAME).files["neutral.errors.csv"])

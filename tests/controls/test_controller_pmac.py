@@ -193,6 +193,16 @@ def test_a_varying_reversal_becomes_ixx86_and_a_backlash_table():
         assert up - down == pytest.approx(-curve.at(np.array([x]))[0], abs=2 / 16000)
 
 
+def test_backlash_tables_are_defined_from_the_highest_motor_down():
+    """Software Reference, DEFINE BLCOMP: in another order the control gives ERR003."""
+    ends = [np.array(travel) for travel in TRAVELS]
+    varying = {(k, k): compgen.Curve(at, np.array([-0.006, -0.014]), np.full(2, np.nan)) for k, at in enumerate(ends)}
+    exported, tables = made(machine_with(), errors_of(EXX=1e-5), ReversalCurves(varying))
+    assert [table.motor for table in tables.backlash] == sorted((t.motor for t in tables.backlash), reverse=True)
+    assert len(tables.backlash) == 3
+    assert [text for text in CONTROL(machine_with()).violations(tables) if "order" in text] == []
+
+
 @pytest.mark.parametrize("counts", [1000.0, -1000.0])
 @pytest.mark.parametrize("home", [0.0, 120.0])
 def test_a_varying_reversal_leaves_minus_half_of_it_after_either_direction(counts, home):
