@@ -78,7 +78,7 @@ def kernels(
     """Correlation matrices (T, T) of a block: one per time constant, then two of single runs."""
     apart = np.abs(time[:, None] - time[None, :]) / spacing
     found = [np.exp(-apart / tau) for tau in TAU]
-    if runs and len(np.unique(run)) > 1:
+    if runs:
         same = (run[:, None] == run[None, :]).astype(np.float64)
         found += [same, same * np.outer(in_run, in_run)]
     else:
@@ -221,7 +221,8 @@ def reml_problem(
             continue
         taken = np.unique(matrix.indices)
         stop, few = block.stop[taken], matrix[:, taken]
-        pattern = kernels(time[stop], spacing, layout.run[stop], layout.in_run[stop], runs=runs)
+        run = layout.run[stop]  # within one run alone, what a run shares is a constant, which the fit takes up
+        pattern = kernels(time[stop], spacing, run, layout.in_run[stop], runs=runs and len(np.unique(run)) > 1)
         between = np.stack([np.ascontiguousarray(few @ (few @ kernel).T) for kernel in pattern])
         channels = np.stack([matrix @ turned[c] for c in range(block.channels)])
         parts.append(_Part(between, np.ascontiguousarray(channels[:, :, 0]), channels[:, :, 1:]))

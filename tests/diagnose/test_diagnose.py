@@ -20,6 +20,7 @@ from compgen.diagnose.noise_model import (
     fit_reml,
     kernels,
     noise_of,
+    pieces_of,
     reml_problem,
     rotation,
     whitener,
@@ -175,6 +176,24 @@ def test_whitening_turns_the_covariance_into_the_identity(gantry):
     covariance = common[np.ix_(stop, stop)] + own[np.ix_(stop, stop)] * (station[:, None] == station[None, :])
     covariance += variances.white * np.eye(len(stop))
     assert np.allclose(white(white(covariance).T), np.eye(len(stop)), atol=1e-8)
+
+
+def test_a_covariance_is_factorised_in_pieces_also_where_a_piece_lies_within_one_run():
+    """Two runs of 210 stops: most pieces contain one run only, whose offset and drift connect them all the same."""
+    count, white, variances = 210, 1e-8, np.full(7, 2e-9)
+    time, run, in_run = np.arange(2.0 * count), np.repeat([0, 1], count), np.tile(np.linspace(-1.0, 1.0, count), 2)
+    same = run[:, None] == run[None, :]
+    covariance = white * np.eye(2 * count) + 2e-9 * same * (1.0 + np.outer(in_run, in_run))
+    for tau in (3.0, 10.0, 40.0, 200.0, 2000.0):
+        covariance += 2e-9 * np.exp(-np.abs(time[:, None] - time[None, :]) / tau)
+    states, whitened = np.zeros((7, 2 * count)), np.empty_like(covariance)
+    for piece in pieces_of(time, run, in_run, white, variances):
+        rows = slice(piece.first, piece.last)
+        new = piece.inverse @ covariance[rows] - piece.known @ states
+        whitened[rows] = new
+        states = piece.kept[:, None] * states + piece.learnt @ new
+    factor = np.linalg.cholesky(covariance)
+    assert np.allclose(whitened, factor.T, atol=1e-9 * np.abs(factor).max())
 
 
 def test_an_orthonormal_basis_spans_the_columns():
