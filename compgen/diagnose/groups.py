@@ -487,7 +487,9 @@ def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
             if count and gain > count + CHANCE * np.sqrt(2.0 * count) and evidence > least:
                 best, least = (basis, columns), evidence
         if best is not None:
-            found.append(Wider(axis, best[0], Group(f"wider curves of {AXES[axis]}", "base", Placed(best[1]))))
+            # what is visible of a group is a share of its whole span: the curves of the fit belong to it
+            whole = Placed(np.hstack([fit.jacobian[:, : size_of(old)], best[1]]))
+            found.append(Wider(axis, best[0], Group(f"wider curves of {AXES[axis]}", "base", whole)))
     return tuple(found)
 
 
