@@ -18,7 +18,6 @@ import pytest
 import sqlalchemy as sa
 
 from compgen.cli import cli
-from compgen.cli import shared_options as parallel_options
 from compgen.cli.common import run_command
 from compgen.data.deviations import Deviations, format_deviations
 from compgen.data.lengths import read_lengths
@@ -336,7 +335,7 @@ def test_diagnoses_of_many_measurements_are_the_same_in_processes(
     said = capsys.readouterr().out
     assert code == 1 and "wrong.lengths.csv: " in said
     monkeypatch.setattr(pool, "close", lambda: None)
-    monkeypatch.setattr(parallel_options, "opened_workers", lambda workers, address: pool)
+    monkeypatch.setattr(parallel, "opened_workers", lambda workers, address: pool)
     assert run_command(cli, [*words, "--out", str(tmp_path / "there"), "--workers", "2"]) == code
     assert capsys.readouterr().out == said
     assert listing(tmp_path / "here") == listing(tmp_path / "there")
