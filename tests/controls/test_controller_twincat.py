@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import compgen
 from compgen.controls import CONTROLLERS, SourceFile
+from compgen.controls.twincat_tables import PlaneTable, units_outwards
 from compgen.data import toml_files
 from compgen.data.error_table import ReversalCurves
 from compgen.data.machine import Axis, Chain, Machine
@@ -310,3 +311,29 @@ def test_damaged_text_is_read_or_refused(place, piece):
             parsed(text[:at] + piece + text[at + len(piece) :])
         except InputError:
             continue
+
+
+# --- positions in whole units ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("travel_mm", "at_mm", "units"),
+    [
+        ((-30.0, 50.0), (-30.0, 0.0, 50.0), (-300000, 0, 500000)),  # whole units stay
+        (
+            (-30.00004, 50.00004),
+            (-30.00004, 50.00004),
+            (-300001, 500001),
+        ),  # ends move outwards, so that they are covered
+        ((-30.00004, 50.00004), (-10.00004, 20.00004), (-100000, 200000)),  # nodes within are rounded
+    ],
+)
+def test_nodes_in_whole_units_still_cover_the_travel(travel_mm, at_mm, units):
+    axis = Axis(travel_mm, np.linspace(*travel_mm, 3))
+    machine = Machine("m", Chain("WFYXZT"), (axis, axis, axis))
+    assert units_outwards(machine, 0, np.array(at_mm)).tolist() == list(units)
+
+
+def test_a_plane_of_one_row_holds_its_value_along_the_second_master():
+    plane = PlaneTable((0, 1), (0.0, 0.0), 10.0, np.array([[4.0, 8.0]]))
+    assert plane.at(np.array([0.0, 5.0, 10.0]), np.array([-3.0, 0.0, 99.0])) == pytest.approx([4.0, 6.0, 8.0])
