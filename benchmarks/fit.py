@@ -37,9 +37,8 @@ from compgen.data.machine import Axis, Chain, Machine
 from compgen.data.names import CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.fit import FitOptions, fit, zero_ends
 from compgen.fit.bounds import Bounds, constraint_rows
-from compgen.fit.fitting import prepare, smoothness, solve
+from compgen.fit.fitting import CurveProblem, prepare, smoothness, solve, solve_curves
 from compgen.fit.smoother import Smoother, second_difference
-from compgen.fit.stacked import CurveProblem, solve_curves
 from compgen.kinematics import modelled_errors
 
 OURS, OSQP, CVXPY = "compgen", "OSQP cold", "cvxpy+Clarabel"

@@ -7,8 +7,15 @@ from compgen.resources import load_on_first_use
 if TYPE_CHECKING:
     from compgen.accuracy.compare import CompareOptions, Comparison, compare_errors, compare_fields, compare_runs
     from compgen.accuracy.evaluate import Accuracy, accuracy_of_errors, straightness
-    from compgen.accuracy.field import ErrorField, ErrorSource, aligned, error_source, volume_figures
-    from compgen.accuracy.figure import ComparedFigure, Figure
+    from compgen.accuracy.field import (
+        ComparedFigure,
+        ErrorField,
+        ErrorSource,
+        Figure,
+        aligned,
+        error_source,
+        volume_figures,
+    )
     from compgen.accuracy.positioning import (
         PositioningTest,
         RunStatistics,

@@ -23,24 +23,25 @@ from compgen.accuracy.evaluate import (
 )
 from compgen.accuracy.field import (
     Alignment,
+    ComparedFigure,
     ErrorField,
     ErrorSource,
+    Figure,
     Spread,
     aligned,
     independent_spread,
     unknown_spread,
     volume_figures,
 )
-from compgen.accuracy.figure import ComparedFigure, Figure
 from compgen.accuracy.positioning import EDITIONS, LATEST, SAME_TARGET_MM, RunStatistics, SetupBudget, accuracy_of_runs
 from compgen.data.csv_files import FloatArray
-from compgen.data.declared import option
 from compgen.data.deviations import Deviations
 from compgen.data.display import Bars, Drawable, Overview, Panel
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, ERROR_INDEX, MM_PER_UM, error_named
+from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.identify.covariance import normalized_error
 from compgen.kinematics.curves import hat_matrix

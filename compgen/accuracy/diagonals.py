@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from compgen.accuracy.evaluate import Accuracy
-from compgen.accuracy.figure import Figure
+from compgen.accuracy.field import Figure
 from compgen.accuracy.positioning import (
     LATEST,
     MEAN_UP,

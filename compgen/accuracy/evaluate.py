@@ -16,12 +16,12 @@ from compgen.accuracy.field import (
     Alignment,
     ErrorField,
     ErrorSource,
+    Figure,
     aligned,
     grid_points,
     range_weight,
     volume_figures,
 )
-from compgen.accuracy.figure import Figure
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Bars, Drawable, Overview, Panel, shortened
 from compgen.data.error_table import Curve, ReversalCurves, read_reversal

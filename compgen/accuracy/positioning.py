@@ -10,11 +10,11 @@ import numpy as np
 from scipy.special import gammaln
 
 from compgen.accuracy.evaluate import Accuracy
-from compgen.accuracy.figure import Figure
+from compgen.accuracy.field import Figure
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.csv_files import FloatArray
-from compgen.data.declared import option
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import option
 from compgen.errors import InputError
 
 # What a positioning test's set-up adds to the uncertainty of its figures, in the manner of ISO/TR 230-9.

@@ -10,13 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controls.isg_kernel import ANGLE_DIGITS, LENGTH_DIGITS, POSITION_DIGITS, IsgTables, VolumetricController
-from compgen.controls.isg_parameters import (
+from compgen.controls.isg_kernel import (
+    ANGLE_DIGITS,
     ARGUMENTS,
     CONTROL_NAMES,
     ISO_NAMES,
+    LENGTH_DIGITS,
+    POSITION_DIGITS,
     ErrorParameter,
+    IsgTables,
     ParameterFile,
+    VolumetricController,
     check_name,
     collect,
     is_rotary,

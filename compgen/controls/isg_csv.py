@@ -15,17 +15,15 @@ import numpy as np
 
 from compgen.controls.isg_kernel import (
     ANGLE_DIGITS,
-    LENGTH_DIGITS,
-    POSITION_DIGITS,
-    IsgCsvSettings,
-    IsgTables,
-    VolumetricController,
-)
-from compgen.controls.isg_parameters import (
     ARGUMENTS,
     CONTROL_NAMES,
+    LENGTH_DIGITS,
+    POSITION_DIGITS,
     ErrorParameter,
+    IsgCsvSettings,
+    IsgTables,
     ParameterFile,
+    VolumetricController,
     check_name,
     is_rotary,
 )

@@ -10,13 +10,13 @@ import numpy as np
 
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.csv_files import FloatArray
-from compgen.data.declared import option
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest
 from compgen.data.names import MM_PER_UM
+from compgen.data.toml_files import option
 from compgen.diagnose.analysis import Analysis, analyse
 from compgen.diagnose.axis_diagnosis import AxisDiagnosis, findings_of
 from compgen.diagnose.axis_session import Order

@@ -16,11 +16,11 @@ import numpy as np
 
 from compgen.data.axis_runs import AxisRuns, format_axis_runs
 from compgen.data.csv_files import FloatArray
-from compgen.data.declared import option
 from compgen.data.deviations import Deviations, format_deviations
 from compgen.data.error_table import ErrorTable, ReversalCurves, format_errors, format_reversal
 from compgen.data.lengths import Lengths, format_lengths
 from compgen.data.names import AXES
+from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.foreign.cells import Table
 from compgen.foreign.column_names import (

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from compgen.data.csv_files import FloatArray, read_csv
-from compgen.data.declared import option
 from compgen.data.lengths import POSITION_COLUMNS, Lengths
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest
 from compgen.data.names import MM_PER_UM
+from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.adjust.starts import station_start

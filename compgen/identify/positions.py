@@ -17,10 +17,9 @@ from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify.adjust.problem import SeparationProblem
 from compgen.identify.adjust.propagation import Adjustment
-from compgen.identify.adjust.rank import determined_factor
 from compgen.identify.adjust.residual_tests import misfit_of, residual_series
 from compgen.identify.adjust.robust import fit_accepted, rejected_components
-from compgen.identify.adjust.solver import LeastSquaresSolution, factorise, solve
+from compgen.identify.adjust.solver import LeastSquaresSolution, determined_factor, factorise, solve
 from compgen.identify.adjust.unknowns import (
     ErrorParameters,
     State,

@@ -17,7 +17,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import approach_of
-from compgen.identify.adjust.levels import levels_of
+from compgen.identify.adjust.grid_problem import levels_of
 from compgen.identify.adjust.robust import time_order
 from compgen.identify.adjust.unknowns import IntArray
 

@@ -26,10 +26,9 @@ from compgen.errors import ConvergenceError, InputError
 from compgen.identify.adjust.path_problem import Chunk, Noise, PathModel, Sums, chunk_of, path_model
 from compgen.identify.adjust.problem import LengthProblem
 from compgen.identify.adjust.propagation import SystematicInputs
-from compgen.identify.adjust.rank import Rank, determined_factor, unknown_names
 from compgen.identify.adjust.residual_tests import misfit_of, residual_series
 from compgen.identify.adjust.robust import LIMIT, MOST_REJECTED, Rejected, standardised_spread
-from compgen.identify.adjust.solver import Factor, step_levers
+from compgen.identify.adjust.solver import Factor, Rank, determined_factor, step_levers, unknown_names
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State, check_travel, common_tool
 from compgen.identify.identification import Identification, error_table, uncertainty_scale, worst_uncertainty
 from compgen.identify.options import IdentifyOptions

@@ -18,10 +18,9 @@ from compgen.data.names import MM_PER_UM
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identify.adjust.propagation import Adjustment
-from compgen.identify.adjust.rank import Rank, describe_rank, determined_factor, unknown_names
 from compgen.identify.adjust.residual_tests import EXPLAINS, Cause, drift_of_repeats, labels_of, split_labels
 from compgen.identify.adjust.robust import RobustFit, WeightedReadings, belonging, explain_rejected, fit_robustly
-from compgen.identify.adjust.solver import Factor, solve
+from compgen.identify.adjust.solver import Factor, Rank, describe_rank, determined_factor, solve, unknown_names
 from compgen.identify.adjust.starts import (
     StationStart,
     affine_start,

@@ -14,9 +14,8 @@ from compgen.data.lengths import Lengths
 from compgen.data.names import MM_PER_UM
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjust.problem import LEVER_MM, PointEquations, SeparationProblem, Sights, frame_rotation
-from compgen.identify.adjust.rank import determined_factor
 from compgen.identify.adjust.robust import MOST_ROUNDS, Rejected, accepted_readings, check_rejected
-from compgen.identify.adjust.solver import LeastSquaresSolution, factorise, solve
+from compgen.identify.adjust.solver import LeastSquaresSolution, determined_factor, factorise, solve
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State
 from compgen.kinematics.exact_chain import cross_matrices
 from compgen.kinematics.first_order import tool_of

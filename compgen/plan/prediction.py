@@ -23,7 +23,7 @@ from compgen.effects.structure import SignError, Squareness
 from compgen.errors import InputError
 from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identify.adjust.problem import LengthProblem, length_problem
-from compgen.identify.adjust.rank import ZERO_EIGENVALUE, Rank, describe_rank, unknown_names
+from compgen.identify.adjust.solver import ZERO_EIGENVALUE, Rank, describe_rank, unknown_names
 from compgen.identify.adjust.unknowns import ErrorParameters, State, check_travel, error_parameters
 from compgen.identify.covariance import error_values
 from compgen.identify.identification import table_of_values

@@ -18,7 +18,7 @@ from compgen.data.names import COVERAGE, error_named
 if TYPE_CHECKING:
     from compgen.accuracy.compare import Comparison
     from compgen.accuracy.evaluate import Accuracy
-    from compgen.accuracy.figure import ComparedFigure, Figure
+    from compgen.accuracy.field import ComparedFigure, Figure
     from compgen.fit import FitResult
     from compgen.identify import Identification
     from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate

@@ -14,10 +14,10 @@ import numpy as np
 
 from compgen.controls import AnyController
 from compgen.data.csv_files import FloatArray
-from compgen.data.declared import option
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import option
 from compgen.errors import InputError
 
 #: A step between neighbouring nodes that the slope of the best table does not explain is absurd from here on, um.

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compgen.fit import stacked
+from compgen.fit import fitting
 from compgen.fit.bounds import Bounds, curvature, solve_curve
+from compgen.fit.fitting import CurveProblem, solve_curves
 from compgen.fit.smoother import CorrelatedSmoother, Smoother, second_difference
-from compgen.fit.stacked import CurveProblem, solve_curves
 from compgen.fit.zeroing import interpolation_row
 
 NO_BOUNDS = Bounds()
@@ -51,7 +51,7 @@ def one_by_one(monkeypatch):
         seen.append(len(smoother.weight))
         return solve_curve(smoother, *rest)
 
-    monkeypatch.setattr(stacked, "solve_curve", counted)
+    monkeypatch.setattr(fitting, "solve_curve", counted)
     return seen
 
 

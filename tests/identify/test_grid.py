@@ -9,8 +9,7 @@ from scipy.linalg import LinAlgError
 import machines
 from compgen.data.lengths import Lengths
 from compgen.identify import identify
-from compgen.identify.adjust.grid_problem import grid_problem
-from compgen.identify.adjust.levels import MOST_LEVELS, levels_of
+from compgen.identify.adjust.grid_problem import MOST_LEVELS, grid_problem, levels_of
 from compgen.identify.adjust.problem import length_problem
 from compgen.identify.adjust.solver import factorise
 from compgen.identify.adjust.starts import start_moments

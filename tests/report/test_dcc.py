@@ -24,8 +24,8 @@ from compgen.errors import InputError
 from compgen.report.dcc import certificate_files, certificate_xml, read_certificate, read_schema
 from compgen.report.dcc.laboratory import CONDITIONS
 from compgen.report.dcc.xml import local_copy
-from compgen.report.html.content import content
 from compgen.report.html.folder import read_folder
+from compgen.report.html.write import content
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "certificate.toml"

@@ -19,8 +19,8 @@ from compgen.data.lengths import read_lengths
 from compgen.data.machine import load_machine
 from compgen.identify import IdentifyOptions, identify, joint_covariance
 from compgen.pipeline import export_and_verify
-from compgen.report.html.content import content
 from compgen.report.html.folder import read_folder
+from compgen.report.html.write import content
 from compgen.tables import read_tables, verify
 from compgen.tables.verification import coverage_of, figure_uncertainty
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.names import SQUARENESS_NAMES
-from compgen.identify.adjust.grid_problem import ENTRIES, add_own_blocks, lever_directions
-from compgen.identify.adjust.levels import MotionMap, motion_map
+from compgen.identify.adjust.grid_problem import ENTRIES, MotionMap, add_own_blocks, lever_directions, motion_map
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State
 from compgen.kinematics.exact_chain import passing_order, travel_directions
 

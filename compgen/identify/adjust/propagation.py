@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.declared import option
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.identify.adjust.solver import Factor
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State

@@ -18,7 +18,7 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM
 from compgen.errors import CompgenWarning
-from compgen.identify.adjust.levels import levels_of
+from compgen.identify.adjust.grid_problem import levels_of
 from compgen.identify.adjust.robust import time_order
 from compgen.identify.adjust.unknowns import IntArray
 from compgen.kinematics.first_order import c_matrix

@@ -13,8 +13,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.names import AXES
 from compgen.errors import ConvergenceError, InputError
-from compgen.identify.adjust.grid_problem import GridProblem
-from compgen.identify.adjust.levels import LevelGrid, nominal_targets
+from compgen.identify.adjust.grid_problem import GridProblem, LevelGrid, nominal_targets
 from compgen.identify.adjust.solver import factorise
 from compgen.identify.adjust.unknowns import IntArray, State
 

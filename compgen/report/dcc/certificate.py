@@ -495,7 +495,7 @@ def certificate_xml(data: Mapping[str, Any], options: Certificate, version: str 
 
     Parameters
     ----------
-    data : the numbers of a report (:func:`compgen.report.html.content.content`), only finite numbers or None.
+    data : the numbers of a report (:func:`compgen.report.html.write.content`), only finite numbers or None.
     options : what the laboratory stated.
     version : release of the DCC schema, one of :data:`compgen.report.dcc.xml.VERSIONS`.
 
