@@ -44,7 +44,7 @@ from compgen.fleet.store import Store, open_store
 from compgen.kinematics import modelled_errors
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.kernel_switch import one_thread
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid
 
 CONTROL = "siemens-cec"
 NOISE_MM = 3e-4

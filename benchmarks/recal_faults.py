@@ -34,7 +34,7 @@ from compgen.fleet.job import read_job
 from compgen.fleet.runner import run_jobs
 from compgen.fleet.store import Store, open_store
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid
 
 MACHINE = """\
 name = "mill"

@@ -23,7 +23,7 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
-from compgen.foreign.opening import open_measurement
+from compgen.foreign.source import open_measurement
 from compgen.identify import Identification, IdentifyOptions, covariance
 from compgen.identify.any_measurement import Measurement, describe, evidence_files, identify_measurement
 from compgen.identify.reversal_errors import SIGNIFICANT

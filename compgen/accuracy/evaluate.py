@@ -31,7 +31,7 @@ from compgen.data.names import AXES, BODY_DIAGONALS, ERROR_INDEX, MM_PER_UM, RAD
 from compgen.errors import InputError
 from compgen.kinematics.curves import fitted_line, hat_matrix
 from compgen.kinematics.first_order import c_matrix
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid
 
 if TYPE_CHECKING:
     from compgen.identify import Identification

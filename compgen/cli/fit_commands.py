@@ -17,7 +17,7 @@ from compgen.cli.shared_options import (
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
 from compgen.fit import FitOptions, fit
-from compgen.foreign.opening import open_errors
+from compgen.foreign.source import open_errors
 from compgen.pipeline import fit_files, write_all
 from compgen.report.terminal import fit_table
 

@@ -20,7 +20,7 @@ from compgen.data.files import OutputFolder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.errors import InputError
-from compgen.foreign.opening import open_measurement
+from compgen.foreign.source import open_measurement
 from compgen.identify import IdentifyOptions
 from compgen.identify.any_measurement import describe, evidence_files
 from compgen.pipeline import (

@@ -32,7 +32,7 @@ from compgen.fit import FitOptions
 from compgen.identify import IdentifyOptions
 from compgen.pipeline import run
 from compgen.report.terminal import identification_table, verification_table
-from compgen.tables.safety import SafetyLimits
+from compgen.tables.judge import SafetyLimits
 
 if TYPE_CHECKING:
     from compgen.report.html.write import Further

@@ -219,7 +219,7 @@ def fitting_options(command: Command) -> Command:
 
 def limits_option(command: Command) -> Command:
     """Add --max-step-um; the command receives ``limits``."""
-    from compgen.tables.safety import SafetyLimits
+    from compgen.tables.judge import SafetyLimits
 
     return options_of(SafetyLimits, "limits")(command)
 

@@ -61,9 +61,9 @@ from compgen.report.terminal import crash_table, difference_table, merge_text, v
 from compgen.tables import REJECTED_PREFIX, Provenance, export, read_tables, residuals, verify
 from compgen.tables.active import ActiveTables, bare_errors, keeping_others, merge_report, merged_errors, read_active
 from compgen.tables.diff import difference
+from compgen.tables.judge import SafetyLimits
 from compgen.tables.options import capability
 from compgen.tables.options import explain as explained
-from compgen.tables.safety import SafetyLimits
 from compgen.tables.signs import ENTRIES, CrashTest, check_files, crash_test
 from compgen.tables.verification import verification_files
 

@@ -2,43 +2,670 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal, InvalidOperation
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from compgen.controls.mitsubishi_tables import (
-    BASE,
-    FIRST_NUMBER,
-    HIGHEST_VALUE,
-    INTERVAL_QUANTUM_MM,
-    SET_STEP,
-    SYSTEM,
-    ControlSet,
-    MitsubishiSettings,
-    MitsubishiTables,
-    SetShortfall,
-    SetTable,
-    begins_with_mark,
-    parse_tables,
-    read_mitsubishi_settings,
-    sheet_usage,
-    sheet_violations,
-    shortfall_text,
-    values_of,
-)
-from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis
-from compgen.controls.shared.grids import EquidistantGrid, curve_nodes_mm, equidistant_grid
+from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
+from compgen.controls.shared.grids import EquidistantGrid, curve_nodes_mm, equidistant_grid, loss_setting
 from compgen.controls.shared.integers import best_integers, lowest_free, travel_weights
-from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
+from compgen.controls.shared.scanner import check_size
+from compgen.controls.shared.terms import ACROSS, one_dimensional_name, one_dimensional_terms
+from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
+from compgen.data.files import read_bytes
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
+from compgen.data.messages import one_line
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.errors import InputError
+from compgen.data.toml_files import axis_setting, file_setting, multiple_of, setting, whole, word_for
+from compgen.errors import CompgenWarning, InputError
+
+# Rows of a set sheet and records of the control's own parameter file, and what that file shows of all axes.
+#
+# The parameter file (``ALL.PRM``) has a line ``%`` at either end, comments that begin with ``;``, a line ``PARA101()`` and
+# records ``N4101P-2``: number, perhaps a word T, A or K with an index, and behind P the value. So a public backup of an M80
+# has it; no document describes it.
+
+
+#: Increment or absolute system, for all sets alike; unit of the values.
+SYSTEM, UNIT = 4000, 1006
+#: Parameters of set k have these numbers plus 10 (k - 1).
+BASE, OUTPUT, REFERENCE, NEGATIVE, POSITIVE, SCALE, INTERVAL = range(4001, 4008)
+SET_STEP, SETS = 10, 10
+#: Numbers of compensation values: the last one of most controls, and of an M80.
+FIRST_NUMBER, LAST_NUMBER, MOST_NUMBER = 4101, 5124, 5999
+#: Values of #1006 as they are remembered, um.
+UNITS_UM = {"A": 10.0, "B": 1.0, "C": 0.1, "D": 0.01, "E": 0.001}
+#: No sheet and no parameter file is longer than this, or has lines of this length.
+MOST_CHARACTERS, MOST_IN_LINE = 4_000_000, 500
+MOST_IN_SHEET = 1_000_000
+
+_WHOLE = re.compile(r"[+-]?\d{1,9}", re.ASCII)
+_DECIMAL = re.compile(r"\d{1,6}(?:\.\d{1,6})?", re.ASCII)
+_RECORD = re.compile(r"N(\d{1,6})((?:[A-OQ-Z]\d{1,4})*)P([^\r\n]*)", re.ASCII)
+
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class ParameterEntry:
+    """One row of a sheet, or one record of a parameter file."""
+
+    number: int
+    value: str
+    file: SourceFile
+    line: int
+
+    def fail(self, message: str) -> InputError:
+        """Return the error that points at this row."""
+        return self.file.fail(f"#{self.number}: {message}", self.line)
+
+    def whole(self, low: int, high: int) -> int:
+        """Return the value as a whole number within limits."""
+        if not _WHOLE.fullmatch(self.value) or not low <= int(self.value) <= high:
+            raise self.fail(f"{one_line(self.value)[:30]!r} is given; a whole number from {low} to {high} is expected")
+        return int(self.value)
+
+    def interval_mm(self) -> Decimal:
+        """Return the value as a division interval, mm."""
+        if not _DECIMAL.fullmatch(self.value) or not Decimal(self.value):
+            raise self.fail(
+                f"{one_line(self.value)[:30]!r} is given; an interval in mm as a plain decimal number is expected"
+            )
+        return Decimal(self.value)
+
+
+def is_parameter_file(file: SourceFile) -> bool:
+    """Whether a text is a parameter file of the control: it begins with ``%``."""
+    return file.text.removeprefix("\ufeff").lstrip().startswith("%")
+
+
+def begins_with_mark(path: Path) -> bool:
+    """Whether a file is a parameter file of the control."""
+    return is_parameter_file(SourceFile(path, read_bytes(path)[:100].decode("ascii", "replace")))
+
+
+def sheet_entries(file: SourceFile) -> list[ParameterEntry]:
+    """Rows ``#number,value,meaning``; blank lines and lines that begin with '#' and no digit (the header) are skipped."""
+    check_size(file, MOST_IN_SHEET)
+    found = []
+    for line, raw in enumerate(file.text.removeprefix("\ufeff").split("\n"), start=1):
+        text = raw.strip(" \t\r")
+        if len(text) > MOST_IN_LINE or not text.isascii():
+            raise file.fail(f"is not a row of a set sheet: {one_line(text[:30])!r} ...", line)
+        if text and not re.match(r"#\s*(?!\d)", text):
+            found.append(_row(file, line, text))
+    return found
+
+
+def _row(file: SourceFile, line: int, text: str) -> ParameterEntry:
+    cells = [cell.strip() for cell in text.split(",", 2)]
+    number = cells[0].removeprefix("#").strip()
+    if not re.fullmatch(r"\d{1,6}", number, re.ASCII):
+        raise file.fail(f"{one_line(cells[0])[:30]!r} is not the number of a parameter such as #4101", line)
+    if len(cells) < 3:
+        raise file.fail(
+            f"#{number}: number, value and meaning are expected, separated by commas (is the file cut?)", line
+        )
+    return ParameterEntry(int(number), cells[1], file, line)
+
+
+def file_entries(file: SourceFile) -> tuple[list[ParameterEntry], int]:
+    """Records of a parameter file that compensation needs, and how many lines were passed over.
+
+    InputError with the line for a record of compensation that is not understood, and for a file that is cut.
+    """
+    check_size(file, MOST_CHARACTERS)
+    lines = [raw.strip(" \t\r") for raw in file.text.removeprefix("\ufeff").split("\n")]
+    inside = [number for number, text in enumerate(lines, start=1) if text]
+    if len(inside) < 2 or lines[inside[0] - 1] != "%" or lines[inside[-1] - 1] != "%":
+        raise file.fail("the '%' at its beginning or end is missing: is the file cut?", inside[-1] if inside else 1)
+    found, passed_over = [], 0
+    for line in inside[1:-1]:
+        text = lines[line - 1]
+        if text == "%":
+            raise file.fail("a '%' within the file; it ends there", line)
+        record = _RECORD.fullmatch(text) if len(text) <= MOST_IN_LINE else None
+        number = int(record[1]) if record else 0
+        if number in (SYSTEM, *range(BASE, FIRST_NUMBER), *range(FIRST_NUMBER, MOST_NUMBER + 1)):
+            assert record is not None
+            if record[2]:
+                raise file.fail(f"#{number} has the word {record[2][:10]}; compensation parameters have none", line)
+            found.append(ParameterEntry(number, record[3].strip(), file, line))
+        elif number == UNIT and record is not None:
+            if all(entry.number != UNIT for entry in found):
+                found.append(ParameterEntry(UNIT, record[3].strip(), file, line))
+        elif re.match(r"N\s*[45]\d{3}(?!\d)", text):
+            raise file.fail(f"{one_line(text[:30])!r} is not understood; a record such as N4101P-2 is expected", line)
+        else:
+            passed_over += not text.startswith(";")
+    return found, passed_over
+
+
+def by_number(entries: Sequence[ParameterEntry]) -> dict[int, ParameterEntry]:
+    """Return entries by their number; InputError for a number that is given twice."""
+    found: dict[int, ParameterEntry] = {}
+    for entry in entries:
+        before = found.setdefault(entry.number, entry)
+        if before is not entry:
+            raise entry.fail(f"is given a second time (first in {before.file.path}:{before.line})")
+    return found
+
+
+@dataclass(frozen=True)
+class ControlSet:
+    """A set of the control's file: its index 0 ... 9, axis names, numbers, scale and interval as they are there."""
+
+    index: int
+    base: str
+    output: str
+    reference: int
+    first: int
+    last: int
+    scale: int
+    interval_mm: Decimal
+    entry: ParameterEntry
+
+    @property
+    def span(self) -> Span:
+        """Numbers that the set uses, that of its reference point among them."""
+        return min(self.first, self.reference), max(self.last, self.reference)
+
+
+@dataclass(frozen=True)
+class ControlFile:
+    """What the parameter file of the user's control shows; without one it is empty.
+
+    ``absolute`` is the system of all sets (None: not known), ``unit_um`` the unit of the values as #1006 has it.
+    """
+
+    file: SourceFile | None = None
+    absolute: bool | None = None
+    unit_um: float | None = None
+    sets: tuple[ControlSet, ...] = ()
+    last_number: int = LAST_NUMBER
+    entries: Mapping[int, ParameterEntry] = field(default_factory=dict)
+
+    def others(self, names: Sequence[str]) -> list[ControlSet]:
+        """Return the sets that belong to an axis other than ``names``."""
+        return [item for item in self.sets if not {item.base, item.output} <= set(names)]
+
+
+def read_control_file(paths: Sequence[Path]) -> ControlFile:
+    """Read the parameter file of the user's control; InputError for what is not understood."""
+    if not paths:
+        return ControlFile()
+    if len(paths) > 1:
+        raise InputError("one parameter file of the control (ALL.PRM) is expected", file=paths[1])
+    content = read_bytes(paths[0])
+    file = SourceFile(paths[0], content.decode("ascii", errors="replace"))
+    if "\ufffd" in file.text:
+        line = file.text[: file.text.index("\ufffd")].count("\n") + 1
+        raise file.fail("holds a byte that is not ASCII; a parameter file is ASCII text", line)
+    if not is_parameter_file(file):
+        raise file.fail("is not a parameter file of the control (ALL.PRM): the first line is not '%'", 1)
+    entries = by_number(file_entries(file)[0])
+    if SYSTEM not in entries:
+        raise file.fail(f"#{SYSTEM} (absolute or increment system) is missing", 1)
+    sets = []
+    for index in range(
+        SETS
+    ):  # a set without axes is empty, whatever its numbers are; others need not be of a linear axis
+        shift = SET_STEP * index
+        expected = [entries.get(parameter + shift) for parameter in range(BASE, INTERVAL + 1)]
+        present = [entry for entry in expected if entry is not None]
+        names = [entry.value for entry in present if entry.number - shift in (BASE, OUTPUT)]
+        if not any(names):
+            continue
+        if len(present) < len(expected) or not all(names):
+            message = f"set {index + 1} is not complete: #{BASE + shift} to #{INTERVAL + shift} are expected"
+            raise present[0].fail(message)
+        reference, negative, positive, scale = (entry.whole(0, 99999) for entry in present[2:6])
+        low, high = sorted((negative, positive))
+        interval_mm = present[6].interval_mm()
+        sets.append(ControlSet(index, names[0], names[1], reference, low, high, scale, interval_mm, present[3]))
+    unit_um = UNITS_UM.get(entries[UNIT].value) if UNIT in entries else None
+    numbers = [number for number in entries if number >= FIRST_NUMBER]
+    full = sorted(numbers) == list(range(FIRST_NUMBER, FIRST_NUMBER + len(numbers)))
+    last = max(numbers) if full and numbers else LAST_NUMBER
+    return ControlFile(file, entries[SYSTEM].whole(0, 1) == 0, unit_um, tuple(sets), last, entries)
+
+
+# Settings of ``[controllers.mitsubishi]``: what the control counts in, section lengths, numbers that are free.
+
+
+#: Smallest step of the division interval.
+INTERVAL_QUANTUM_MM = Decimal("0.001")
+#: Values per division point (E68 manual p. II-292, C64 manual 9.2).
+LOWEST_VALUE, HIGHEST_VALUE = -128, 127
+
+
+def _across(value: Any) -> tuple[tuple[int, int], ...]:
+    """True for all tables of one axis as a function of another, false for none, or a list of names."""
+    if isinstance(value, bool):
+        return tuple(ACROSS.values()) if value else ()
+    if not isinstance(value, list) or any(item not in ACROSS for item in value) or len(set(value)) < len(value):
+        raise ValueError(f"true, false or a list of {', '.join(map(repr, ACROSS))} is expected")
+    return tuple(ACROSS[item] for item in value)
+
+
+def _name(value: Any) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,3}", value, re.ASCII):
+        raise ValueError("a name of at most four letters and digits is expected")
+    return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class MitsubishiSettings:
+    """Settings of machine error compensation.
+
+    ``sample`` is the control's own parameter file; ``absolute`` says whether values are sums up to their point (#4000 = 0)
+    and not steps (1), None: not known; ``adds`` is True if the control adds the numbers (corrections), False if it
+    subtracts them; ``across`` are (output, base axis) of the tables of one axis as a function of another.
+    """
+
+    sample: ControlFile = file_setting(
+        read_control_file,
+        several=True,
+        key="style_from",
+        meaning="the control's own parameter file (ALL.PRM): mode, unit, sets, numbers, intervals and scales are kept, "
+        "those of other axes never overwritten",
+    )
+    absolute: bool | None = setting(
+        word_for({"incremental": False, "absolute": True}),
+        None,
+        key="mode",
+        meaning="system of the values (#4000), which holds for all axes: increments or absolute. Needed for an export without "
+        "style_from",
+    )
+    setting_unit_um: float = setting(
+        toml_files.positive, 1.0, meaning="setting unit of the control; one count is half of it, times scale"
+    )
+    scale: int | None = setting(
+        whole(1, 99),
+        None,
+        meaning="compensation scale factor (sc) of every set; that of the control's file, else 1, if not stated",
+    )
+    adds: bool = setting(
+        word_for({"correction": True, "error": False}),
+        key="stores",
+        stated="correction",
+        meaning="what the numbers are: correction (added) or error",
+    )
+    across: tuple[tuple[int, int], ...] = setting(
+        _across,
+        key="relative_errors",
+        stated=True,
+        meaning="also correct axes as a function of another one (straightness, squareness): true, false, or a list, e.g. "
+        '["Y(x)"]',
+    )
+    interval_mm: tuple[float | None, float | None, float | None] = axis_setting(
+        multiple_of(INTERVAL_QUANTUM_MM), meaning="division interval of each base axis; chosen if it is not stated"
+    )
+    loss_mm: float = loss_setting("loss by interpolation, um at the tool, that is worth no shorter interval")
+    first_number: int = setting(
+        whole(FIRST_NUMBER, MOST_NUMBER), FIRST_NUMBER, meaning="first number of a value that is free"
+    )
+    last_number: int = setting(
+        whole(FIRST_NUMBER, MOST_NUMBER), LAST_NUMBER, meaning="last number of a value that is free"
+    )
+    first_set: int = setting(whole(1, SETS), 1, meaning="first set of parameters that is free, 1 to 10")
+    axis_names: tuple[str, str, str] = axis_setting(
+        _name, AXES, differ="{}: expected three different names", meaning="names of X, Y, Z on the control"
+    )
+
+    @property
+    def sign(self) -> int:
+        """+1 if the numbers are the correction, -1 if they are the error."""
+        return 1 if self.adds else -1
+
+    @property
+    def half_unit_mm(self) -> float:
+        """One unit of output: half of the setting unit, mm."""
+        return 0.5 * self.setting_unit_um * MM_PER_UM
+
+    def scale_of(self, pair: tuple[int, int]) -> int:
+        """Scale of a table (output, base axis): that of the machine file, else of the control's own set, else 1."""
+        own = self.own_set(pair)
+        return self.scale or (own.scale if own is not None and own.scale else 1)
+
+    def count_mm(self, pair: tuple[int, int]) -> float:
+        """One count of a written table (output, base axis), mm."""
+        return self.half_unit_mm * self.scale_of(pair)
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """(output, base axis) of the tables: positioning of the three axes first."""
+        return [*((axis, axis) for axis in range(3)), *self.across]
+
+    def own_set(self, pair: tuple[int, int]) -> ControlSet | None:
+        """Return the set of the control's file that holds a table (output, base axis)."""
+        output, base = (self.axis_names[axis] for axis in pair)
+        return next((item for item in self.sample.sets if (item.output, item.base) == (output, base)), None)
+
+    def kept(self, pair: tuple[int, int]) -> ControlSet | None:
+        """Return the set of the control whose numbers and interval a table keeps: unless another interval is stated."""
+        own, stated = self.own_set(pair), self.interval_mm[pair[1]]
+        same = own is not None and (stated is None or Decimal(repr(stated)) == own.interval_mm)
+        return own if same else None
+
+    def kept_at_reference(self, pair: tuple[int, int]) -> int:
+        """Return the value at the reference number that a kept set of the control has: a constant, which stays; else 0."""
+        kept = self.kept(pair)
+        entry = None if kept is None else self.sample.entries.get(kept.reference)
+        return 0 if entry is None or not entry.value else entry.whole(LOWEST_VALUE, HIGHEST_VALUE)
+
+    def free_sets(self) -> list[int]:
+        """Return the sets (0 to 9) that no table of the control's file needs, from ``first_set`` on."""
+        used = {item.index for item in self.sample.sets}
+        return [index for index in range(self.first_set - 1, SETS) if index not in used]
+
+
+def read_mitsubishi_settings(machine: Machine) -> MitsubishiSettings:
+    """Read and check ``[controllers.mitsubishi]``.
+
+    Every key has a default but ``mode``, which an export needs unless the control's own file is given.
+    """
+    section = machine.controller_settings("mitsubishi")
+    settings = toml_files.read_settings(MitsubishiSettings, section)
+    sample = settings.sample
+    shown = {"setting_unit_um": sample.unit_um or 1.0, "last_number": sample.last_number, "absolute": sample.absolute}
+    settings = toml_files.unless_stated(settings, section, **shown)
+    if sample.file is not None and settings.absolute != sample.absolute:
+        stated = "absolute" if settings.absolute else "incremental"
+        raise section.fail(
+            "mode", f"{stated!r} is stated, but {sample.file.path} has #4000 = {int(not sample.absolute)}"
+        )
+    if settings.last_number - settings.first_number + 1 < 3 * len(settings.pairs):
+        raise section.fail("last_number", f"leaves too few numbers from {settings.first_number} on")
+    new = [pair for pair in settings.pairs if settings.own_set(pair) is None]
+    free = settings.free_sets()
+    if len(new) > len(free):
+        others = "".join(f", set {item.index + 1} of {item.base}" for item in sample.others(settings.axis_names))
+        raise section.fail(
+            "first_set",
+            f"{len(new)} new sets are needed and {len(free)} of the {SETS} sets of the control are free{others}; state which "
+            'tables are wanted, e.g. relative_errors = ["Y(x)", "X(y)"], or false for positioning alone',
+        )
+    return settings
+
+
+# Numbers of machine error compensation: tables read from text, the curves they mean, the limits they must keep.
+#
+# Increment system, E60/E68 manual p. II-292 and C64 manual 9.2. On the positive side of the reference point the value of
+# point n is (division interval - actual movement) x 2 for a feed from n-1 to n, on the negative side (division interval +
+# actual movement) x 2 for a feed from n+1 to n. So with the curve A in units of output, zero at the reference number,
+#
+#     A[n] = A[n-1] + v[n] on the positive side,   A[n] = A[n+1] - v[n] on the negative side.
+#
+# In the absolute system (#4000 = 0) the value of a point is A itself, but for a constant: the value at the reference number
+# shifts the zero of the axis and nothing else. That system holds for the sets of all axes.
+
+
+@dataclass(frozen=True)
+class SetTable:
+    """One set: the axis ``output`` is corrected as a function of the axis ``base``.
+
+    ``values`` are the numbers as stored for ``first`` ... ``last``; ``reference`` is the number at the reference point;
+    ``absolute`` tells how they count; ``index`` is the place of the set, 0 to 9.
+    """
+
+    base: int
+    output: int
+    reference: int
+    first: int
+    values: tuple[int, ...]
+    scale: int
+    interval_mm: Decimal
+    absolute: bool = False
+    index: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name such as ``X(y)``."""
+        return one_dimensional_name(self.output, self.base)
+
+    @property
+    def last(self) -> int:
+        """Farthest number on the positive side."""
+        return self.first + len(self.values) - 1
+
+    @property
+    def curve(self) -> NDArray[np.int64]:
+        """Curve A in counts at the numbers ``first`` ... ``last``, zero at the reference number, shape (n,)."""
+        at = self.reference - self.first
+        values = np.array(self.values, dtype=np.int64)
+        if self.absolute:
+            return np.asarray(values - values[at], dtype=np.int64)
+        above = np.cumsum(values[at + 1 :])
+        below = -np.cumsum(values[:at][::-1])[::-1]
+        return np.concatenate([below, [0], above]).astype(np.int64)
+
+    @property
+    def at_reference(self) -> int:
+        """Value at the reference number."""
+        return self.values[self.reference - self.first]
+
+    @property
+    def along_mm(self) -> FloatArray:
+        """Positions of the numbers from the reference point, shape (n,), mm."""
+        return np.array([float((self.first + k - self.reference) * self.interval_mm) for k in range(len(self.values))])
+
+
+@dataclass(frozen=True)
+class SetShortfall:
+    """How far the limit of the values keeps a table from what was requested, in counts."""
+
+    output: int
+    base: int
+    missed_counts: float
+
+
+@dataclass(frozen=True)
+class MitsubishiTables:
+    """All sets of X, Y, Z; ``shortfalls`` is known of tables that were built.
+
+    ``others`` are the sets of other axes in a parameter file, as (name, first, last number); ``remarks`` say what reading
+    kept apart and passed over.
+    """
+
+    sets: tuple[SetTable, ...]
+    shortfalls: tuple[SetShortfall, ...] = field(default=(), compare=False)
+    others: tuple[tuple[str, int, int], ...] = field(default=(), compare=False)
+    remarks: tuple[str, ...] = field(default=(), compare=False)
+
+
+def values_of(curve: NDArray[np.int64], at: int, at_reference: int = 0, *, absolute: bool = False) -> tuple[int, ...]:
+    """Return the numbers for a curve (n,) in counts that is zero at the index ``at``, where ``at_reference`` is stored."""
+    if absolute:
+        return tuple(int(value) + at_reference for value in curve)
+    steps = np.diff(curve)
+    return tuple(int(value) for value in (*steps[:at], at_reference, *steps[at:]))
+
+
+def parse_tables(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
+    """Read set sheets, or the control's own parameter file; files that end in ``.json`` (the plan) are left out.
+
+    A parameter file that is given with a sheet must hold the same tables.
+    """
+    texts = [file for file in files if file.path.suffix.lower() != ".json"]
+    if not texts:
+        raise InputError("no set sheet or parameter file is given", file=files[0].path if files else None)
+    own = [file for file in texts if is_parameter_file(file)]
+    sheets = [file for file in texts if not is_parameter_file(file)]
+    if len(own) > 1:
+        raise own[1].fail("a second parameter file; one is expected")
+    if not own:
+        return _sets_of(settings, sheets[0], by_number([entry for file in sheets for entry in sheet_entries(file)]))
+    entries, passed_over = file_entries(own[0])
+    found = _sets_of(settings, own[0], by_number(entries), passed_over)
+    if sheets and parse_tables(settings, sheets).sets != found.sets:
+        raise own[0].fail(f"does not hold the same tables as {sheets[0].path.name}")
+    return found
+
+
+def _sets_of(
+    settings: MitsubishiSettings, file: SourceFile, entries: dict[int, ParameterEntry], passed_over: int | None = None
+) -> MitsubishiTables:
+    """Tables of the entries of a sheet, or (``passed_over`` is not None) of a parameter file of the control."""
+    if SYSTEM not in entries:
+        raise file.fail(f"#{SYSTEM} (absolute or increment system) is missing", 1)
+    absolute = entries[SYSTEM].whole(0, 1) == 0
+    if settings.absolute is not None and absolute != settings.absolute:
+        stated = "absolute" if settings.absolute else "incremental"
+        raise entries[SYSTEM].fail(
+            f"{int(not absolute)} is the {'absolute' if absolute else 'increment'} system, but mode = {stated!r} is stated or is "
+            "that of the control's file"
+        )
+    sets, others = [], []
+    for number in range(1, SETS + 1):
+        table, name = _set_table(settings, entries, number, absolute, passed_over is not None)
+        sets += [] if table is None else [table]
+        others += [] if name is None else [(f"set {number} of {name[0]}", *name[1])]
+    if not sets:
+        raise file.fail(f"holds no set of the axes {', '.join(settings.axis_names)} (#4001, #4011, ...)", 1)
+    if passed_over is None:
+        return MitsubishiTables(tuple(sets))
+    system = "absolute values" if absolute else "increments"
+    said = [
+        f"#{SYSTEM} = {int(not absolute)}: {system}; unit: the machine is taken to be metric, the setting unit "
+        f"{settings.setting_unit_um:g} um"
+    ]
+    said += [
+        f"{set_name(table)}: the value {table.at_reference} at the reference number #{table.reference} shifts the zero of the "
+        "axis by a constant, which is not counted"
+        for table in sets
+        if absolute and table.at_reference
+    ]
+    said += [f"{name}, numbers {first} to {last}: not of the machine file, kept apart" for name, first, last in others]
+    said += [f"passed over: {passed_over} lines that cannot change a table"] if passed_over else []
+    return MitsubishiTables(tuple(sets), others=tuple(others), remarks=tuple(said))
+
+
+def _set_table(
+    settings: MitsubishiSettings, entries: dict[int, ParameterEntry], number: int, absolute: bool, is_file: bool
+) -> tuple[SetTable | None, tuple[str, tuple[int, int]] | None]:
+    """Return set ``number`` (1 to 10), None if it is empty; or the name of another axis and the numbers of its set.
+
+    In a parameter file of the control a set without axes is empty, whatever its numbers are.
+    """
+    shift = SET_STEP * (number - 1)
+    due = {parameter: entries.get(parameter + shift) for parameter in range(BASE, INTERVAL + 1)}
+    present = {parameter: entry for parameter, entry in due.items() if entry is not None}
+    names = [present[parameter].value for parameter in (BASE, OUTPUT) if parameter in present]
+    if not any(names if is_file else [entry.value for entry in present.values()]):
+        return None, None
+    first_entry = next(iter(present.values()))
+    missing = [f"#{parameter + shift}" for parameter, entry in due.items() if entry is None or not entry.value]
+    if missing:
+        raise first_entry.file.fail(f"{', '.join(missing)} of set {number} missing", first_entry.line)
+    strange = [name for name in names if name not in settings.axis_names]
+    if strange:
+        name = one_line(strange[0])[:10]
+        if not is_file:
+            message = f"set {number} belongs to the axis {name}, not of the machine file: not used"
+            warnings.warn(message, CompgenWarning, stacklevel=6)
+        numbers = [present[key].whole(0, 99999) for key in (NEGATIVE, POSITIVE, REFERENCE)]
+        return None, (name, (min(numbers), max(numbers)))
+    first, last = (present[key].whole(FIRST_NUMBER, MOST_NUMBER) for key in (NEGATIVE, POSITIVE))
+    reference = present[REFERENCE].whole(FIRST_NUMBER, MOST_NUMBER)
+    if not first <= reference <= last:
+        raise present[REFERENCE].fail(f"the reference number {reference} is none of {first} to {last} of its set")
+    table = SetTable(
+        base=settings.axis_names.index(names[0]),
+        output=settings.axis_names.index(names[1]),
+        reference=reference,
+        first=first,
+        values=_values(entries, first, last, present[POSITIVE]),
+        scale=present[SCALE].whole(0, 99),
+        interval_mm=present[INTERVAL].interval_mm(),
+        absolute=absolute,
+        index=number - 1,
+    )
+    return table, None
+
+
+def _values(entries: dict[int, ParameterEntry], first: int, last: int, who: ParameterEntry) -> tuple[int, ...]:
+    missing = [number for number in range(first, last + 1) if number not in entries]
+    if missing:
+        some = ", ".join(f"#{number}" for number in missing[:5])
+        raise who.fail(f"points {first} to {last} are given, {some} ({len(missing)} in all) missing")
+    return tuple(entries[number].whole(LOWEST_VALUE, HIGHEST_VALUE) for number in range(first, last + 1))
+
+
+def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables) -> list[str]:
+    """Return broken limits: range of values, numbers, overlaps, scale, doubled pairs, travel left out."""
+    found = []
+    for table in tables.sets:
+        what = set_name(table)
+        start_mm, end_mm = machine.reference_point_mm[table.base] + table.along_mm[[0, -1]]
+        found += coverage_violations(machine, table.base, float(start_mm), float(end_mm), what)
+        wide = [value for value in table.values if not LOWEST_VALUE <= value <= HIGHEST_VALUE]
+        if wide:
+            most = max(map(abs, wide))
+            cure = f"; set scale = {-(-most * table.scale // HIGHEST_VALUE)} or more" if table.absolute else ""
+            found.append(f"{what}: the value {most} lies outside {LOWEST_VALUE} ... {HIGHEST_VALUE}{cure}")
+        if table.last > settings.last_number:
+            found.append(f"{what}: numbers go up to {table.last}, the last free one is {settings.last_number}")
+        if table.scale == 0:
+            found.append(f"{what}: the scale is 0, which leaves nothing of the table")
+        kept = settings.kept_at_reference((table.output, table.base))
+        if table.at_reference != kept:
+            own = " as in the control's file" if kept else ""
+            found.append(f"{what}: the value at the reference number {table.reference} must be {kept}{own}")
+    for one, other in combinations(tables.sets, 2):
+        if one.first <= other.last and other.first <= one.last:
+            found.append(f"the numbers of {set_name(one)} and {set_name(other)} overlap")
+        if (one.base, one.output) == (other.base, other.output):
+            found.append(f"{set_name(one)} is given in two sets")
+    others = [
+        *tables.others,
+        *((f"set {k.index + 1} of {k.base}", *k.span) for k in settings.sample.others(settings.axis_names)),
+    ]
+    for name, first, last in dict.fromkeys(others):
+        for table in tables.sets:
+            if table.first <= last and table.last >= first:
+                found.append(f"the numbers of {set_name(table)} overwrite those of {name}, {first} to {last}")
+    missing = [AXES[axis] for axis in range(3) if not any(t.base == t.output == axis for t in tables.sets)]
+    found += [f"{letter} has no table of its own position" for letter in missing]
+    return found + [shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts > 1.0]
+
+
+def set_name(table: SetTable) -> str:
+    """Name of a set in messages, e.g. ``the table X(y)``."""
+    return f"the table {table.name}"
+
+
+def shortfall_text(settings: MitsubishiSettings, item: SetShortfall) -> str:
+    """Say that the range of the values keeps a table from what was requested, and what helps."""
+    count_um = settings.count_mm((item.output, item.base)) / MM_PER_UM
+    return (
+        f"the table {one_dimensional_name(item.output, item.base)} is too steep for {HIGHEST_VALUE} counts of "
+        f"{count_um:g} um per division: it misses by up to {item.missed_counts * count_um:.1f} um; a larger scale or a "
+        "shorter interval_mm is needed"
+    )
+
+
+def sheet_usage(settings: MitsubishiSettings, tables: MitsubishiTables) -> list[Usage]:
+    """Return the largest value, the numbers and the sets against their limits."""
+    largest = max(max(map(abs, table.values)) for table in tables.sets)
+    used = sum(len(table.values) for table in tables.sets)
+    return [
+        Usage("largest value of a division", largest, HIGHEST_VALUE, "counts"),
+        Usage("compensation numbers", used, settings.last_number - settings.first_number + 1, "numbers"),
+        Usage("sets", len(tables.sets), SETS, "sets"),
+    ]
+
 
 # What the templates of machine error compensation show: rows of the set sheet, plan, worked numbers, warnings.
 
@@ -62,7 +689,7 @@ def _same(old: str, new: str) -> bool:
         return old == new
 
 
-def _row(number: int, value: str, meaning: str) -> dict[str, str]:
+def _setting_row(number: int, value: str, meaning: str) -> dict[str, str]:
     return {"number": str(number), "value": value, "meaning": meaning}
 
 
@@ -298,22 +925,23 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         names, absolute = self.settings.axis_names, tables.sets[0].absolute
         known = "as the control has it" if self.settings.sample.file is not None else "must be the control's own value"
         system = f"Pinc: {'absolute values' if absolute else 'increments'}; holds for the sets of ALL axes and {known}"
-        parameters, values = [_row(SYSTEM, str(int(not absolute)), system)], []
+        parameters, values = [_setting_row(SYSTEM, str(int(not absolute)), system)], []
         for table in tables.sets:
             numbers = (table.reference, table.first, table.last, table.scale)
             cells = (names[table.base], names[table.output], *map(str, numbers), f"{table.interval_mm:.3f}")
             parameters += [
-                _row(BASE + k + SET_STEP * table.index, cell, f"{name}: {meaning}; set {table.index + 1}")
+                _setting_row(BASE + k + SET_STEP * table.index, cell, f"{name}: {meaning}; set {table.index + 1}")
                 for k, (cell, (name, meaning)) in enumerate(zip(cells, MEANINGS, strict=True))
             ]
             positions = self.machine.reference_point_mm[table.base] + table.along_mm
             values += [
-                _row(table.first + k, str(value), f"{table.name} at {AXES[table.base]} {positions[k]:.3f} mm")
+                _setting_row(table.first + k, str(value), f"{table.name} at {AXES[table.base]} {positions[k]:.3f} mm")
                 for k, value in enumerate(table.values)
             ]
         for item in self._no_longer_used(tables):
             parameters += [
-                _row(BASE + k + SET_STEP * item.index, "", f"set {item.index + 1} is no longer used") for k in (0, 1)
+                _setting_row(BASE + k + SET_STEP * item.index, "", f"set {item.index + 1} is no longer used")
+                for k in (0, 1)
             ]
         return parameters, values
 

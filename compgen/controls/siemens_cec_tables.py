@@ -22,8 +22,7 @@ from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.many_points import volumetric_error
-from compgen.kinematics.volume_grid import volume_sample
+from compgen.kinematics.many_points import volume_sample, volumetric_error
 
 # SINUMERIK CEC tables: what a set of them adds up to, and angular errors as products of two tables.
 #

@@ -13,8 +13,21 @@ from typing import Any
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
-from compgen.effects.axes import Backlash, CosineError, LostMotion, Periodic, ServoLag, SpindleGrowth, ThermalScale
-from compgen.effects.axis_session import BadRun, DisturbedReadings, LinearDrift, Settling, StepBetweenRuns, WarmupDrift
+from compgen.effects.axes import (
+    Backlash,
+    BadRun,
+    CosineError,
+    DisturbedReadings,
+    LinearDrift,
+    LostMotion,
+    Periodic,
+    ServoLag,
+    Settling,
+    SpindleGrowth,
+    StepBetweenRuns,
+    ThermalScale,
+    WarmupDrift,
+)
 from compgen.effects.base import (
     ANY_STATION,
     AllStations,

@@ -48,7 +48,7 @@ from compgen.pipeline import RunResult, identified_reversal, run
 from compgen.tables import ReadTables, parse_tables, program_version, read_tables, verify
 from compgen.tables.active import ActiveTables
 from compgen.tables.diff import difference
-from compgen.tables.safety import SafetyLimits
+from compgen.tables.judge import SafetyLimits
 from compgen.tables.verification import MISFIT_CODES
 
 #: A measurement that is dated more than this in the future has a wrong time.

@@ -30,7 +30,7 @@ from compgen.identify.identification import table_of_values
 from compgen.identify.options import IdentifyOptions, ReadingNoise, reading_noise
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.kernel_switch import one_thread
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid
 from compgen.plan.stations import PlannedStations
 
 # The least-squares problem of a measurement that has not been made: its normal matrix, and what follows from it.

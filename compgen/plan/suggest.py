@@ -18,7 +18,7 @@ from compgen.errors import InputError
 from compgen.identify.adjust.solver import factorise
 from compgen.identify.options import ReadingNoise
 from compgen.kinematics.kernel_switch import one_thread
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid
 from compgen.plan.prediction import NEAREST_MM, Plan, Planned, plan_of, planned
 from compgen.plan.stations import PlannedStations, Region
 from compgen.simulate.trajectory import Line, Trajectory, trajectory_points

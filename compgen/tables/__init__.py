@@ -9,9 +9,8 @@ if TYPE_CHECKING:
     from compgen.kinematics.gauge import without_rigid_motion
     from compgen.resources import program_version
     from compgen.tables.export import REJECTED_PREFIX, REPORT_FILES, Export, export, set_aside_superseded, usable_format
-    from compgen.tables.judge import Residuals, residuals
+    from compgen.tables.judge import Residuals, SafetyLimits, residuals
     from compgen.tables.render import Format, load_format
-    from compgen.tables.safety import SafetyLimits
     from compgen.tables.signs import check_files
     from compgen.tables.synthesis import Projector, projector, synthesize, wanted_correction
     from compgen.tables.verification import (

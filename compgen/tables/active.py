@@ -21,10 +21,9 @@ from compgen.errors import CompgenWarning, ConvergenceError, InputError
 from compgen.identify.adjust.unknowns import check_travel
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, modelled_errors
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid
 from compgen.tables import wanted_correction
-from compgen.tables.judge import figures_of
-from compgen.tables.safety import node_positions
+from compgen.tables.judge import figures_of, node_positions
 from compgen.tables.synthesis import Projector, projector
 from compgen.tables.verification import ReadTables, read_tables, table_files
 

@@ -13,9 +13,8 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.kinematics.volume_grid import volume_grid
-from compgen.tables.judge import components, figures_of, rms
-from compgen.tables.safety import node_positions
+from compgen.kinematics.many_points import volume_grid
+from compgen.tables.judge import components, figures_of, node_positions, rms
 from compgen.tables.verification import ReadTables
 
 #: Components below this, um rms, are left out of the list.

@@ -24,11 +24,9 @@ from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.gauge import without_rigid_motion
-from compgen.kinematics.many_points import volumetric_error
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid, volumetric_error
 from compgen.tables import Export, export
-from compgen.tables.judge import Residuals, in_both_directions, left_by_reversal, residuals
-from compgen.tables.safety import LargestStep, safety_of
+from compgen.tables.judge import LargestStep, Residuals, in_both_directions, left_by_reversal, residuals, safety_of
 from compgen.tables.synthesis import Projector, basis_field, placed_terms, projector, wanted_correction
 
 # Levels of compensation that controls sell, as bases of terms, and the best that each could do for given errors.

@@ -24,7 +24,7 @@ from compgen.errors import ConvergenceError
 from compgen.kinematics.curves import free_basis, hat_entries, hat_matrix
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.volume_grid import volume_sample
+from compgen.kinematics.many_points import volume_sample
 
 #: Where the volume leaves a choice, values stay at their start at the positions ``Term.keep_mm``; where even that
 #: leaves one, everywhere. Both weights lie far below that of any data (the normal matrix has unit diagonal).

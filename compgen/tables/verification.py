@@ -32,14 +32,16 @@ from compgen.tables.entries import entry_check
 from compgen.tables.judge import (
     Judge,
     Residuals,
+    Safety,
+    SafetyLimits,
     in_both_directions,
     judge_of,
     left_by_reversal,
     mean_correction,
     residuals,
     reversal_reasons,
+    safety_of,
 )
-from compgen.tables.safety import Safety, SafetyLimits, safety_of
 from compgen.tables.synthesis import Projector, wanted_correction
 
 # The verdict on tables and on the measurement behind them: one state, one headline, and what speaks against it.
@@ -674,7 +676,7 @@ def verify(
     errors : usually the identified errors; the exact model moves with them.
     points : where the residuals are reported; default the grid of the nodes of curves and tables and the middles
         between them. The judgement itself is always made on that grid and on lines along the axes.
-    limits : for the steps of the tables, see :func:`compgen.tables.safety.safety_of`.
+    limits : for the steps of the tables, see :func:`compgen.tables.judge.safety_of`.
     reversal : what each axis does differently in its two directions, in addition to the errors (their mean); points that do
         not say from where they were approached are then looked at from both sides.
     covariance : joint covariance of the errors, for the uncertainty of the figures; without it that of the single values

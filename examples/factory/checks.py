@@ -23,7 +23,7 @@ from compgen.fleet.drift import Drift, DriftSettings, FigureDrift, drift_report,
 from compgen.fleet.store import open_store
 from compgen.identify.covariance import covariance_or_independent
 from compgen.kinematics import volumetric_error
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid
 
 
 @dataclass(frozen=True)

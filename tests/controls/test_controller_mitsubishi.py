@@ -17,7 +17,7 @@ import compgen
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.controls import SourceFile, controller_named
-from compgen.controls.mitsubishi_tables import values_of
+from compgen.controls.mitsubishi import values_of
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Points
 from compgen.data.machine import read_machine

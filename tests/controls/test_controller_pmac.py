@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import compgen
 from compgen.controls import CONTROLLERS, SourceFile
-from compgen.controls.pmac_tables import CompTable1D, CompTable2D
+from compgen.controls.pmac import CompTable1D, CompTable2D
 from compgen.data import toml_files
 from compgen.data.error_table import ReversalCurves
 from compgen.data.machine import Axis, Chain, Machine

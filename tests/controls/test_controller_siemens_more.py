@@ -21,7 +21,7 @@ from compgen.data.toml_files import Section
 from compgen.errors import InputError
 from compgen.kinematics import modelled_errors
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.volume_grid import volume_sample
+from compgen.kinematics.many_points import volume_sample
 from compgen.tables import export, read_tables, verify, wanted_correction
 
 GOLDEN = Path(__file__).parents[1] / "golden"

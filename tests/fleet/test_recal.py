@@ -25,7 +25,7 @@ from compgen.fleet.status import fleet
 from compgen.fleet.store import Store, open_store
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.kernel_switch import one_thread
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid
 from compgen.tables import read_tables
 
 NOISE_UM = 0.3

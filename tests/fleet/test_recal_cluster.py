@@ -34,8 +34,8 @@ from compgen.identify import identify, self_check
 from compgen.kinematics import parallel
 from compgen.kinematics import parallel as cluster
 from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.many_points import volume_grid
 from compgen.kinematics.parallel import LostError, Packed, Processes, RemoteError, StoppedError, spread
-from compgen.kinematics.volume_grid import volume_grid
 
 _SPEC = importlib.util.spec_from_file_location("compgen_postgres", Path(__file__).resolve().parents[1] / "postgres.py")
 postgres = importlib.util.module_from_spec(_SPEC)

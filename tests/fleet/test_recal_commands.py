@@ -27,7 +27,7 @@ from compgen.fleet.runner import MachineOutcome, run_jobs
 from compgen.fleet.store import open_store
 from compgen.fleet.watch import Watch, trigger_of
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.volume_grid import volume_grid
+from compgen.kinematics.many_points import volume_grid
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "recal"
 MACHINE = """\

@@ -21,7 +21,7 @@ from compgen.data.toml_files import Section
 from compgen.errors import InputError
 from compgen.kinematics import modelled_errors
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.volume_grid import MOST_POINTS
+from compgen.kinematics.many_points import MOST_POINTS
 from compgen.tables import export, synthesize
 from compgen.tables.export import Provenance, export_context, rerender
 

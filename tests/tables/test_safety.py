@@ -22,7 +22,7 @@ from compgen.kinematics.exact_chain import exact_error
 from compgen.pipeline import identify_bare
 from compgen.tables import export, read_tables, verify
 from compgen.tables.active import ActiveTables, bare_errors, without_active
-from compgen.tables.safety import SafetyLimits, lines_along, safety_of
+from compgen.tables.judge import SafetyLimits, lines_along, safety_of
 from compgen.tables.signs import check_files, check_program, exported_tables, signed_permutations
 
 ALL = sorted(CONTROLLERS)
