@@ -37,14 +37,13 @@ from compgen.accuracy.positioning import EDITIONS, LATEST, SAME_TARGET_MM, RunSt
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.display import Bars, Drawable, Overview, Panel
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import Curve, ErrorTable, hat_matrix
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, ERROR_INDEX, MM_PER_UM, error_named
 from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.identify.covariance import normalized_error
-from compgen.kinematics.curves import hat_matrix
 from compgen.kinematics.first_order import observable_errors, tool_of
 from compgen.kinematics.gauge import LEVER_MM, gauge_directions
 

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable
+from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
 from compgen.identify.covariance import Covariance, covariance_or_independent, normalized_error
-from compgen.kinematics.curves import hat_matrix
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import c_matrix, tool_of
 from compgen.kinematics.gauge import rigid_fields, without_rigid_motion

@@ -38,13 +38,12 @@ from compgen.controls.shared.grids import curve_nodes_mm
 from compgen.controls.shared.terms import ACROSS, one_dimensional_name, one_dimensional_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
-from compgen.data.error_table import ErrorTable
+from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import setting, whole
 from compgen.errors import InputError
-from compgen.kinematics.curves import hat_matrix
 
 # Settings of ``[controllers.fanuc-straightness]``: what is compensated, the point numbers, the style of the file.
 

@@ -119,11 +119,13 @@ def read_lengths(files: str | Path | Sequence[str | Path]) -> Lengths:
     >>> compgen.read_lengths("examples/zha-gantry.lengths.csv").metadata["instrument"]
     'laser-tracer'
     """
-    from compgen.data.length_archive import read_archive  # imported here: it is built on what this file declares
-
     sources = [files] if isinstance(files, str | Path) else list(files)
     binary = [source for source in sources if str(source).lower().endswith(ARCHIVE)]
-    parts = [read_archive(source) for source in binary]
+    parts = []
+    if binary:
+        from compgen.data.length_archive import read_archive  # imported here: it is built on what this file declares
+
+        parts = [read_archive(source) for source in binary]
     text = [source for source in sources if source not in binary]
     for values in map(_LENGTHS.values, _LENGTHS.read_tables(text) if text or not binary else []):
         stations = tuple(dict.fromkeys(values["station"]))

@@ -10,12 +10,12 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import hat_matrix, spline_matrix
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
-from compgen.diagnose.observed import Observed, Poses
+from compgen.diagnose.observed import DistinctPoses, Observed
 from compgen.effects import Effect, Readings
 from compgen.errors import InputError
-from compgen.kinematics.curves import hat_matrix, spline_matrix
 from compgen.kinematics.exact_chain import exact_columns
 from compgen.kinematics.first_order import modelled_errors
 
@@ -342,7 +342,7 @@ def _columns(effect: Effect, readings: Readings) -> FloatArray:
     return change
 
 
-def along(direction: FloatArray, poses: Poses) -> csr_array:
+def along(direction: FloatArray, poses: DistinctPoses) -> csr_array:
     """Sparse matrix (n, 3 m) that takes the three components of all poses to the readings along ``direction`` (n, 3)."""
     count, size = len(direction), len(poses.position_mm)
     rows, columns = np.tile(np.arange(count), 3), np.concatenate([poses.of + k * size for k in range(3)])

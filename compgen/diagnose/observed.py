@@ -81,7 +81,7 @@ def _residual(target_mm: FloatArray, length_mm: FloatArray, group: IntArray, sta
 
 
 @dataclass(frozen=True)
-class Poses:
+class DistinctPoses:
     """Distinct positions with their tools (m, 3), and the pose of each reading (n,)."""
 
     position_mm: FloatArray
@@ -89,12 +89,12 @@ class Poses:
     of: IntArray
 
 
-def poses_of(position_mm: FloatArray, tool_mm: FloatArray) -> Poses:
+def poses_of(position_mm: FloatArray, tool_mm: FloatArray) -> DistinctPoses:
     """Number the distinct poses of readings; positions and tools (n, 3)."""
     keys: FloatArray = np.column_stack([position_mm, np.broadcast_to(tool_mm, position_mm.shape)])
     unique, inverse = np.unique(np.round(keys, 7), axis=0, return_inverse=True)
     unique = np.asarray(unique, dtype=np.float64)
-    return Poses(unique[:, :3], unique[:, 3:], inverse.ravel().astype(np.int64))
+    return DistinctPoses(unique[:, :3], unique[:, 3:], inverse.ravel().astype(np.int64))
 
 
 class Observed(ABC):
@@ -102,7 +102,7 @@ class Observed(ABC):
 
     machine: Machine
     value_mm: FloatArray
-    poses: Poses
+    poses: DistinctPoses
     layout: MeasurementLayout
     placement_names: tuple[str, ...]
 

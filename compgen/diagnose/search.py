@@ -37,8 +37,8 @@ COARSE = 1e-4
 
 
 @dataclass(frozen=True)
-class Facts:
-    """Facts about all groups, (groups,): number of the name, tier, visible dimensions ...
+class GroupFacts:
+    """GroupFacts about all groups, (groups,): number of the name, tier, visible dimensions ...
 
     ``random``: charged as a random effect, as groups without a name are, and curves of many columns.
     """
@@ -150,10 +150,10 @@ class Design:
         return self.count - int(self.base.shape[1])
 
     @cached_property
-    def facts(self) -> Facts:
+    def facts(self) -> GroupFacts:
         """What the search asks about all groups."""
         size, tier = np.diff(self.start), np.array([group.tier for group in self.groups], dtype=object)
-        return Facts(
+        return GroupFacts(
             np.unique([group.name for group in self.groups], return_inverse=True)[1],
             tier,
             size,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable
+from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
@@ -26,7 +26,6 @@ from compgen.identify.covariance import (
     error_design,
     values_at_nodes,
 )
-from compgen.kinematics.curves import hat_matrix
 from compgen.kinematics.gauge import LEVER_MM, gauge_directions, rigid_fields
 from compgen.kinematics.many_points import volumetric_error
 

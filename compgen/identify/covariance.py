@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview
-from compgen.data.error_table import ErrorTable
+from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.files import read_bytes, sha256_of
 from compgen.data.lengths import Lengths, Points
 from compgen.data.machine import Machine
@@ -28,7 +28,6 @@ from compgen.errors import InputError
 from compgen.identify.adjust.propagation import Contribution, Systematic, SystematicInputs, responses
 from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.identification import Identification, worst_uncertainty
-from compgen.kinematics.curves import hat_matrix
 from compgen.kinematics.first_order import c_matrix
 
 FILE_NAME = "identified.covariance.npz"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import PART, Deviations, aligned, setups_of
+from compgen.data.error_table import hat_matrix
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
@@ -40,7 +41,6 @@ from compgen.identify.identification import (
 )
 from compgen.identify.options import IdentifyOptions, deviation_sigma
 from compgen.identify.reference_conditions import without_effects
-from compgen.kinematics.curves import hat_matrix
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.kernel_switch import one_thread
 

@@ -23,7 +23,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.data.records import POSITION_COLUMNS
 from compgen.errors import ConvergenceError, InputError
-from compgen.identify.adjust.path_problem import Chunk, Noise, PathModel, Sums, chunk_of, path_model
+from compgen.identify.adjust.path_problem import Chunk, DistanceNoise, PathModel, Sums, chunk_of, path_model
 from compgen.identify.adjust.problem import LengthProblem
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.adjust.residual_tests import misfit_of, residual_series
@@ -75,7 +75,7 @@ class _Stream:
             x, y, z = (columns[name][rows] for name in POSITION_COLUMNS)
             yield chunk_of((x, y, z), station, group, columns["length_mm"][rows])
 
-    def sums(self, state: State, noise: Noise, rejected: list[tuple[int, float]], *, matrix: bool) -> Sums:
+    def sums(self, state: State, noise: DistanceNoise, rejected: list[tuple[int, float]], *, matrix: bool) -> Sums:
         """Pass over all readings; ``rejected`` gets row and residual of those that are not used, some of them."""
         rejected.clear()
         first = 0
@@ -102,7 +102,7 @@ class _Stream:
         return total
 
     def _add_plain(
-        self, total: Sums, chunk: Chunk, state: State, noise: Noise, look: Callable[[Chunk, FloatArray], None]
+        self, total: Sums, chunk: Chunk, state: State, noise: DistanceNoise, look: Callable[[Chunk, FloatArray], None]
     ) -> None:
         """Add a chunk without compiled code: its normal equations are those of a problem of its own."""
         count, stations = len(chunk.group), len(self.archive.stations)
@@ -189,7 +189,7 @@ class _Optimum:
     passes: int
 
 
-def _optimum(stream: _Stream, state: State, noise: Noise) -> _Optimum:
+def _optimum(stream: _Stream, state: State, noise: DistanceNoise) -> _Optimum:
     """Gauss-Newton with one normal matrix, made in the first pass, until no unknown moves and the same readings count."""
     archive, layout, setups, count = stream.archive, stream.layout, stream.setups, len(stream.archive)
 
@@ -236,7 +236,7 @@ def _with_all(
     distance = sample.length_mm + found.residual_mm + state.dead_length_mm[found.adjustment.group]
     standardised = found.residual_mm / (constant_mm + proportional * distance)
     limit = LIMIT * standardised_spread(standardised) if reject else np.inf
-    noise = Noise(constant_mm, proportional, scale_mm, limit)
+    noise = DistanceNoise(constant_mm, proportional, scale_mm, limit)
     optimum = _optimum(stream, state, noise)
     state, factor, sums, used = optimum.state, optimum.factor, optimum.sums, int(optimum.sums.by_group[:, 0].sum())
     size = len(sums.gradient)

@@ -13,7 +13,7 @@ from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths
 from compgen.data.names import MM_PER_UM
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
-from compgen.identify.adjust.problem import LEVER_MM, PointEquations, SeparationProblem, Sights, frame_rotation
+from compgen.identify.adjust.problem import LEVER_MM, LinesOfSight, PointEquations, SeparationProblem, frame_rotation
 from compgen.identify.adjust.robust import MOST_ROUNDS, Rejected, accepted_readings, check_rejected
 from compgen.identify.adjust.solver import LeastSquaresSolution, determined_factor, factorise, solve
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State
@@ -100,7 +100,9 @@ def linearise(data: Network, frame: Frame) -> Linear:
     residual, unit = residuals(data, frame)
     weight = 1.0 / seen.sigma_mm**2
     counts = len(frame.points_mm), len(frame.stations_mm), len(frame.dead_length_mm)
-    equations = Sights(seen.point, seen.station, seen.group, counts).equations(unit, weight, residual).of(data.free)
+    equations = (
+        LinesOfSight(seen.point, seen.station, seen.group, counts).equations(unit, weight, residual).of(data.free)
+    )
     flat = equations.coupling.reshape(-1, len(data.free))
     reduced = equations.own - flat.T @ solved(equations.information, equations.coupling).reshape(flat.shape)
     return Linear(residual, 0.5 * float(np.dot(weight, residual**2)), equations, 0.5 * (reduced + reduced.T))

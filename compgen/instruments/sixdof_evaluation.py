@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import Curve, ErrorTable, fitted_line
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import InputError
@@ -25,7 +25,6 @@ from compgen.instruments.sixdof_reduction import (
     turned_by,
     zeroed,
 )
-from compgen.kinematics.curves import fitted_line
 
 # Runs of all axes to the 21 errors: mean over runs, lines out of the straightness, squareness from their slopes.
 

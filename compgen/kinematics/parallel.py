@@ -364,7 +364,7 @@ class _BlamedError(Exception):
 
 
 @dataclass(frozen=True)
-class Facts:
+class WorkerFacts:
     """What a worker has to be like: versions of packages, and the machine (empty: any)."""
 
     versions: tuple[tuple[str, str], ...]
@@ -372,19 +372,19 @@ class Facts:
 
 
 @cache
-def facts(*, host: bool) -> Facts:
+def facts(*, host: bool) -> WorkerFacts:
     """Return the facts of this process; ``host`` names this start of this computer."""
     versions = tuple((name, next((item.version for item in distributions(name=name)), "none")) for name in PACKAGES)
     if not host:
-        return Facts(versions)
+        return WorkerFacts(versions)
     try:
         start = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
-        return Facts(versions, gethostname())
-    return Facts(versions, f"{gethostname()} {start}")
+        return WorkerFacts(versions, gethostname())
+    return WorkerFacts(versions, f"{gethostname()} {start}")
 
 
-def objection(required: Facts, found: Facts, who: str) -> str:
+def objection(required: WorkerFacts, found: WorkerFacts, who: str) -> str:
     """Say why a scheduler or worker cannot be used, empty if it can."""
     here, there = dict(required.versions), dict(found.versions)
     other = [f"{name} {there.get(name, 'none')} in place of {here[name]}" for name in here if here[name] != there[name]]
@@ -395,7 +395,7 @@ def objection(required: Facts, found: Facts, who: str) -> str:
     return ""
 
 
-def perform_there(required: Facts, function: Packed, item: Packed) -> Answer | str:
+def perform_there(required: WorkerFacts, function: Packed, item: Packed) -> Answer | str:
     """Compute one item on a worker, or say why that worker must not."""
     return objection(required, facts(host=bool(required.host)), "a worker") or perform(function, item)
 
@@ -451,8 +451,8 @@ class Cluster:
         sides = {"the scheduler": found["scheduler"], **{f"worker {k}": v for k, v in found["workers"].items()}}
         for who, item in sides.items():
             packages = {} if item is None else item["packages"]
-            there = Facts(tuple((name, str(packages.get(name) or "none")) for name in PACKAGES))
-            self._refuse(objection(Facts(self._required.versions), there, who))
+            there = WorkerFacts(tuple((name, str(packages.get(name) or "none")) for name in PACKAGES))
+            self._refuse(objection(WorkerFacts(self._required.versions), there, who))
         if self._required.host:
             for who, item in self._client.run(facts, host=True).items():
                 self._refuse(objection(self._required, item, f"worker {who}"))

@@ -17,11 +17,10 @@ from scipy.sparse import block_diag, coo_array, csr_array, hstack
 
 from compgen.controls.shared.base import Term
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable
+from compgen.data.error_table import ErrorTable, free_basis, hat_entries, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine, Vector3
 from compgen.errors import ConvergenceError
-from compgen.kinematics.curves import free_basis, hat_entries, hat_matrix
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import volume_sample

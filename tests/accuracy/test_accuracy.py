@@ -23,12 +23,11 @@ from compgen.accuracy import (
 )
 from compgen.accuracy.evaluate import diagonal_deviation, diagonal_points, squareness_figure, volume_fields
 from compgen.accuracy.field import grid_points
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import Curve, ErrorTable, fitted_line
 from compgen.data.machine import read_machine
 from compgen.data.names import CURVE_NAMES, error_named
 from compgen.errors import InputError
 from compgen.kinematics import c_matrix, volumetric_error
-from compgen.kinematics.curves import fitted_line
 from compgen.report.terminal import accuracy_table
 
 EXACT = 1e-9

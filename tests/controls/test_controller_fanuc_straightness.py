@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 import machines
 from compgen.controls import SourceFile, controller_named
 from compgen.controls.fanuc_straightness import best_polyline
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import Curve, ErrorTable, hat_matrix
 from compgen.data.lengths import Points
 from compgen.errors import InputError
-from compgen.kinematics.curves import hat_matrix
 from compgen.tables import export, read_tables, verify
 
 CONTROL = controller_named("fanuc-straightness")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compgen.data.error_table import Curve, ErrorTable, read_errors
+from compgen.data.error_table import Curve, ErrorTable, fitted_line, read_errors
 from compgen.data.machine import Axis, Chain, Machine
 from compgen.data.names import ERRORS
 from compgen.errors import CompgenWarning, InputError
@@ -28,7 +28,6 @@ from compgen.instruments.sixdof_instrument import (
 )
 from compgen.instruments.sixdof_readings import SixDof, read_sixdof
 from compgen.instruments.sixdof_reduction import expected_away, printed_run, reduce_runs
-from compgen.kinematics.curves import fitted_line
 from compgen.simulate import SimulatedSixDof
 from compgen.simulate.sixdof import Tracer
 

@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import Curve, ErrorTable, fitted_line
 from compgen.data.machine import Axis, Chain, Machine
 from compgen.data.names import ERRORS, error_named
 from compgen.errors import CompgenWarning
@@ -14,7 +14,6 @@ from compgen.instruments.sixdof_evaluation import evaluate
 from compgen.instruments.sixdof_instrument import SIGNALS, AxisSetUp, Optics, SetUp, SixDofInstrument, known_systematics
 from compgen.instruments.sixdof_readings import SixDof
 from compgen.instruments.sixdof_reduction import errors_of_run, expected_away, reduce_runs
-from compgen.kinematics.curves import fitted_line
 from compgen.simulate.sixdof import Tracer, run_signals
 
 ARCSEC = np.pi / 648000

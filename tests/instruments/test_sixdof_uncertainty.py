@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import Curve, ErrorTable, fitted_line
 from compgen.data.machine import load_machine
 from compgen.data.names import error_named
 from compgen.instruments.sixdof_evaluation import (
@@ -21,7 +21,6 @@ from compgen.instruments.sixdof_evaluation import (
 )
 from compgen.instruments.sixdof_instrument import known_systematics, read_instrument
 from compgen.instruments.sixdof_uncertainty import uncertainty_budget
-from compgen.kinematics.curves import fitted_line
 from compgen.simulate import SimulatedSixDof, draw_truth
 from compgen.simulate.sixdof import HALF_RANGE, TABLE_3
 from compgen.simulate.truth import RandomErrors, TruthPlan

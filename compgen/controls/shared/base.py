@@ -13,11 +13,10 @@ import numpy as np
 
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.error_table import ErrorTable, ReversalCurves, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.errors import InputError
-from compgen.kinematics.curves import hat_matrix
 from compgen.kinematics.first_order import factor
 
 # What every control has in common: a basis of tables, and text that is built, parsed and emulated.

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import hat_entries, hat_matrix
 from compgen.data.machine import Machine
-from compgen.kinematics.curves import hat_entries, hat_matrix
 
 IntArray = NDArray[np.int64]
 

@@ -243,7 +243,7 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class Noise:
+class DistanceNoise:
     """Standard uncertainty a + b d of a reading over the distance d, mm; its weight is (scale / (a + b d))^2.
 
     A reading whose residual exceeds ``limit`` of them has no weight.
@@ -319,7 +319,7 @@ class PathModel:
         self,
         state: State,
         chunks: Iterator[tuple[Chunk, FloatArray, FloatArray]],
-        noise: Noise,
+        noise: DistanceNoise,
         *,
         matrix: bool,
         look: Callable[[Chunk, FloatArray], None] = lambda *_: None,
@@ -460,7 +460,7 @@ class PathProblem:
         return replace(self, weight=np.require(weight, np.float64, ["C"]))
 
     def _sums(self, state: State, residual: FloatArray, *, matrix: bool) -> Sums:
-        return self.model.sums(state, iter([(self.readings, self.weight, residual)]), Noise(), matrix=matrix)
+        return self.model.sums(state, iter([(self.readings, self.weight, residual)]), DistanceNoise(), matrix=matrix)
 
     def evaluate(self, state: State) -> tuple[float, FloatArray]:
         """Half the weighted sum of squares with the exact model, and its exact gradient (size,)."""

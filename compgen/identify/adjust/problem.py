@@ -77,7 +77,7 @@ def summed(values: FloatArray, index: IntArray, count: int) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Sights:
+class LinesOfSight:
     """n readings along lines of sight: point, station and dead length of each, with their numbers in all.
 
     ``point``, ``station``, ``group`` (n,) are indices below ``counts``.
@@ -127,7 +127,7 @@ CHUNK_POSES = 2048
 
 
 @dataclass(frozen=True)
-class Poses:
+class MachinePoses:
     """The unknown errors and m poses of the machine: positions, tools (m, 3), and the curve bases there."""
 
     parameters: ErrorParameters
@@ -141,7 +141,7 @@ class Poses:
         return tip_position(self.parameters.machine, values, self.position_mm, self.tool_mm)
 
     def chunks(self, state: State) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
-        """Poses, tips (p, 3) and derivatives of the tips by the unknown errors (p, 3, size)."""
+        """MachinePoses, tips (p, 3) and derivatives of the tips by the unknown errors (p, 3, size)."""
         for first in range(0, len(self.position_mm), CHUNK_POSES):
             rows = slice(first, first + CHUNK_POSES)
             bases = [basis[rows] for basis in self.bases]
@@ -156,12 +156,12 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class LengthProblem(Poses):
+class LengthProblem(MachinePoses):
     """Readings by pose and station; n readings, m poses (distinct positions with distinct tools).
 
     Parameters
     ----------
-    parameters, position_mm, tool_mm, bases : as for :class:`Poses`.
+    parameters, position_mm, tool_mm, bases : as for :class:`MachinePoses`.
     pose, station, group : index of pose, station and dead length of each reading, each (n,).
     length_mm : readings, (n,).
     weight : 1/variance of each reading in 1/mm^2, zero for a rejected one, (n,).
@@ -230,7 +230,7 @@ class LengthProblem(Poses):
             sight = tip[local] - state.stations_mm[station]
             distance = np.linalg.norm(sight, axis=1)
             residual = distance - state.dead_length_mm[group] - self.length_mm[rows]
-            sights = Sights(local, station, group, (len(tip), self.stations, self.groups))
+            sights = LinesOfSight(local, station, group, (len(tip), self.stations, self.groups))
             yield sights.equations(sight / distance[:, None], self.weight[rows], residual), design
 
 
@@ -280,7 +280,7 @@ LEVER_MM = 1000.0
 
 
 @dataclass(frozen=True)
-class SeparationProblem(Poses):
+class SeparationProblem(MachinePoses):
     """Positions measured at m poses; it has the interface of :class:`compgen.identify.adjust.unknowns.LeastSquaresProblem`.
 
     In the state, ``stations_mm`` (2, 3) holds translation and rotation vector (times 1000 mm) of the frame, and
@@ -288,7 +288,7 @@ class SeparationProblem(Poses):
 
     Parameters
     ----------
-    parameters, position_mm, tool_mm, bases : as for :class:`Poses`.
+    parameters, position_mm, tool_mm, bases : as for :class:`MachinePoses`.
     measured_mm : measured tip positions (m, 3), the placement known roughly.
     information : U_j, (m, 3, 3), 1/mm^2; zero in the directions that were not measured.
     lever, station_information : L_j (m, 3, q) and B (q, q).

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import free_basis, hat_matrix, spline_matrix
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, SQUARENESS_NAMES, ErrorName, error_named
 from compgen.errors import InputError
-from compgen.kinematics.curves import free_basis, hat_matrix, spline_matrix
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.first_order import modelled_errors, observable_errors, tool_of
 
