@@ -22,6 +22,8 @@ from compgen.kinematics.first_order import c_matrix, tool_of
 from compgen.kinematics.gauge import rigid_fields, without_rigid_motion
 from compgen.kinematics.many_points import volumetric_error
 
+# One figure of accuracy with its uncertainty, and how two of them compare.
+
 Verdict = Literal["better", "worse", "not separated", "smaller", "larger", "same"]
 
 

@@ -183,6 +183,8 @@ def stopped_by_signals() -> Iterator[threading.Event]:
             signal.signal(known, handler)
 
 
+# Text for people, through rich: tables, messages, progress; loaded by the first command or message that needs it.
+
 #: Tables into a pipe or a file get the width that they need, not that of an unknown terminal.
 PIPE_WIDTH = None if sys.stdout.isatty() else 130
 

@@ -32,6 +32,8 @@ from compgen.kinematics.first_order import coefficients, factor
 # mm, angles rad, arguments of linear axes mm.
 
 
+# Error parameters and list file of the ISG kernel's volumetric compensation, read strictly from text.
+
 #: Errors by the control's name (position errors have no leading E): ``"C0Y"`` -> ``"EC0Y"``, ``"EXX"`` -> ``"EXX"``.
 ISO_NAMES: dict[str, str] = {(name[1:] if name in SQUARENESS_NAMES else name): name for name in ERROR_NAMES}
 CONTROL_NAMES: dict[str, str] = {iso: control for control, iso in ISO_NAMES.items()}

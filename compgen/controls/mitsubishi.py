@@ -37,6 +37,8 @@ from compgen.errors import CompgenWarning, InputError
 # has it; no document describes it.
 
 
+# Mitsubishi machine error compensation: records of the parameter file, settings, tables, and their limits.
+
 #: Increment or absolute system, for all sets alike; unit of the values.
 SYSTEM, UNIT = 4000, 1006
 #: Parameters of set k have these numbers plus 10 (k - 1).

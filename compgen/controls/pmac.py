@@ -31,6 +31,8 @@ from compgen.errors import CompgenWarning, InputError
 # Source: PMAC User Manual p. 79-83, PMAC 2 Software Reference p. 207-211, Turbo PMAC Software Reference p. 301-306.
 
 
+# Compensation tables of PMAC and Turbo PMAC as the control keeps them, and their download files.
+
 IntArray = NDArray[np.int64]
 
 #: Entries are 1/16 count.

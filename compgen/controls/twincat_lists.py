@@ -30,6 +30,8 @@ from compgen.errors import CompgenWarning, InputError
 # 308709003, 15327290891) and its parameters P-COMP-00004 ... P-COMP-00033.
 
 
+# Axis lists of the TwinCAT CNC (TF5200): leadscrew, cross and plane tables, their lookup, and reading them.
+
 #: 0.1 um in mm.
 MM_PER_UNIT = 1e-4
 

@@ -480,6 +480,9 @@ def format_reversal(reversal: ReversalCurves, metadata: Mapping[str, object] | N
 # Bases of curves over one axis: hat functions between nodes, and null spaces of a few linear constraints.
 
 
+# Bases of curves over one axis, and reference lines through straightness readings.
+
+
 def hat_entries(nodes_mm: FloatArray, position_mm: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
     """Left node (m,) of the interval of each position, and the share (m,) of the right node in the value there.
 

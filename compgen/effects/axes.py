@@ -244,6 +244,10 @@ class CosineError(SingleAxisEffect):
         return along(self.axis, -readings.position_mm[:, self.axis])
 
 
+# What changes within a session of axis runs: drift, a step, a bad run, disturbed readings, an axis that has not settled.
+#
+# Time is ``time_s`` where it was logged, else the number of the reading in the order of time.
+
 #: Number of time constants that are tried.
 STEPS = 64
 #: Longest time constant that is tried, as a share of the session, and the shortest, also in readings.

@@ -44,6 +44,14 @@ from compgen.fit.zeroing import FixedCurve, zero_ends
 from compgen.identify.covariance import Covariance
 from compgen.kinematics.kernel_switch import one_thread
 
+# Many curves in one banded system: their nodes follow one another, and nothing couples one curve with the next.
+#
+# A = W + mu D2^T D2 of a curve with independent nodes that is fixed at whole nodes has half-bandwidth 2. Laid behind one
+# another such curves are one :class:`compgen.fit.smoother.Smoother` whose second differences across two curves are zero.
+# One factorisation serves all, whatever their nodes, weights and mu; each is refined by itself, so that no curve changes
+# with the company it has. What keeps its bounds is finished; the others are solved by
+# :func:`compgen.fit.bounds.solve_curve`.
+
 #: Half-bandwidth of A, and one more.
 _DIAGONALS = 3
 #: What is put behind the second differences of a curve of n nodes: it has n - 2 of them, or none.

@@ -51,6 +51,8 @@ from compgen.identify.covariance import error_design
 # crash. The error probability counts every gap (and every figure) that was looked at: Bonferroni.
 
 
+# Trend of one figure over time: regression, random walk, steps; forecast of the first exit from its tolerance.
+
 #: Standard deviations of the random walk over the whole history that are weighed, as multiples of the median u.
 WALKS = (0.3, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 #: Prior probability that there is no random walk.

@@ -378,6 +378,11 @@ def header_date(text: str, chosen: Order | None = None) -> tuple[str | None, str
     return iso(found, order), None
 
 
+# How commands open files: native ones are read as they are, foreign ones are converted in memory.
+#
+# :func:`open_measurement` and :func:`open_errors` take any file; a foreign one that leaves something open is refused with
+# what ``volcomp import`` needs. What converts a foreign file is imported when there is one.
+
 _NATIVE_SUFFIXES = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv", ".part.csv")
 
 

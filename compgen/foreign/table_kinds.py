@@ -66,6 +66,11 @@ from compgen.foreign.one_axis import (
 from compgen.foreign.source import parse_number, shown
 from compgen.identify.single_axes import POSITIONING, SAME_TARGET_MM, two_way_mean
 
+# Tables of readings along axes: a row for each reading, or a row for each target and a column for each run.
+#
+# :func:`axis_readings` finds runs, deviations, axes and directions. Columns that say the same thing twice (deviations next to
+# readings, means next to runs) are compared, and the user is asked where they disagree.
+
 #: Units that are tried for deviations without one, mm.
 _LIKELY = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "in", "nm")}
 #: A column without a telling name holds readings, not deviations, if it follows the targets so closely.

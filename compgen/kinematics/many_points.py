@@ -19,6 +19,8 @@ from compgen.errors import InputError
 from compgen.kinematics.first_order import coefficients, tool_of
 from compgen.kinematics.kernel_switch import one_thread, use_compiled
 
+# Points that fill the working volume: where tables have their nodes, and between them.
+
 #: A full grid larger than this is thinned to about as many points.
 MOST_POINTS = 20_000
 

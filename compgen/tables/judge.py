@@ -374,6 +374,11 @@ def left_by_reversal(reversal: ReversalCurves | None, *, corrected: bool) -> dic
     return {name: round(value / MM_PER_UM, 3) for name, value in largest.items() if value >= 0.5 * WORTH_MM}
 
 
+# What parsed tables would make the axes do, whatever the errors are: steps, the reference point, the table's ends.
+#
+# The tables are looked at on lines along the axes at all of their nodes, also those outside the travel, which no
+# residual over the working volume shows.
+
 #: A step between neighbouring nodes that the slope of the best table does not explain is absurd from here on, um.
 UNEXPLAINED_STEP_UM = 500.0
 #: A step is absurd if it is this many times as steep as the steepest one that does not touch the same nodes ...

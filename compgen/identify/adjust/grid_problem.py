@@ -18,6 +18,9 @@ from compgen.kinematics.kernel_switch import use_compiled
 # The sparse map from the unknown errors to the motion of the carriages at the levels of a grid.
 
 
+# Readings sorted into a full grid of axis levels, and the motion of the carriages at those levels.
+
+
 @dataclass(frozen=True)
 class MotionMap:
     """Entries of the matrix from the unknown errors to delta and eps of every level, the levels of X, Y, Z in a row.

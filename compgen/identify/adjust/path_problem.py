@@ -24,6 +24,8 @@ from compgen.kinematics.compiled_kernels import rotation_factors
 from compgen.kinematics.exact_chain import SERIES_BELOW, passing_order, travel_directions
 from compgen.kinematics.kernel_switch import FAST, loop
 
+# Compiled pass over readings at any positions (numba, ``pip install compgen[fast]``): cost, gradient, normal matrix.
+
 #: Powers of the three local coordinates in each monomial of degree 4 and less; those of degree 2 and less come first.
 POWERS = np.array(
     sorted(((a, b, c) for a in range(5) for b in range(5 - a) for c in range(5 - a - b)), key=lambda p: (sum(p), p)),

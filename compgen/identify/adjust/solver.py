@@ -173,6 +173,8 @@ def step_levers(parameters: ErrorParameters, size: int) -> FloatArray:
     return levers
 
 
+# What the data do not determine: numerical rank, unobservable combinations in words, nodes without data.
+
 #: Eigenvalues of the normal matrix with unit diagonal below this count as zero. A determined problem stays above
 #: about 1e-7, an undetermined direction falls to 1e-14: there is a wide gap.
 ZERO_EIGENVALUE = 1e-11

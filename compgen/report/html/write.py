@@ -45,6 +45,8 @@ from compgen.tables.verification import coverage_of
 # Figures of ISO 230 in the report: those of the folder, else those of the identified errors.
 
 
+# The report as plain data: what `report.json` holds, with the figures of ISO 230 and the limitations.
+
 #: Reference line of straightness and squareness.
 LINE = "ls"
 GROUPS = {
