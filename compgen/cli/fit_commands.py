@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from compgen.cli.common import answer, json_option, out_option
+from compgen.cli.common import json_option, out_option
 from compgen.cli.shared_options import (
     covariance_of,
     covariance_options,
@@ -14,6 +14,7 @@ from compgen.cli.shared_options import (
     fitting_options,
     machine_argument,
 )
+from compgen.cli.terminal import answer
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
 from compgen.fit import FitOptions, fit

@@ -19,15 +19,12 @@ from compgen.cli.common import (
     PATH,
     STOPPED,
     Command,
-    answer,
-    complain,
     fleet_options,
     json_option,
     print_json,
-    say,
-    stdout,
     stopped_by_signals,
 )
+from compgen.cli.terminal import answer, complain, say, stdout
 from compgen.errors import InputError
 
 if TYPE_CHECKING:

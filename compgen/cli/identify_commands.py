@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from compgen.cli.common import fleet_options, json_option, out_option, print_json, progress, stdout
+from compgen.cli.common import fleet_options, json_option, out_option, print_json
 from compgen.cli.shared_options import (
     active_options,
     identify_options,
@@ -16,6 +16,7 @@ from compgen.cli.shared_options import (
     mapper,
     measurements_argument,
 )
+from compgen.cli.terminal import progress, stdout
 from compgen.data.files import OutputFolder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from compgen.cli.common import PATH, json_option, out_option, print_json, progress, say, say_paths, stdout
+from compgen.cli.common import PATH, json_option, out_option, print_json
 from compgen.cli.shared_options import (
     active_options,
     controller_option,
@@ -25,6 +25,7 @@ from compgen.cli.shared_options import (
     templates_option,
     unverified_option,
 )
+from compgen.cli.terminal import progress, say, say_paths, stdout
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
 from compgen.errors import CompgenWarning, InputError

@@ -10,19 +10,7 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import (
-    NUMBER,
-    PATH,
-    answer,
-    complain,
-    json_option,
-    out_option,
-    print_json,
-    progress,
-    say,
-    say_paths,
-    stdout,
-)
+from compgen.cli.common import NUMBER, PATH, json_option, out_option, print_json
 from compgen.cli.shared_options import (
     active_options,
     controller_option,
@@ -39,6 +27,7 @@ from compgen.cli.shared_options import (
     tool_offset,
     unverified_option,
 )
+from compgen.cli.terminal import answer, complain, progress, say, say_paths, stdout
 from compgen.controls import CONTROLLERS
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import format_errors, read_reversal
