@@ -1,4 +1,4 @@
-"""Fields of position errors and where they come from: alignment, figures of a volume, their uncertainty."""
+"""Figures of accuracy and fields of position errors: where they come from, alignment, uncertainty, comparison of two."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from compgen.accuracy.evaluate import (
 )
 from compgen.accuracy.field import Alignment, ErrorField, ErrorSource, aligned, error_source
 from compgen.accuracy.positioning import RunStatistics, axis_statistics
-from compgen.controls.etalon_exchange import is_exchange_text, read_error_file
+from compgen.controls.isg_kernel import is_exchange_text, read_error_file
 from compgen.data.axis_runs import AxisRuns, read_diagonals
 from compgen.data.csv_files import FloatArray, names_in_header, read_csv
 from compgen.data.deviations import Deviations

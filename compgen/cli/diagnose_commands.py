@@ -12,7 +12,7 @@ import click
 from compgen.cli.common import fleet_options, json_option, out_option, print_json
 from compgen.cli.shared_options import instrument_option, machine_argument, mapper, measurements_argument, options_of
 from compgen.cli.terminal import progress, say
-from compgen.controls.etalon_exchange import read_error_file
+from compgen.controls.isg_kernel import read_error_file
 from compgen.data.files import OutputFolder, json_text
 from compgen.data.machine import Machine
 from compgen.diagnose import AxisDiagnosis, DiagnoseOptions, Diagnosis, diagnose

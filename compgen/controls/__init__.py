@@ -58,8 +58,8 @@ class Controls(MutableMapping[str, "type[AnyController]"]):
 #: The class of every control by its name on the command line; ``CONTROLLERS["pmac"](machine)`` is that of a machine.
 CONTROLLERS = Controls(
     {
-        "isg-csv": "isg_csv.IsgCsv",
-        "etalon-exchange": "etalon_exchange.EtalonExchange",
+        "isg-csv": "isg_kernel.IsgCsv",
+        "etalon-exchange": "isg_kernel.EtalonExchange",
         "fanuc-pitch": "fanuc_pitch.FanucPitch",
         "fanuc-3d": "fanuc_3d.Fanuc3d",
         "fanuc-straightness": "fanuc_straightness.FanucStraightness",

@@ -1,4 +1,4 @@
-"""Volumetric compensation of the ISG kernel (Beckhoff TwinCAT CNC TF5280): what its two file formats share."""
+"""Volumetric compensation of the ISG kernel (Beckhoff TwinCAT CNC TF5280): error parameters, list file, both file formats."""
 
 from __future__ import annotations
 
@@ -8,19 +8,21 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
-from compgen.controls.shared.grids import ParameterGrid, loss_setting, uneven_nodes_mm
-from compgen.controls.shared.scanner import MOST_LINES, check_complete, content_lines
+from compgen.controls.shared.grids import ParameterGrid, grid_order, loss_setting, uneven_nodes_mm
+from compgen.controls.shared.scanner import MOST_LINES, check_complete, content_lines, floating, uses_exponent
 from compgen.controls.shared.terms import error_terms
 from compgen.data.csv_files import FloatArray, fixed
-from compgen.data.error_table import ErrorTable
+from compgen.data.error_table import Curve, ErrorTable, read_errors
+from compgen.data.files import read_text
 from compgen.data.lengths import Points
 from compgen.data.machine import Chain, Machine
-from compgen.data.messages import nearest
+from compgen.data.messages import doubled, nearest
 from compgen.data.names import AXES, ERROR_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.toml_files import Section, axis_setting, choice, flag, setting, unless_stated, whole
 from compgen.errors import CompgenWarning, InputError
@@ -644,3 +646,307 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
                 "use_axis_offsets 1: what the control then shifts is not documented in public and not emulated."
             )
         return found
+
+
+# ISG_CSV: the error parameters as white-space separated columns (kernel help, page 296429067).
+#
+# A header names arguments and parameters, rows of numbers follow; ``//`` starts a comment, a line with ``#`` ends a
+# block. Several argument columns make a grid, e.g. errors of X at several Z.
+
+_Row = tuple[int, list[str]]
+
+
+def parse_csv(source: SourceFile) -> ParameterFile:
+    """Read an ISG_CSV file; InputError with file and line for anything that the grammar does not have."""
+    parameters: list[ErrorParameter] = []
+    records = 0
+    exponent: int | None = None
+    for block in _blocks(source):
+        parameters += _block(source, block)
+        records += len(block) - 1
+        lines = (line for line, words in block[1:] if uses_exponent(words))
+        exponent = next(lines, None) if exponent is None else exponent
+    check_complete(source, records)
+    return ParameterFile(tuple(parameters), records, exponent)
+
+
+def _blocks(source: SourceFile) -> list[list[_Row]]:
+    blocks: list[list[_Row]] = [[]]
+    for line, text in content_lines(source):
+        if text.startswith("#"):
+            blocks.append([])
+        elif "#" in text:
+            raise source.fail("a '#' ends a block and must be at the start of its own line", line)
+        else:
+            blocks[-1].append((line, text.split()))
+    filled = [block for block in blocks if block]
+    if not filled:
+        raise source.fail("holds no block; is it the right file, or was it cut?")
+    return filled
+
+
+def _block(source: SourceFile, block: list[_Row]) -> list[ErrorParameter]:
+    """Return the parameters of one block: header and rows that form a grid over its arguments."""
+    (header_line, names), rows = block[0], block[1:]
+    _check_header(source, header_line, names)
+    if not rows:
+        raise source.fail(f"the block {' '.join(names)[:60]!r} has no rows; was the file cut?", header_line)
+    for line, words in rows:
+        if len(words) != len(names):
+            raise source.fail(f"has {len(words)} columns, its header in line {header_line} has {len(names)}", line)
+    matrix = np.array(
+        [[floating(source, line, word, name) for word, name in zip(words, names, strict=True)] for line, words in rows]
+    )
+    columns = {name: matrix[:, k] for k, name in enumerate(names)}
+    if any(name in "ABC" for name in names):
+        mixed = [name for name in names if len(name) > 1 and not is_rotary(name)]
+        if mixed:
+            raise source.fail(f"{mixed[0]} depends on a rotary axis; the model has three linear axes", header_line)
+        where = f"{source.path}:{header_line}"
+        warnings.warn(f"{where}: the block belongs to a rotary axis and is left out", CompgenWarning, stacklevel=2)
+        return []
+    arguments = [name for name in names if name in ARGUMENTS]
+    nodes, order = grid_order(source, [line for line, _ in rows], [columns[name] for name in arguments])
+    axes = tuple(ARGUMENTS.index(name) for name in arguments)
+    shape = tuple(len(line) for line in nodes)
+    return [
+        ErrorParameter(name, ParameterGrid(axes, nodes, column[order].reshape(shape)), source, header_line)
+        for name, column in columns.items()
+        if name not in ARGUMENTS
+    ]
+
+
+def _check_header(source: SourceFile, line: int, names: list[str]) -> None:
+    for name in names:
+        if name[0] in "+-.0123456789":
+            raise source.fail(f"expected a header with names at the start of a block, found {name[:40]!r}", line)
+        check_name(source, line, name)
+    twice = doubled(names)
+    if twice is not None:
+        raise source.fail(f"the header names {twice} twice (the control's error 70469)", line)
+    if all(len(name) == 1 for name in names):
+        raise source.fail("the header has arguments only; expected at least one error parameter", line)
+
+
+class IsgCsv(VolumetricController):
+    """``isg-csv``: error parameters as columns, one block per axis."""
+
+    name = "isg-csv"
+    file_format = "ISG_CSV"
+    parameter_file = "volcomp0.csv"
+    settings_class = IsgCsvSettings
+
+    def parse_parameters(self, source: SourceFile) -> ParameterFile:
+        """Read one ISG_CSV file."""
+        return parse_csv(source)
+
+    def count_records(self, fields: Mapping[str, ParameterGrid], constants: Mapping[str, float]) -> int:
+        """One row for the position errors, one for the tool, one per position of each axis."""
+        return sum(len(block["rows"]) for block in _table_blocks(fields, constants))
+
+    def body(self, tables: IsgTables) -> dict[str, Any]:
+        """Return the blocks: title, names, rows and digits of each column."""
+        return {"blocks": _table_blocks(tables.fields, tables.constants)}
+
+
+def _table_blocks(fields: Mapping[str, ParameterGrid], constants: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Blocks in the order of the file: constants, tool position, then the curves of X, Y, Z that share their nodes."""
+    groups: dict[tuple[Any, ...], dict[str, ParameterGrid]] = {}
+    for name, item in sorted(fields.items(), key=lambda pair: pair[1].axes):
+        key = (item.axes, *(nodes.tobytes() for nodes in item.nodes_mm))
+        groups.setdefault(key, {})[name] = item
+    blocks = [_rows(group) for group in groups.values()]
+    if constants:
+        row = {"names": list(constants), "digits": [POSITION_DIGITS] * len(constants), "rows": [[*constants.values()]]}
+        first_curve = next((k for k, block in enumerate(blocks) if block["names"][0] in ARGUMENTS), len(blocks))
+        blocks.insert(first_curve, {"title": "tool position at machine zero, mm", **row})
+    return blocks
+
+
+def _rows(group: Mapping[str, ParameterGrid]) -> dict[str, Any]:
+    """Block of the parameters that share one grid: its names, rows, and digits of each column."""
+    first = next(iter(group.values()))
+    letters = [AXES[axis] for axis in first.axes]
+    positions = itertools.product(*(nodes.tolist() for nodes in first.nodes_mm))
+    columns = [np.ravel(item.values).tolist() for item in group.values()]
+    linear = [error_named(name).kind == "linear" for name in group]
+    return {
+        "title": f"errors over {' and '.join(letters)}, mm and rad" if letters else "position errors, rad",
+        "names": [*letters, *(CONTROL_NAMES[name] for name in group)],
+        "digits": [POSITION_DIGITS] * len(letters) + [LENGTH_DIGITS if flag else ANGLE_DIGITS for flag in linear],
+        "rows": [[*at, *values] for at, *values in zip(positions, *columns, strict=True)],
+    }
+
+
+# ETALON_EXCHANGE: the exchange file of Etalon's software, variant "Vendor" (ISG kernel help, page 296430091).
+#
+# ``[EXY]`` starts a parameter; ``VALUE = number`` gives a constant, ``Gridpoints = {`` rows ``argument value`` and ``}``
+# a curve over the axis' own position. ``//`` starts a comment. :func:`errors_from_etalon` imports such a file.
+
+
+_SECTION = re.compile(r"\[\s{0,9}([A-Za-z0-9_]{1,40})\s{0,9}\]")
+_VALUE = re.compile(r"value\s{0,40}=\s{0,40}(\S+)", re.IGNORECASE)
+_GRID = re.compile(r"gridpoints\s{0,40}=\s{0,40}\{", re.IGNORECASE)
+
+
+@dataclass
+class _Section:
+    """One ``[NAME]`` while it is read; ``open`` between the braces of its grid points."""
+
+    name: str
+    line: int
+    value: float | None = None
+    rows: list[tuple[int, list[str]]] = field(default_factory=list)
+    open: bool = False
+    grid: bool = False
+
+
+def parse_etalon(source: SourceFile) -> ParameterFile:
+    """Read an ETALON_EXCHANGE file; InputError with file and line for anything that the grammar does not have."""
+    sections: list[_Section] = []
+    exponent: int | None = None
+    for line, text in content_lines(source):
+        _take_line(source, sections, line, text)
+        if exponent is None and uses_exponent([word for word in text.split() if word[0] in "+-.0123456789"]):
+            exponent = line
+    if sections and sections[-1].open:
+        raise source.fail(f"[{sections[-1].name}] has no closing brace: the file was cut", sections[-1].line)
+    records = sum(len(section.rows) if section.grid else 1 for section in sections)
+    parameters = []
+    for section in sections:
+        name, line = section.name, section.line
+        if section.value is not None:
+            parameters.append(ErrorParameter(name, ParameterGrid((), (), np.array(section.value)), source, line))
+            continue
+        if not section.rows:
+            raise source.fail(f"[{name}] has no values; was the file cut?", line)
+        if name in ISO_NAMES and ISO_NAMES[name] in SQUARENESS_NAMES:
+            raise source.fail(f"[{name}] is a constant; expected 'VALUE = number'", line)
+        pairs = np.array([[floating(source, at, word, name) for word in words] for at, words in section.rows])
+        nodes, order = grid_order(source, [at for at, _ in section.rows], [pairs[:, 0]])
+        axis = 0 if is_rotary(name) else ARGUMENTS.index(name[-1])
+        parameters.append(ErrorParameter(name, ParameterGrid((axis,), nodes, pairs[order, 1]), source, line))
+    check_complete(source, records)
+    return ParameterFile(tuple(parameters), records, exponent)
+
+
+def _take_line(source: SourceFile, sections: list[_Section], line: int, text: str) -> None:
+    """Add one line to the section that is being read, or start a new one."""
+    current = sections[-1] if sections else None
+    header = _SECTION.match(text)
+    if header and not (current and current.open):
+        check_name(source, line, header.group(1))
+        if len(header.group(1)) == 1:
+            raise source.fail(f"[{header.group(1)}] is an argument; expected a parameter such as [EXX]", line)
+        sections.append(_Section(header.group(1), line))
+        if rest := text[header.end() :].strip():
+            _take_entry(source, sections[-1], line, rest)
+    elif current is None:
+        raise source.fail(f"expected a parameter name in brackets such as [EXX], found {text[:40]!r}", line)
+    elif current.open:
+        row, brace, rest = text.partition("}")
+        words = row.split()
+        if rest or len(words) not in ((0, 2) if brace else (2,)):
+            message = f"expected two numbers 'argument value' or '}}' in [{current.name}], got {text[:40]!r}"
+            raise source.fail(message, line)
+        if words:
+            current.rows.append((line, words))
+        current.open = not brace
+    else:
+        _take_entry(source, current, line, text)
+
+
+def _take_entry(source: SourceFile, section: _Section, line: int, text: str) -> None:
+    if section.grid or section.value is not None:
+        raise source.fail(f"[{section.name}] has its value already; expected a new [NAME], got {text[:40]!r}", line)
+    value = _VALUE.fullmatch(text)
+    if value:
+        section.value = floating(source, line, value.group(1), section.name)
+    elif _GRID.fullmatch(text):
+        section.grid = section.open = True
+    else:
+        message = f"expected 'VALUE = number' or 'Gridpoints = {{' in [{section.name}], got {text[:40]!r}"
+        raise source.fail(message, line)
+
+
+def is_exchange_text(text: str) -> bool:
+    """Whether a text begins, after comments, with a parameter name in brackets, as an exchange file does."""
+    for line in text[:20_000].split("\n"):
+        content = line.partition("//")[0].strip()
+        if content:
+            return _SECTION.match(content) is not None
+    return False
+
+
+def errors_from_etalon(text: str, path: Path | None = None) -> ErrorTable:
+    """Import an exchange file that a laser tracer's software wrote ("Vendor" variant).
+
+    Parameters
+    ----------
+    text : contents of the file; lengths in mm, angles in rad, positions in mm.
+    path : where it came from, for messages.
+
+    Returns
+    -------
+    the errors as in the file, squareness in the convention of ISO 230-1 (X is the reference); uncertainties unknown.
+    Errors of rotary axes are left out with a warning.
+    """
+    source = SourceFile(path or Path("exchange file"), text)
+    fields, _ = collect(parse_etalon(source).parameters)
+    curves = {name: _curve(item) for name, item in fields.items() if name not in SQUARENESS_NAMES}
+    squareness = {name: (float(fields[name].values), np.nan) for name in SQUARENESS_NAMES if name in fields}
+    return ErrorTable(curves, squareness, {"source": source.path.name, "format": "ETALON_EXCHANGE"})
+
+
+def _curve(item: ParameterGrid) -> Curve:
+    position = item.nodes_mm[0] if item.axes else np.zeros(1)
+    value = np.atleast_1d(item.values)
+    return Curve(position, value, np.full(len(value), np.nan))
+
+
+class EtalonExchange(VolumetricController):
+    """``etalon-exchange``: one section per parameter."""
+
+    name = "etalon-exchange"
+    file_format = "ETALON_EXCHANGE"
+    parameter_file = "volcomp0.etalon.txt"
+
+    def parse_parameters(self, source: SourceFile) -> ParameterFile:
+        """Read one exchange file."""
+        return parse_etalon(source)
+
+    def count_records(self, fields: Mapping[str, ParameterGrid], constants: Mapping[str, float]) -> int:
+        """One record per VALUE and per row of grid points."""
+        return sum(int(np.size(item.values)) for item in fields.values()) + len(constants)
+
+    def body(self, tables: IsgTables) -> dict[str, Any]:
+        """Return the sections: squareness first, then the curves with their rows."""
+        names = [*(name for name in SQUARENESS_NAMES if name in tables.fields)]
+        names += [name for name in tables.fields if name not in names]
+        return {"sections": [_section(name, tables.fields[name]) for name in names]}
+
+
+def _section(name: str, item: ParameterGrid) -> dict[str, Any]:
+    linear = error_named(name).kind == "linear"
+    rows = list(zip(item.nodes_mm[0].tolist(), item.values.tolist(), strict=True)) if item.axes else []
+    return {
+        "name": CONTROL_NAMES[name],
+        "unit": "mm" if linear else "rad",
+        "digits": LENGTH_DIGITS if linear else ANGLE_DIGITS,
+        "position_digits": POSITION_DIGITS,
+        "value": None if item.axes else float(item.values),
+        "rows": rows,
+    }
+
+
+# Errors from the files that users have: ``*.errors.csv``, or an exchange file that a laser tracer's software wrote.
+
+
+def read_error_file(path: str | Path) -> ErrorTable:
+    """Read an ``*.errors.csv`` file (um, urad) or an Etalon exchange file, variant Vendor (mm, rad).
+
+    Which of the two it is shows in the text: an exchange file begins, after comments, with a name in brackets.
+    """
+    source = Path(path)
+    text = read_text(source)
+    return errors_from_etalon(text, source) if is_exchange_text(text) else read_errors(source)

@@ -1,4 +1,4 @@
-"""Omron PMAC and Turbo PMAC (``pmac``): leadscrew, cross-axis, two-dimensional and backlash tables."""
+"""Omron PMAC and Turbo PMAC (``pmac``): leadscrew, cross-axis, two-dimensional and backlash tables, and their files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TwinCAT CNC axis lists (``twincat-lists``): leadscrew, cross and plane tables of the axes."""
+"""TwinCAT CNC axis lists (``twincat-lists``): leadscrew, cross and plane tables of the axes, their text and lookup."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Geometric errors and reversal as curves over the axis position, read and written.
+"""Geometric errors and reversal as curves over the axis position, read and written; bases of such curves.
 
 :class:`ErrorTable` is what identification, fit and export hand on: 18 curves and 3 squareness errors in mm and rad. Files
 hold um and urad (``*.errors.csv``). :class:`ReversalCurves` adds what differs between both directions of travel

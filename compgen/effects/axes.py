@@ -1,4 +1,4 @@
-"""Effects of single axes: thermal scale, spindle growth, backlash, lost motion, periodic error, lag, cosine error.
+"""Effects of single axes: heat, backlash, lost motion, periodic errors, lag, cosine error; changes within a session of runs.
 
 The card of a class is a template: ``{A}`` and ``{a}`` are replaced by the letter of the axis.
 """

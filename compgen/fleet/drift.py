@@ -1,4 +1,4 @@
-"""Drift of one machine from its calibrations: changes, trends, steps, forecasts, in figures and in sentences.
+"""Drift of one machine from its calibrations: trends, steps, forecasts, in figures and in sentences.
 
 See ``docs/drift.md``; :mod:`compgen.fleet.change` compares calibrations, :mod:`compgen.fleet.drift` fits and forecasts.
 """

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from compgen.controls.etalon_exchange import errors_from_etalon, is_exchange_text
+from compgen.controls.isg_kernel import errors_from_etalon, is_exchange_text
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable

@@ -1,4 +1,4 @@
-"""Foreign files as text: limits of size, encodings, numbers, dates and times."""
+"""Files as users have them: opened by what they are; limits of size, encodings, numbers, dates and times."""
 
 from __future__ import annotations
 

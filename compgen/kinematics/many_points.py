@@ -1,4 +1,4 @@
-"""E = C P at many points and on grids: tables per axis, plain or compiled."""
+"""E = C P at many points and on grids: tables per axis, plain or compiled; points that fill the working volume."""
 
 from __future__ import annotations
 

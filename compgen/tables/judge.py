@@ -1,4 +1,4 @@
-"""The judgement on a correction, compared with the best possible: residuals, components, dense lines, reversal."""
+"""The judgement on a correction: what it leaves, compared with the best possible, and what it would make the axes do."""
 
 from __future__ import annotations
 

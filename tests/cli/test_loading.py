@@ -112,7 +112,7 @@ def test_a_run_loads_the_control_in_use_and_no_room_that_it_does_not_need(tmp_pa
     loaded(tmp_path, listed + PROGRAM.format(words))
     modules = {name.removeprefix("compgen.") for name in (tmp_path / "modules.txt").read_text().split()}
     controls = {name for name in modules if name.startswith("controls.") and not name.startswith("controls.shared")}
-    assert controls == {"controls.isg_csv", "controls.isg_kernel"}
+    assert controls == {"controls.isg_kernel"}
     rooms = {name.partition(".")[0] for name in modules}
     assert not rooms & {"simulate", "plan", "diagnose", "fleet", "accuracy", "plugins"}
     assert not modules & {

@@ -14,7 +14,7 @@ import compgen
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.controls import CONTROLLERS
-from compgen.controls.etalon_exchange import errors_from_etalon, read_error_file
+from compgen.controls.isg_kernel import errors_from_etalon, read_error_file
 from compgen.controls.shared.base import SourceFile
 from compgen.data import toml_files
 from compgen.data.error_table import Curve, ErrorTable

@@ -1,4 +1,4 @@
-"""The tracer-length problem on a grid of levels: the fast path, with cost, exact gradient and normal matrix."""
+"""Tracer lengths on a full grid of axis levels: the fast path, with cost, exact gradient and normal matrix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on the scaled normal equations (Zha & Zhang 2024, eq. 28), with a frozen factor.
+"""Levenberg-Marquardt on the scaled normal equations (Zha & Zhang 2024, eq. 28), and what the data leave undetermined.
 
 The factor of one normal matrix serves as long as it makes good progress: convergence is then linear with a small
 ratio, and every pass costs only residuals and gradient. The exact gradient decides where the optimum is.
