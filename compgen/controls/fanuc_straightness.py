@@ -277,7 +277,7 @@ def best_polyline(
     """
     if len(candidates_mm) < 4:
         raise ValueError("at least four candidates are needed")
-    gain = _gain_of_inner_knots(_segments(candidates_mm, position_mm, wanted, weight))
+    gain = _gain_of_inner_knots(candidates_mm, position_mm, wanted, weight)
     b, c = (int(k) for k in np.unravel_index(int(np.argmax(gain)), gain.shape))
     knots = (0, b, c, len(candidates_mm) - 1)
     matrix = hat_matrix(candidates_mm[list(knots)], position_mm)
@@ -286,29 +286,26 @@ def best_polyline(
     return Polyline(knots, np.asarray(values), float(np.sum(weight * (matrix @ values - wanted) ** 2)))
 
 
-def _segments(
+def _gain_of_inner_knots(
     candidates: FloatArray, position: FloatArray, wanted: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, ...]:
-    """Sums of h0^2, h0 h1, h1^2, h0 y, h1 y over the samples of each segment from candidate p to q, (m, m), only p < q."""
+) -> FloatArray:
+    """How much the squared deviation falls with inner knots b (row) and c (column), shape (m, m); -inf where b >= c."""
+    # sums of h0^2, h0 h1, h1^2, h0 y, h1 y over the samples of each segment from candidate p to q, (m, m), only p < q
     middle = 0.5 * (candidates[0] + candidates[-1])
     x, y = position - middle, wanted
     at = candidates - middle
-    sums = np.array([weight, weight * x, weight * x**2, weight * y, weight * x * y])
-    running = np.hstack([np.zeros((5, 1)), np.cumsum(sums, axis=1)])
+    moments = np.array([weight, weight * x, weight * x**2, weight * y, weight * x * y])
+    running = np.hstack([np.zeros((5, 1)), np.cumsum(moments, axis=1)])
     cut = np.searchsorted(position, candidates - 1e-9)
     cut[-1] = len(position)  # the last segment holds its end, the others do not
     s0, s1, s2, t0, t1 = running[:, cut][:, None, :] - running[:, cut][:, :, None]
     length = np.where(at[None, :] > at[:, None], at[None, :] - at[:, None], 1.0)
     first = at[:, None]
     h1 = (s1 - first * s0) / length
-    g11 = (s2 - 2.0 * first * s1 + first**2 * s0) / length**2
-    r1 = (t1 - first * t0) / length
-    return s0 - 2.0 * h1 + g11, h1 - g11, g11, t0 - r1, r1
-
-
-def _gain_of_inner_knots(sums: tuple[FloatArray, ...]) -> FloatArray:
-    """How much the squared deviation falls with inner knots b (row) and c (column), shape (m, m); -inf where b >= c."""
-    count = len(sums[0])
+    h11 = (s2 - 2.0 * first * s1 + first**2 * s0) / length**2
+    h1y = (t1 - first * t0) / length
+    sums = (s0 - 2.0 * h1 + h11, h1 - h11, h11, t0 - h1y, h1y)
+    count = len(candidates)
     b, c = np.arange(count)[:, None], np.arange(count)[None, :]
     # the three segments from knot to knot, each sum with the shape of all pairs (b, c)
     where = ((np.zeros_like(c), b), (b, c), (c, np.full_like(c, count - 1)))

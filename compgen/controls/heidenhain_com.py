@@ -590,7 +590,19 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         wanted = np.array([term.start for term in terms])
         tolerances = np.array([worth_mm(errors, axis, self.settings.loss_mm, output) for output in range(3)])
         if self.settings.older:
-            return self._power_of_two(axis, candidates, wanted / tolerances[:, None])
+            # nodes with the widest spacing, a power of two, that loses nothing
+            scaled, stated = wanted / tolerances[:, None], self.settings.exponent[axis]
+            tried: list[tuple[float, EquidistantGrid]] = []
+            for exponent in range(LARGEST_EXPONENT, SMALLEST_EXPONENT - 1, -1) if stated is None else (stated,):
+                grid = self._grid(axis, spacing_mm(exponent))
+                if grid.count > self.settings.max_points - 2 and tried:
+                    break
+                at = grid.nodes_mm
+                lost = [np.interp(candidates, at, np.interp(at, candidates, row)) - row for row in scaled]
+                tried.append((float(np.max(np.abs(lost))), grid))
+                if tried[-1][0] <= 1.0:
+                    return grid.nodes_mm
+            return (nearly_best(tried) or tried[-1][1]).nodes_mm
         reference = np.flatnonzero(np.abs(candidates - self.machine.reference_point_mm[axis]) < 1e-6).tolist()
         chosen = candidates
         while True:
@@ -605,24 +617,6 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         parts = int(np.clip(MOST_CANDIDATES // len(nodes), 1, MOST_PARTS))
         fine = np.interp(np.arange(parts * (len(nodes) - 1) + 1) / parts, np.arange(len(nodes)), nodes)
         return np.unique(np.round(fine, 4))
-
-    def _power_of_two(self, axis: int, candidates: FloatArray, scaled: FloatArray) -> FloatArray:
-        """Nodes with the widest spacing that loses nothing; ``scaled`` are the corrections (3, n) in tolerances."""
-        stated = self.settings.exponent[axis]
-        tried: list[tuple[float, EquidistantGrid]] = []
-        for exponent in range(LARGEST_EXPONENT, SMALLEST_EXPONENT - 1, -1) if stated is None else (stated,):
-            grid = self._grid(axis, spacing_mm(exponent))
-            if grid.count > self.settings.max_points - 2 and tried:
-                break
-            at = grid.nodes_mm
-            lost = [np.interp(candidates, at, np.interp(at, candidates, row)) - row for row in scaled]
-            tried.append((float(np.max(np.abs(lost))), grid))
-            if tried[-1][0] <= 1.0:
-                break
-        if tried[-1][0] <= 1.0:
-            return tried[-1][1].nodes_mm
-        best = nearly_best(tried)
-        return (best or tried[-1][1]).nodes_mm
 
     def _grid(self, axis: int, step: Decimal) -> EquidistantGrid:
         """Nodes of a spacing from the last one at or below the travel to the first one at or above its end."""

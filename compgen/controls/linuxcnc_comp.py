@@ -459,7 +459,20 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         found: dict[int, CompTable] = {}
         remarks = []
         for source in files:
-            axis = _axis_of_foreign(source, settings.comp_files)
+            last = _LAST_LETTER.search(source.path.stem)
+            if source.path.name in settings.comp_files:
+                axis = settings.comp_files.index(source.path.name)
+            elif last and not _AXIS_OF_NAME.search(source.path.name):
+                axis = AXES.index(last.group(1).upper())
+            else:
+                try:
+                    axis = _axis_of(source)  # by our own rule
+                except InputError:
+                    message = (
+                        "the name does not say which joint it belongs to; state it in the machine file: "
+                        f'[controllers.linuxcnc-comp] comp_files = {{ X = "{source.path.name}" }}'
+                    )
+                    raise source.fail(message) from None
             if axis in found:
                 raise source.fail(f"is a second file for {AXES[axis]}; give one per joint")
             found[axis] = parse_comp(source, settings.comp_file_type, settings.mm_per_unit)
@@ -531,23 +544,6 @@ def _written(values: FloatArray, digits: int = POSITION_DIGITS) -> FloatArray:
 def _written_mm(position_mm: FloatArray, settings: CompSettings) -> FloatArray:
     """Positions as the file has them, in mm: two that are equal in the file are equal here, to the last bit."""
     return _written(position_mm / settings.mm_per_unit) * settings.mm_per_unit
-
-
-def _axis_of_foreign(source: SourceFile, comp_files: tuple[str | None, ...]) -> int:
-    """The axis of a file: as the machine file states it, by our own rule, or by the last letter of its name."""
-    if source.path.name in comp_files:
-        return comp_files.index(source.path.name)
-    last = _LAST_LETTER.search(source.path.stem)
-    if last and not _AXIS_OF_NAME.search(source.path.name):
-        return AXES.index(last.group(1).upper())
-    try:
-        return _axis_of(source)
-    except InputError:
-        message = (
-            "the name does not say which joint it belongs to; state it in the machine file: [controllers.linuxcnc-comp] "
-            f'comp_files = {{ X = "{source.path.name}" }}'
-        )
-        raise source.fail(message) from None
 
 
 def _axis_of(source: SourceFile) -> int:

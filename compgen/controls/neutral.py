@@ -128,7 +128,27 @@ def _read(source: SourceFile) -> FieldGrid | ErrorTable:
         line = text.count("\n", 0, MOST_CHARACTERS) + 1
         raise source.fail(f"has {len(text)} characters; at most {MOST_CHARACTERS} are read", line)
     if text.lstrip()[:1] in ("{", "["):
-        return _read_json(source)
+        try:
+            data = json.loads(source.text, parse_constant=_refused, object_pairs_hook=_pairs)
+        except json.JSONDecodeError as error:
+            raise source.fail(f"is not valid JSON: {error.msg}; was it cut?", error.lineno) from None
+        except (ValueError, RecursionError) as error:
+            raise source.fail(f"is not usable JSON: {one_line(error)[:200]}", 1) from None
+        if (
+            not isinstance(data, dict)
+            or data.get("schema") not in (FIELD_SCHEMA, CURVE_SCHEMA)
+            or data.get("version") != 1
+        ):
+            raise source.fail(f'"schema" must be "{FIELD_SCHEMA}" or "{CURVE_SCHEMA}", and "version" 1', 1)
+        if data["schema"] == CURVE_SCHEMA:
+            return _curves_json(source, data)
+        lines = _object(source, data, "nodes_mm", "nodes_mm")
+        x, y, z = (_ascending(source, lines.get(letter), f"nodes_mm.{letter}") for letter in ("x", "y", "z"))
+        values = _array(source, data.get("correction_um"), "correction_um", columns=3)
+        if len(values) != len(x) * len(y) * len(z):
+            due = f"expected {len(x)} x {len(y)} x {len(z)} vertices"
+            raise _fail(source, "correction_um", f"has {len(values)} entries; {due}")
+        return FieldGrid((x, y, z), values.reshape(len(x), len(y), len(z), 3))
     header = next((line for line in text.split("\n") if line.strip() and not line.lstrip().startswith("#")), "")
     if "error" in [name.strip() for name in header[:1000].split(",")]:
         return errors_of_table(csv_table(source.path, text, ERROR_COLUMNS, ("u_value",)))
@@ -149,26 +169,6 @@ def _pairs(items: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) != len(items):
         raise ValueError(f"the key {one_line(doubled(name for name, _ in items))[:40]!r} is given twice in one object")
     return found
-
-
-def _read_json(source: SourceFile) -> FieldGrid | ErrorTable:
-    try:
-        data = json.loads(source.text, parse_constant=_refused, object_pairs_hook=_pairs)
-    except json.JSONDecodeError as error:
-        raise source.fail(f"is not valid JSON: {error.msg}; was it cut?", error.lineno) from None
-    except (ValueError, RecursionError) as error:
-        raise source.fail(f"is not usable JSON: {one_line(error)[:200]}", 1) from None
-    if not isinstance(data, dict) or data.get("schema") not in (FIELD_SCHEMA, CURVE_SCHEMA) or data.get("version") != 1:
-        raise source.fail(f'"schema" must be "{FIELD_SCHEMA}" or "{CURVE_SCHEMA}", and "version" 1', 1)
-    if data["schema"] == CURVE_SCHEMA:
-        return _curves_json(source, data)
-    lines = _object(source, data, "nodes_mm", "nodes_mm")
-    x, y, z = (_ascending(source, lines.get(letter), f"nodes_mm.{letter}") for letter in ("x", "y", "z"))
-    values = _array(source, data.get("correction_um"), "correction_um", columns=3)
-    if len(values) != len(x) * len(y) * len(z):
-        due = f"expected {len(x)} x {len(y)} x {len(z)} vertices"
-        raise _fail(source, "correction_um", f"has {len(values)} entries; {due}")
-    return FieldGrid((x, y, z), values.reshape(len(x), len(y), len(z), 3))
 
 
 def _fail(source: SourceFile, key: str, message: str) -> InputError:

@@ -937,7 +937,18 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         constant = round(-PER_COUNT * scale * at_home)
         if len(curve.position_mm) == 1:
             return table, None, constant
-        ring = self._ring_for(axis, table, curve)
+        # the spacing of the pitch table is divided as far as the reversal needs it
+        travel, step = self.machine.axes[axis].range_mm, table.length // len(table.entries)
+        where = np.clip(np.unique(np.concatenate([np.array(travel), curve.position_mm])), *travel)
+        rings = []
+        for part in (part for part in range(1, _MOST_PARTS + 1) if step % part == 0):
+            ring = self._ring_of(axis, step / part / scale)
+            nodes = ring.nodes_mm(settings)
+            miss = float(np.max(np.abs(np.interp(where, nodes, curve.at(nodes)) - curve.at(where))))
+            rings.append((miss, ring))
+            if miss <= WORTH_MM:
+                break
+        ring = min(rings, key=lambda pair: pair[0])[1]
         counts = {motor: np.zeros(ring.size) for motor in settings.motors}
         counts[table.source] = settings.counts_per_mm[axis] * (ring.positions_mm(settings) - home)
         pitch = np.rint(table.at(counts)).astype(np.int64)
@@ -951,21 +962,6 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         length = ring.step * ring.size
         own = BacklashTable(settings.motors[axis], length, np.append(size[1:], 0))
         return replace(table, entries=entries, length=length), own if np.any(size) else None, constant
-
-    def _ring_for(self, axis: int, table: CompTable1D, curve: Curve) -> Ring:
-        """Return the ring of a pitch table, its spacing divided as far as the reversal needs it."""
-        scale, step = abs(self.settings.counts_per_mm[axis]), table.length // len(table.entries)
-        where = np.unique(np.concatenate([np.array(self.machine.axes[axis].range_mm), curve.position_mm]))
-        where = np.clip(where, *self.machine.axes[axis].range_mm)
-        rings = []
-        for part in (part for part in range(1, _MOST_PARTS + 1) if step % part == 0):
-            ring = self._ring_of(axis, step / part / scale)
-            nodes = ring.nodes_mm(self.settings)
-            miss = float(np.max(np.abs(np.interp(where, nodes, curve.at(nodes)) - curve.at(where))))
-            rings.append((miss, ring))
-            if miss <= WORTH_MM:
-                break
-        return min(rings, key=lambda pair: pair[0])[1]
 
 
 def _motors(table: CompTable1D | CompTable2D | BacklashTable) -> set[int]:

@@ -775,7 +775,22 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             found += one_dimensional_terms(machine, errors, [nodes_mm] * 3, [(slave, axis)], lever_origin_mm=origin)
         if plane is None:
             return found
-        nodes = self._plane_nodes_mm(errors, slave, plane)
+        # one distance for both masters, within the control's limit
+        points = settings.most.crosscomp2
+        grids = [
+            equidistant_grid(
+                machine, errors, axis, most=max(3, points // 2 - 1), loss_mm=settings.loss_mm, output=slave
+            )
+            for axis in plane
+        ]
+        step = min(float(grid.step) for grid in grids) / MM_PER_UNIT
+        while True:
+            first, second = (self._even_units(axis, step) for axis in plane)
+            if len(first) * len(second) <= points:
+                break
+            step *= 1.02
+        nodes = [np.zeros(1)] * 3
+        nodes[plane[0]], nodes[plane[1]] = first * MM_PER_UNIT, second * MM_PER_UNIT
         pairs = [(slave, axis) for axis in plane if axis not in (slave, cross)]
         found += one_dimensional_terms(machine, errors, nodes, pairs, lever_origin_mm=origin)
         products = product_terms(machine, errors, nodes, origin)
@@ -793,23 +808,6 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         count = max(1, math.ceil((high - 1e-3 - start) / distance)) + 1
         return np.asarray(start + distance * np.arange(count), dtype=np.float64)
 
-    def _plane_nodes_mm(self, errors: ErrorTable, slave: int, masters: tuple[int, int]) -> list[FloatArray]:
-        """Return the nodes of both masters (and any of the third axis): one distance for both, within the control's limit."""
-        points, loss_mm = self.settings.most.crosscomp2, self.settings.loss_mm
-        most = max(3, points // 2 - 1)
-        grids = [
-            equidistant_grid(self.machine, errors, axis, most=most, loss_mm=loss_mm, output=slave) for axis in masters
-        ]
-        step = min(float(grid.step) for grid in grids) / MM_PER_UNIT
-        while True:
-            first, second = (self._even_units(axis, step) for axis in masters)
-            if len(first) * len(second) <= points:
-                break
-            step *= 1.02
-        nodes = [np.zeros(1)] * 3
-        nodes[masters[0]], nodes[masters[1]] = first * MM_PER_UNIT, second * MM_PER_UNIT
-        return nodes
-
     def _list_of(self, slave: int, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> AxisList:
         screw_term, cross_term, *plane_terms = (term for term in basis if term.carrier[0].output == slave)
         cross = CrossTable(
@@ -817,7 +815,24 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             _units(cross_term.nodes_mm),
             self._rounded(self.settings.cross_factor * values[cross_term.name]),
         )
-        plane = self._plane_table(slave, cross.master, plane_terms, values) if plane_terms else None
+        plane = None
+        if plane_terms:
+            # first and second master are as the machine file has them, else in the order X, Y, Z
+            stated = self.settings.planes[slave]
+            axes = {axis for term in plane_terms for axis in (term.axis, term.carrier[0].lever) if axis is not None}
+            masters = stated if isinstance(stated, tuple) else sorted(axes if len(axes) == 2 else {*axes, cross.master})
+            one, other = masters
+            step = float(np.diff(_units(plane_terms[0].nodes_mm))[0])
+            lines = [self._even_units(axis, step) for axis in (one, other)]
+            second, first = np.meshgrid(lines[1] * MM_PER_UNIT, lines[0] * MM_PER_UNIT, indexing="ij")
+            position_mm = np.zeros((first.size, 3))
+            position_mm[:, one], position_mm[:, other] = first.ravel(), second.ravel()
+            total = np.zeros(first.size)  # between nodes it is bilinear, as each of the terms is
+            for term in plane_terms:
+                carrier = term.carrier_field(position_mm, np.zeros(3))[:, term.carrier[0].output]
+                total += carrier * term.curve(np.asarray(values[term.name]), position_mm)
+            numbers = self._rounded(self.settings.cross_factor * total.reshape(first.shape))
+            plane = PlaneTable((one, other), (float(lines[0][0]), float(lines[1][0])), step, numbers)
         nodes = _units(screw_term.nodes_mm)
         return AxisList(
             LeadscrewTable(
@@ -828,28 +843,6 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             cross if np.any(cross.values) else None,
             plane if plane is not None and np.any(plane.values) else None,
         )
-
-    def _plane_table(
-        self, slave: int, cross: int, terms: Sequence[Term], values: Mapping[str, FloatArray]
-    ) -> PlaneTable:
-        """Return the sum of the terms at the nodes of a plane; between nodes it is bilinear, as each of the terms is.
-
-        First and second master are as the machine file has them, else in the order X, Y, Z.
-        """
-        stated = self.settings.planes[slave]
-        axes = {axis for term in terms for axis in (term.axis, term.carrier[0].lever) if axis is not None}
-        one, other = stated if isinstance(stated, tuple) else sorted(axes if len(axes) == 2 else {*axes, cross})
-        step = float(np.diff(_units(terms[0].nodes_mm))[0])
-        lines = [self._even_units(axis, step) for axis in (one, other)]
-        second, first = np.meshgrid(lines[1] * MM_PER_UNIT, lines[0] * MM_PER_UNIT, indexing="ij")
-        position_mm = np.zeros((first.size, 3))
-        position_mm[:, one], position_mm[:, other] = first.ravel(), second.ravel()
-        total = np.zeros(first.size)
-        for term in terms:
-            carrier = term.carrier_field(position_mm, np.zeros(3))[:, term.carrier[0].output]
-            total += carrier * term.curve(np.asarray(values[term.name]), position_mm)
-        numbers = self._rounded(self.settings.cross_factor * total.reshape(first.shape))
-        return PlaneTable((one, other), (float(lines[0][0]), float(lines[1][0])), step, numbers)
 
     def _rounded(self, values_mm: FloatArray) -> FloatArray:
         """Return values in 0.1 um as they are written."""

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from compgen.controls.twincat_tables import PlaneTable, units_outwards
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import compgen
 from compgen.controls import CONTROLLERS, SourceFile
+from compgen.controls.twincat_lists import PlaneTable, units_outwards
 from compgen.data import toml_files
 from compgen.data.error_table import ReversalCurves
 from compgen.data.machine import Axis, Chain, Machine

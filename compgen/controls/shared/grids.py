@@ -44,7 +44,18 @@ def fewest_nodes(
     stops = sorted({*required, count - 1})
     for first in range(count - 1):
         stop = next(index for index in stops if index > first)
-        fits, squares = _pieces(position_mm[first : stop + 1], scaled[:, first : stop + 1])
+        # for the lines to every later candidate: whether all between lie within 1, sum of squares
+        along = position_mm[first + 1 : stop + 1] - position_mm[first]
+        rise = scaled[:, first + 1 : stop + 1] - scaled[:, first : first + 1]
+        slope = rise / along
+        nothing = np.full((len(scaled), 1), np.inf)
+        lowest = np.hstack([-nothing, np.maximum.accumulate((rise - 1.0) / along, axis=1)[:, :-1]])
+        highest = np.hstack([nothing, np.minimum.accumulate((rise + 1.0) / along, axis=1)[:, :-1]])
+        margin = 1e-9 * (1.0 + np.abs(slope))
+        fits = np.all((slope >= lowest - margin) & (slope <= highest + margin), axis=0)
+        xx, xy, yy = np.cumsum(along**2), np.cumsum(along * rise, axis=1), np.cumsum(rise**2, axis=1)
+        squares = np.sum(yy - 2.0 * slope * xy + slope**2 * xx, axis=0)  # the end itself adds nothing
+        squares = np.maximum(squares, 0.0)
         for last in (first + 1 + np.flatnonzero(fits)).tolist():
             pieces, square = best[first, 0] + 1.0, best[first, 1] + squares[last - first - 1]
             if pieces < best[last, 0] or (pieces == best[last, 0] and square < best[last, 1]):
@@ -53,24 +64,6 @@ def fewest_nodes(
     while path[-1]:
         path.append(int(before[path[-1]]))
     return path[::-1]
-
-
-def _pieces(position_mm: FloatArray, values: FloatArray) -> tuple[np.ndarray, FloatArray]:
-    """For the lines from the first candidate to every later one: whether all between lie within 1, sum of squares.
-
-    ``values`` (k, n); both results have shape (n-1,).
-    """
-    along = position_mm[1:] - position_mm[0]
-    rise = values[:, 1:] - values[:, :1]
-    slope = rise / along
-    nothing = np.full((len(values), 1), np.inf)
-    lowest = np.hstack([-nothing, np.maximum.accumulate((rise - 1.0) / along, axis=1)[:, :-1]])
-    highest = np.hstack([nothing, np.minimum.accumulate((rise + 1.0) / along, axis=1)[:, :-1]])
-    margin = 1e-9 * (1.0 + np.abs(slope))
-    fits = np.all((slope >= lowest - margin) & (slope <= highest + margin), axis=0)
-    xx, xy, yy = np.cumsum(along**2), np.cumsum(along * rise, axis=1), np.cumsum(rise**2, axis=1)
-    squares = np.sum(yy - 2.0 * slope * xy + slope**2 * xx, axis=0)  # the end itself adds nothing
-    return fits, np.maximum(squares, 0.0)
 
 
 # Node positions for tables: as few as hold the error curves within a requested loss, equidistant where a control demands it.

@@ -140,7 +140,26 @@ def _side(wanted: FloatArray, sections: FloatArray, limit: int | None) -> tuple[
     if found is not None or limit is None:
         assert found is not None  # without a limit every whole number can be reached
         return found, False
-    best = _cheapest(wanted, sections, *_windows(wanted, sections, limit), limit)
+    # Windows that provably hold the best counts: with the real-valued curve u that a solver finds within the limit, and
+    # any table A at least as good as the rounded one R, convexity gives (A-u)^T M (A-u) <= J(R) - J(u) + gap, with gap
+    # the most that the gradient at u could still gain over all curves within the limit. Both sections of a node hold at
+    # least their smallest eigenvalue of it.
+    curve, gap = _reachable(wanted, sections, limit)
+    rounded = np.floor(curve + 0.5).astype(np.int64)
+    rounded[0] = 0
+    for k in range(1, len(rounded)):  # no step larger than the limit
+        rounded[k] = np.clip(rounded[k], rounded[k - 1] - limit, rounded[k - 1] + limit)
+    room = max(_square(rounded - wanted, sections) - _square(curve - wanted, sections) + gap, 0.0)
+    mean, half = 0.5 * (sections[:, 0] + sections[:, 2]), 0.5 * (sections[:, 0] - sections[:, 2])
+    least = np.maximum(mean - np.hypot(half, sections[:, 1]), 0.0)
+    stiffness = np.concatenate([[0.0], least]) + np.concatenate([least, [0.0]])
+    radius = np.sqrt(room * (1.0 + NOISE) / np.maximum(stiffness, 1e-300)) + 1.0
+    low, high = np.empty(len(wanted), dtype=np.int64), np.empty(len(wanted), dtype=np.int64)
+    low[0] = high[0] = 0
+    for k in range(1, len(wanted)):
+        low[k] = max(np.ceil(max(curve[k] - radius[k], -1e15)), low[k - 1] - limit)
+        high[k] = min(np.floor(min(curve[k] + radius[k], 1e15)), high[k - 1] + limit)
+    best = _cheapest(wanted, sections, low, high, limit)
     assert best is not None  # the windows hold the rounded curve from which they were made
     return best, True
 
@@ -177,31 +196,6 @@ def _cheapest(
     for k in range(len(wanted) - 1, 0, -1):
         counts[k - 1] = choices[k - 1][counts[k] - low[k]]
     return counts
-
-
-def _windows(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[IntArray, IntArray]:
-    """Return windows (n,) that provably hold the best counts.
-
-    With the real-valued curve u that a solver finds within the limit, and any table A at least as good as the rounded
-    one R, convexity gives (A-u)^T M (A-u) <= J(R) - J(u) + gap, with gap the most that the gradient at u could still
-    gain over all curves within the limit. Both sections of a node hold at least their smallest eigenvalue of it.
-    """
-    curve, gap = _reachable(wanted, sections, limit)
-    rounded = np.floor(curve + 0.5).astype(np.int64)
-    rounded[0] = 0
-    for k in range(1, len(rounded)):  # no step larger than the limit
-        rounded[k] = np.clip(rounded[k], rounded[k - 1] - limit, rounded[k - 1] + limit)
-    room = max(_square(rounded - wanted, sections) - _square(curve - wanted, sections) + gap, 0.0)
-    mean, half = 0.5 * (sections[:, 0] + sections[:, 2]), 0.5 * (sections[:, 0] - sections[:, 2])
-    least = np.maximum(mean - np.hypot(half, sections[:, 1]), 0.0)
-    stiffness = np.concatenate([[0.0], least]) + np.concatenate([least, [0.0]])
-    radius = np.sqrt(room * (1.0 + NOISE) / np.maximum(stiffness, 1e-300)) + 1.0
-    low, high = np.empty(len(wanted), dtype=np.int64), np.empty(len(wanted), dtype=np.int64)
-    low[0] = high[0] = 0
-    for k in range(1, len(wanted)):
-        low[k] = max(np.ceil(max(curve[k] - radius[k], -1e15)), low[k - 1] - limit)
-        high[k] = min(np.floor(min(curve[k] + radius[k], 1e15)), high[k - 1] + limit)
-    return low, high
 
 
 def _reachable(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[FloatArray, float]:

@@ -58,7 +58,20 @@ def one_dimensional_terms(
     origin = np.asarray(middle if lever_origin_mm is None else lever_origin_mm, dtype=np.float64)
     terms = []
     for output, axis in pairs:
-        start = _one_dimensional_start(machine, errors, output, axis, nodes_mm[axis], origin)
+        start = np.zeros(len(nodes_mm[axis]))
+        for part in coefficients(machine.chain, machine.squareness_reference):
+            if part.output != output:
+                continue
+            if part.error in SQUARENESS_NAMES:
+                if part.lever == axis and part.error in errors.squareness:
+                    start -= part.sign * errors.squareness[part.error][0] * nodes_mm[axis]
+            elif error_named(part.error).axis == axis and part.error in errors.curves:
+                lever: FloatArray | float = 1.0
+                if part.lever is not None and part.lever >= 3:
+                    lever = machine.tool_offset_mm[part.lever - 3]
+                elif part.lever is not None:  # the travel of the axis itself, or the fixed place of another one
+                    lever = nodes_mm[axis] if part.lever == axis else float(origin[part.lever])
+                start -= part.sign * errors.curves[part.error].at(nodes_mm[axis]) * lever
         reference = machine.reference_point_mm[axis] if anchored else None
         if reference is not None:
             start = start - np.interp(reference, nodes_mm[axis], start)
@@ -74,26 +87,6 @@ def one_dimensional_terms(
             )
         )
     return terms
-
-
-def _one_dimensional_start(
-    machine: Machine, errors: ErrorTable, output: int, axis: int, nodes_mm: FloatArray, origin_mm: FloatArray
-) -> FloatArray:
-    start = np.zeros(len(nodes_mm))
-    for part in coefficients(machine.chain, machine.squareness_reference):
-        if part.output != output:
-            continue
-        if part.error in SQUARENESS_NAMES:
-            if part.lever == axis and part.error in errors.squareness:
-                start -= part.sign * errors.squareness[part.error][0] * nodes_mm
-        elif error_named(part.error).axis == axis and part.error in errors.curves:
-            lever: FloatArray | float = 1.0
-            if part.lever is not None and part.lever >= 3:
-                lever = machine.tool_offset_mm[part.lever - 3]
-            elif part.lever is not None:  # the travel of the axis itself, or the fixed place of another one
-                lever = nodes_mm if part.lever == axis else float(origin_mm[part.lever])
-            start -= part.sign * errors.curves[part.error].at(nodes_mm) * lever
-    return start
 
 
 def product_terms(
