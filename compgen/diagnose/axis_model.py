@@ -337,7 +337,19 @@ class Search:
             return taken[:, None], more[:, None]
         price = float(np.log(self.grid.freedom))
         if beside.shape[2] < k:
-            return _ridged_beside(block.value[point], beside, right, price)
+            # C'PC is the eigenvalues (m, k) less B B' with B (m, k, r), r < k: the formula of Woodbury
+            value = block.value[point]
+            taken, determinant = _ridged(value, right, price)
+            if not beside.shape[2]:
+                return taken, determinant
+            inverse = LAMBDAS / (1.0 + LAMBDAS * value[:, :, None])  # (m, k, lambdas)
+            scaled = inverse.transpose(0, 2, 1)[..., None] * beside[:, None]  # (m, lambdas, k, r)
+            middle = np.eye(beside.shape[2]) - beside.transpose(0, 2, 1)[:, None] @ scaled
+            pulled = np.einsum("mlkr,mk->mlr", scaled, right)
+            more = np.einsum("mlr,mlr->ml", pulled, np.linalg.solve(middle, pulled[..., None])[..., 0])
+            beside_of = np.linalg.slogdet(middle)[1]
+            beside_of[:, -1] = 0.0
+            return taken + more, determinant + beside_of
         gram = np.eye(k) * block.value[point][:, None, :] - beside @ beside.transpose(0, 2, 1)
         value, vector = np.linalg.eigh(gram)
         turned = np.einsum("mkl,mk->ml", vector, right)
@@ -413,7 +425,20 @@ class Search:
             if criterion < LEAST_GAIN:
                 break
             self._choose(members, best)
-            grown = self._exchanged([*members, best], allowed)
+            grown = [*members, best]
+            for _ in range(3):
+                changed = False
+                for member in list(grown):
+                    rest = [k for k in grown if k != member]
+                    criteria = self._open(rest, allowed)
+                    best = _first_best(criteria)
+                    if criteria[best] < LEAST_GAIN:
+                        grown, changed = rest, True
+                    elif best != member and criteria[best] > criteria[member] + SAME:
+                        self._choose(rest, best)
+                        grown, changed = [*rest, best], True
+                if not changed or len(grown) < 2:
+                    break
             if len(grown) <= len(members) and self.total(grown) <= self.total(members):
                 break
             members = grown
@@ -430,22 +455,6 @@ class Search:
         criteria = self._open(members, allowed)
         best = _first_best(criteria)
         return best, float(criteria[best])
-
-    def _exchanged(self, members: list[int], allowed: NDArray[np.bool_]) -> list[int]:
-        for _ in range(3):
-            changed = False
-            for member in list(members):
-                rest = [k for k in members if k != member]
-                criteria = self._open(rest, allowed)
-                best = _first_best(criteria)
-                if criteria[best] < LEAST_GAIN:
-                    members, changed = rest, True
-                elif best != member and criteria[best] > criteria[member] + SAME:
-                    self._choose(rest, best)
-                    members, changed = [*rest, best], True
-            if not changed or len(members) < 2:
-                break
-        return members
 
 
 def _first_of(
@@ -565,20 +574,3 @@ def _ridged(value: FloatArray, right: FloatArray, price: float) -> tuple[FloatAr
     determinant = np.sum(np.log1p(grown), axis=1)
     determinant[:, -1] = price * value.shape[1]
     return np.asarray(taken), np.asarray(determinant)
-
-
-def _ridged_beside(
-    value: FloatArray, beside: FloatArray, right: FloatArray, price: float
-) -> tuple[FloatArray, FloatArray]:
-    """The same where C'PC is the eigenvalues (m, k) less B B' with B (m, k, r), r < k: the formula of Woodbury."""
-    taken, determinant = _ridged(value, right, price)
-    if not beside.shape[2]:
-        return taken, determinant
-    inverse = LAMBDAS / (1.0 + LAMBDAS * value[:, :, None])  # (m, k, lambdas)
-    scaled = inverse.transpose(0, 2, 1)[..., None] * beside[:, None]  # (m, lambdas, k, r)
-    middle = np.eye(beside.shape[2]) - beside.transpose(0, 2, 1)[:, None] @ scaled
-    pulled = np.einsum("mlkr,mk->mlr", scaled, right)
-    more = np.einsum("mlr,mlr->ml", pulled, np.linalg.solve(middle, pulled[..., None])[..., 0])
-    beside_of = np.linalg.slogdet(middle)[1]
-    beside_of[:, -1] = 0.0
-    return taken + more, determinant + beside_of

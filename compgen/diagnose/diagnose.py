@@ -210,10 +210,16 @@ def _completed(
     """Verdict, refit and misfit; ``before`` is the fit to the unchanged file."""
     verdict = verdict_of(analysis)
     show("fitting the model with what was found")
-    added = [*verdict.added, *_wanted(analysis, options.add, verdict.added)]
+    added, design = list(verdict.added), analysis.design
+    for name in options.add:
+        groups = [g for g, group in enumerate(design.groups) if group.name == name and group.tier == "named"]
+        if not groups:
+            known = sorted({group.name for group in design.groups if group.tier == "named"})
+            raise InputError(f"{name!r} cannot be added to this measurement; possible are {', '.join(known)}")
+        if not set(groups) & set(verdict.added):  # wanted by the user: at its best scan position
+            added.append(max(groups, key=lambda g: float(np.sum(design.score[design.place(g)] ** 2))))
     found = refit(analysis, added)
     show("testing on lines, stations and times left out")
-    design = analysis.design
     seen = {g: design.groups[g].columns @ design.maps[g] for g in added if design.size(g)}
     base = [columns for g, columns in seen.items() if design.groups[g].tier == "base"]
     columns = [columns for g, columns in seen.items() if design.groups[g].tier != "base"]
@@ -234,20 +240,6 @@ def _completed(
         against = compared(observed, analysis, options.against)
         done = replace(done, changes=against.changes, against_rms_mm=against.rms_mm)
     return done
-
-
-def _wanted(analysis: Analysis, names: Sequence[str], present: Sequence[int]) -> list[int]:
-    """Groups of the names that the user wants added, at their best scan position."""
-    design = analysis.design
-    found = []
-    for name in names:
-        groups = [g for g, group in enumerate(design.groups) if group.name == name and group.tier == "named"]
-        if not groups:
-            known = sorted({group.name for group in design.groups if group.tier == "named"})
-            raise InputError(f"{name!r} cannot be added to this measurement; possible are {', '.join(known)}")
-        if not set(groups) & set(present):
-            found.append(max(groups, key=lambda g: float(np.sum(design.score[design.place(g)] ** 2))))
-    return found
 
 
 # Six-DOF readings: what they say about the instrument that took them, in the form of a diagnosis.

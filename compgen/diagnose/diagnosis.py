@@ -196,12 +196,22 @@ def gap_of(
         order = np.random.default_rng(0).permutation(kinds)
         lines = np.asarray((order % FOLDS)[layout.condition[layout.stop]], dtype=np.int64)
     stations = layout.channel if len(fit.readings.stations) > LEAST_STATIONS else None
+    # what the repeats alone leave, else the standard deviation of the noise model
+    if noise.source == "repeats":
+        squares, size = 0.0, 0
+        for block in layout.blocks:
+            values = difference_matrix(layout, block) @ after[block.rows]
+            squares += float(np.sum(values**2))
+            size += values.size
+        floor = float(np.sqrt(squares / max(size, 1)))
+    else:
+        floor = float(np.sqrt(noise.variances.total))
     return Gap(
         _rms_pair(before, after),
         some.left_out(lines),
         None if stations is None else some.left_out(stations),
         some.left_out(_time_folds(fit)),
-        _floor(fit, after, noise),
+        floor,
         noise.source,
         before,
         after,
@@ -227,20 +237,6 @@ def _time_folds(fit: BaseFit) -> IntArray | None:
 
 def _rms_pair(before: FloatArray, after: FloatArray) -> BeforeAfter:
     return BeforeAfter(float(np.sqrt(np.mean(before**2))), float(np.sqrt(np.mean(after**2))))
-
-
-def _floor(fit: BaseFit, after: FloatArray, noise: Noise) -> float:
-    """RMS that the repeats alone leave, else the standard deviation of the noise model."""
-    if noise.source != "repeats":
-        return float(np.sqrt(noise.variances.total))
-    layout = fit.observed.layout
-    squares, count = 0.0, 0
-    for block in layout.blocks:
-        matrix = difference_matrix(layout, block)
-        values = matrix @ after[block.rows]
-        squares += float(np.sum(values**2))
-        count += values.size
-    return float(np.sqrt(squares / max(count, 1)))
 
 
 class _Problem:

@@ -65,7 +65,18 @@ def looks_gross(observed: ObservedLengths, rms_mm: float) -> bool:
 
 def correction_of(machine: Machine, lengths: Lengths, rms_mm: float) -> Correction | None:
     """Return the mapping that makes the residuals small; None if there is none."""
-    return _mapped(machine, lengths, rms_mm) or _relabelled(machine, lengths, rms_mm)
+    some = _some(lengths)
+    scored = [(_stations_only(machine, mapped), text, mapped) for text, mapped in _mappings(machine, some)]
+    if scored:
+        scored.sort(key=lambda item: item[0])
+        # those that the stations alone cannot tell apart are compared with the errors inside
+        close = [item for item in scored if item[0] < 3.0 * scored[0][0]][:MOST_CLOSE]
+        if len(close) > 1 or scored[0][0] > 0.5 * _stations_only(machine, some):
+            close = sorted(((_small_fit(machine, e[2]), e[1], e[2]) for e in close), key=lambda item: item[0])
+        least, what, best = close[0]
+        if least < rms_mm / BETTER or _small_fit(machine, best) < rms_mm / BETTER:
+            return Correction(dict(_mappings(machine, lengths))[what], what)
+    return _relabelled(machine, lengths, rms_mm)
 
 
 def _mappings(machine: Machine, lengths: Lengths) -> Iterator[tuple[str, Lengths]]:
@@ -124,22 +135,6 @@ def _stations_only(machine: Machine, lengths: Lengths) -> float:
         residual = located(target[rows], lengths.length_mm[rows], member.ravel().astype(np.int64), len(own))[1]
         squares += float(np.sum(residual**2))
     return float(np.sqrt(squares / len(lengths)))
-
-
-def _mapped(machine: Machine, lengths: Lengths, rms_mm: float) -> Correction | None:
-    """Return the best mapping; those that the stations alone cannot tell apart are compared with the errors inside."""
-    some = _some(lengths)
-    scored = [(_stations_only(machine, mapped), text, mapped) for text, mapped in _mappings(machine, some)]
-    if not scored:
-        return None
-    scored.sort(key=lambda item: item[0])
-    close = [item for item in scored if item[0] < 3.0 * scored[0][0]][:MOST_CLOSE]
-    if len(close) > 1 or scored[0][0] > 0.5 * _stations_only(machine, some):
-        close = sorted(((_small_fit(machine, item[2]), item[1], item[2]) for item in close), key=lambda item: item[0])
-    least, what, _ = close[0]
-    if not (least < rms_mm / BETTER or _small_fit(machine, close[0][2]) < rms_mm / BETTER):
-        return None
-    return Correction(dict(_mappings(machine, lengths))[what], what)
 
 
 def _relabelled(machine: Machine, lengths: Lengths, rms_mm: float) -> Correction | None:

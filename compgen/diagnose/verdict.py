@@ -16,7 +16,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_named
 from compgen.diagnose.analysis import HOMOGENEITY_P, Analysis, contribution
-from compgen.diagnose.base_fit import BaseFit, Part, least_norm, size_of
+from compgen.diagnose.base_fit import Part, least_norm, size_of
 from compgen.diagnose.observed import Observed
 from compgen.diagnose.search import (
     Alternative,
@@ -404,13 +404,9 @@ def compared(observed: Observed, analysis: Analysis, errors: ErrorTable) -> Agai
         model, _, columns = observed.placed(tip, placement)
         placement += least_norm(columns, observed.value_mm - model)
     residual = np.asarray(observed.value_mm - observed.placed(tip, placement)[0])
-    return Against(residual, _changes(fit, analysis.design, residual), float(np.sqrt(np.mean(residual**2))))
-
-
-def _changes(fit: BaseFit, design: Design, residual: FloatArray) -> tuple[dict[str, Any], ...]:
-    """Errors whose curve, fitted to the difference, is significant in addition to all others; strongest first."""
-    white = design.whiten(fit.jacobian)
-    target = design.whiten(residual)
+    # errors whose curve, fitted to the difference, is significant in addition to all others; strongest first
+    white = analysis.design.whiten(fit.jacobian)
+    target = analysis.design.whiten(residual)
     solution = least_norm(white, target)
     left = target - white @ solution
     factor = max(1.0, float(left @ left) / max(len(left) - white.shape[1], 1))
@@ -425,7 +421,8 @@ def _changes(fit: BaseFit, design: Design, residual: FloatArray) -> tuple[dict[s
         p = float(chdtrc(basis.shape[1], chi2)) * len(parts)
         if p < SIGNIFICANT:
             found.append(_change(part, solution[place], chi2, p))
-    return tuple(sorted(found, key=lambda item: -item["chi2"]))
+    found.sort(key=lambda item: -item["chi2"])
+    return Against(residual, tuple(found), float(np.sqrt(np.mean(residual**2))))
 
 
 def _change(part: Part, coefficients: FloatArray, chi2: float, p: float) -> dict[str, Any]:

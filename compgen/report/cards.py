@@ -177,7 +177,13 @@ def effect_card_text(card: Card, origin: str | None = None) -> str:
 def catalogue_markdown(effects: Mapping[str, Effect]) -> str:
     """Return the table of ``docs/effects.md``: one row for each family of effects of equal text."""
     rows = ["| effect | equation | columns | parameters | resembles | what separates |", "|---|---|---|---|---|---|"]
-    for names, card in _families(effects):
+    # effects whose names differ in the last part only are one row, with the card of the first
+    families: dict[str, tuple[list[str], Card]] = {}
+    for name, effect in effects.items():
+        family, _, member = name.rpartition("_")
+        key = family if member[:1].isupper() or member.startswith("<") else name
+        families.setdefault(key, ([], effect.card))[0].append(name)
+    for names, card in families.values():
         parameters = ", ".join(f"`{p.name}`" for p in card.parameters)
         settings = "".join(f"; `{s.name}`" for s in card.settings)
         aliases = ", ".join(f"`{a}`" if " " not in a else a for a in card.aliases)
@@ -191,13 +197,3 @@ def catalogue_markdown(effects: Mapping[str, Effect]) -> str:
         ]
         rows.append("| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |")
     return "\n".join(rows) + "\n"
-
-
-def _families(effects: Mapping[str, Effect]) -> list[tuple[list[str], Card]]:
-    """Effects whose names differ in the last part only, with the card of the first."""
-    found: dict[str, tuple[list[str], Card]] = {}
-    for name, effect in effects.items():
-        family, _, member = name.rpartition("_")
-        key = family if member[:1].isupper() or member.startswith("<") else name
-        found.setdefault(key, ([], effect.card))[0].append(name)
-    return list(found.values())

@@ -190,10 +190,6 @@ def explanation_markdown(item: Explanation) -> str:
     if rows:
         table = markdown_table(["error", "displacement before, um", "left, um"], rows)
         parts.append("## What it corrects\n\n" + table)
-    return "\n".join([*parts, _stays(item), _next(item), _nodes(item), _limits(item)])
-
-
-def _stays(item: Explanation) -> str:
     rows = [[fate.name, um_text(fate.after_um), fate.why] for fate in item.fates if fate.after_um > CORRECTED_UM]
     table = markdown_table(["error", "left, um", "why"], rows) if rows else f"Nothing above {CORRECTED_UM:g} um.\n"
     notes = "".join(f"\n{note[0].upper()}{note[1:]}.\n" for note in item.notes)
@@ -208,7 +204,8 @@ def _stays(item: Explanation) -> str:
             "\nThe tables were made for the tool offset of the machine file. With others an angular error acts at another "
             f"lever; the largest error that the best table of this level leaves is {', '.join(tools)}.\n"
         )
-    return "## What remains, and why\n\n" + table + other + notes
+    parts.append("## What remains, and why\n\n" + table + other + notes)
+    return "\n".join([*parts, _next(item), _nodes(item), _limits(item)])
 
 
 def _next(item: Explanation) -> str:

@@ -439,7 +439,14 @@ class Results:
 
     def _verification(self, item: Mapping[str, Any], control: Mapping[str, Any], moved: Mapping[str, float]) -> Element:
         method = _method("Emulation of the control, computed and not measured", str(item["usedMethod"]), ("ISO 230-1",))
-        results = [self._computed(item, when) for when in ("before", "after")]
+        results = []
+        for when, what in (("before", "without new tables"), ("after", "with the tables")):
+            figures = [
+                dcc("quantity", said("name", row["name"]), real(row["value"], row["unit"], self.version))
+                for row in item["results"]
+                if row["when"] == when and row["value"] is not None
+            ] or [dcc("text", dcc("content", "no figures", lang="en"))]
+            results.append(dcc("result", said("name", f"{when}: {what}, computed"), dcc("data", *figures)))
         if moved:
             quantities = [
                 dcc("quantity", said("name", key), real(value, UNITS["um"], self.version))
@@ -451,18 +458,6 @@ class Results:
         verdict = f"{control['verdict']}: {'; '.join(item['conformity']['reasons']) or 'no reason against the tables'}"
         notes = [("Verdict of the program on the tables, computed", verdict), *_files("File", item["files"])]
         return self._result(f"{item['name']}, computed", method, results, notes)
-
-    def _computed(self, item: Mapping[str, Any], when: str) -> Element:
-        quantities = [
-            dcc("quantity", said("name", row["name"]), real(row["value"], row["unit"], self.version))
-            for row in item["results"]
-            if row["when"] == when and row["value"] is not None
-        ]
-        what = "without new tables" if when == "before" else "with the tables"
-        name = said("name", f"{when}: {what}, computed")
-        if not quantities:
-            return dcc("result", name, dcc("data", dcc("text", dcc("content", "no figures", lang="en"))))
-        return dcc("result", name, dcc("data", *quantities))
 
 
 NORMS = ("ISO 230-1", "ISO 230-2", "ISO 230-6")

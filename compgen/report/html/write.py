@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -221,10 +222,23 @@ MEASUREMENT = (
 def content(source: ResultFolder) -> dict[str, Any]:
     """Return the numbers of the report; only plain values, every text as in the files."""
     controls, identify = [_control(item) for item in source.controls], source.identify
+    identified = {} if source.identified is None else source.identified.metadata
+    manifests = [item.manifest for item in source.controls]
+    results = (source.compare, source.accuracy, *(item.result for item in source.controls))
+    # a folder's name says nothing about what is in it
+    title = "Machine without a name" if source.machine is None else source.machine.name
+    if source.machine is None:
+        named = chain(
+            (made.get("machine", {}).get("name") for made in manifests),
+            [identified.get("machine")],
+            (data.get("machine") for data in results),
+        )
+        title = next((str(name) for name in named if name), title)
+    inputs = identify.get("inputs", []) or (manifests[0].get("inputs", []) if manifests else [])
     return {
         "format": "compgen report 1",
         "kind": source.kind,
-        "title": _machine_name(source),
+        "title": title,
         "verdict": _verdict(source, controls),
         "controls": controls,
         "errors": _errors(source.identified),
@@ -232,25 +246,17 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "accuracy": accuracy_groups(source),
         "compare": comparison_groups(source),
         "machine": _machine(source),
-        "provenance": _provenance(source),
+        "provenance": {
+            "tables_made_by": sorted({str(made.get("program", "")) for made in manifests} - {""}),
+            "report_made_by": f"compgen {program_version()}",
+            "inputs": list(inputs or source.compare.get("inputs", []) or source.accuracy.get("inputs", [])),
+            "date": identified.get("date"),
+            **({} if source.residuals is None else source.residuals.stated),
+            "errors_sha256": sorted({str(made.get("errors_sha256", "")) for made in manifests} - {""}),
+        },
         "limitations": limitations(source),
         "notes": list(source.notes),
     }
-
-
-def _machine_name(source: ResultFolder) -> str:
-    if source.machine is not None:
-        return source.machine.name
-    for item in source.controls:
-        name = item.manifest.get("machine", {}).get("name")
-        if name:
-            return str(name)
-    if source.identified is not None and source.identified.metadata.get("machine"):
-        return source.identified.metadata["machine"]
-    for data in (source.compare, source.accuracy, *(item.result for item in source.controls)):
-        if data.get("machine"):
-            return str(data["machine"])
-    return "Machine without a name"  # a folder's name says nothing about what is in it
 
 
 def _control(item: ControlFolder) -> dict[str, Any]:
@@ -446,23 +452,6 @@ def _machine(source: ResultFolder) -> dict[str, Any]:
         "tool_offset_mm": list(machine.tool_offset_mm),
         "reference_point_mm": list(machine.reference_point_mm),
         "travel_mm": {name: list(axis.range_mm) for name, axis in zip("XYZ", machine.axes, strict=True)},
-    }
-
-
-def _provenance(source: ResultFolder) -> dict[str, Any]:
-    inputs = source.identify.get("inputs", [])
-    if not inputs and source.controls:
-        inputs = source.controls[0].manifest.get("inputs", [])
-    inputs = inputs or source.compare.get("inputs", []) or source.accuracy.get("inputs", [])
-    programs = {str(item.manifest.get("program", "")) for item in source.controls} - {""}
-    date = None if source.identified is None else source.identified.metadata.get("date")
-    return {
-        "tables_made_by": sorted(programs),
-        "report_made_by": f"compgen {program_version()}",
-        "inputs": list(inputs),
-        "date": date,
-        **({} if source.residuals is None else source.residuals.stated),
-        "errors_sha256": sorted({str(item.manifest.get("errors_sha256", "")) for item in source.controls} - {""}),
     }
 
 
