@@ -344,7 +344,15 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
             lines.append(f"* {item['error']}: {size:.2f} {item['unit']} (chi-square {item['chi2']:.0f})")
         if not data["against"]["changes"]:
             lines.append("* none")
-    lines += _figure_lines(data, markdown=markdown)
+    # figures of ISO 230-2 before and after, a row for each axis and figure
+    for axis, figures in data.get("iso_230_2", {}).items():
+        taken = ", ".join(data.get("taken_off", {}).get(axis, ()))
+        lines += ["", f"ISO 230-2, axis {axis}, as measured and without {taken or 'anything (nothing was taken off)'}:"]
+        if markdown:
+            lines += ["", "| | as measured, um | without |", "|---|---|---|"]
+            lines += [f"| {key} | {pair['before']:.2f} | {pair['after']:.2f} |" for key, pair in figures.items()]
+        else:
+            lines += [f"{key:20s} {pair['before']:10.2f} {pair['after']:10.2f}" for key, pair in figures.items()]
     lines += ["", f"Noise floor {data['gap']['noise_floor_um']:.3f} um ({data['gap']['noise_floor_source']})."]
     lines += [f"Note: {text}." for text in (*data["reasons"], *data["notes"])]
     if data["advice"]:
@@ -385,17 +393,3 @@ def _gap_lines(data: Mapping[str, Any], *, markdown: bool) -> list[str]:
         return head + [f"| {name} | {before:.3f} | {after:.3f} |" for name, before, after in rows]
     head = ["", f"{'residual, um rms':20s} {'before':>10s} {'after':>10s}"]
     return head + [f"{name:20s} {before:10.3f} {after:10.3f}" for name, before, after in rows]
-
-
-def _figure_lines(data: Mapping[str, Any], *, markdown: bool) -> list[str]:
-    """Figures of ISO 230-2 before and after, a row for each axis and figure."""
-    lines: list[str] = []
-    for axis, figures in data.get("iso_230_2", {}).items():
-        taken = ", ".join(data.get("taken_off", {}).get(axis, ()))
-        lines += ["", f"ISO 230-2, axis {axis}, as measured and without {taken or 'anything (nothing was taken off)'}:"]
-        if markdown:
-            lines += ["", "| | as measured, um | without |", "|---|---|---|"]
-            lines += [f"| {key} | {pair['before']:.2f} | {pair['after']:.2f} |" for key, pair in figures.items()]
-        else:
-            lines += [f"{key:20s} {pair['before']:10.2f} {pair['after']:10.2f}" for key, pair in figures.items()]
-    return lines
