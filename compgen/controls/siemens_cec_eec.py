@@ -166,11 +166,31 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
 
     def violations(self, tables: CecEecTables) -> list[str]:
         """Return the broken rules of either kind, and positioning that is in both."""
-        return [
-            *self._eec.violations(tables.eec),
-            *self._cec.violations(tables.cec),
-            *self._double_positioning(tables),
-        ]
+        settings = self.settings
+        found = [*self._eec.violations(tables.eec), *self._cec.violations(tables.cec)]
+        first_stays, multiplier_stays = MULT_MODES[settings.mult_mode]
+        entries = tables.cec.tables
+        multipliers = {entry.multiplier - 1 for entry in entries.values() if entry.multiplier}
+        # axes whose CEC tables over themselves do not cancel (mean of both directions), in addition to an encoder table
+        for axis in sorted({axis for axis, _ in tables.eec.tables}):
+            own = {
+                index: entry
+                for index, entry in entries.items()
+                if entry.input_axis == entry.output_axis == axis
+                and (first_stays or not entry.multiplier)
+                and (multiplier_stays or index not in multipliers)
+            }
+            if not own:
+                continue
+            where = np.unique(np.concatenate([entry.table.nodes_mm for entry in own.values()]))
+            total = sum(entry.at(where) * (0.5 if entry.direction else 1.0) for entry in own.values())
+            largest = float(np.max(np.abs(total)))
+            if largest > ROUNDING_MM:
+                found.append(
+                    f"the positioning of {settings.axis_names[axis]} is in its encoder table and, with up to "
+                    f"{largest / MM_PER_UM:.3f} um, in the CEC tables {sorted(own)} as well: it would be corrected twice"
+                )
+        return found
 
     def keeping_others(self, tables: CecEecTables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
         """Return ``kept_tables`` with the cross tables of other axes that an archive holds."""
@@ -209,30 +229,3 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
             errors,
             self.machine.reference_point_mm if self.settings.products else None,
         )
-
-    def _double_positioning(self, tables: CecEecTables) -> list[str]:
-        """Name axes whose CEC tables over themselves do not cancel (mean of both directions), in addition to an encoder table."""
-        settings = self.settings
-        first_stays, multiplier_stays = MULT_MODES[settings.mult_mode]
-        entries = tables.cec.tables
-        multipliers = {entry.multiplier - 1 for entry in entries.values() if entry.multiplier}
-        found = []
-        for axis in sorted({axis for axis, _ in tables.eec.tables}):
-            own = {
-                index: entry
-                for index, entry in entries.items()
-                if entry.input_axis == entry.output_axis == axis
-                and (first_stays or not entry.multiplier)
-                and (multiplier_stays or index not in multipliers)
-            }
-            if not own:
-                continue
-            where = np.unique(np.concatenate([entry.table.nodes_mm for entry in own.values()]))
-            total = sum(entry.at(where) * (0.5 if entry.direction else 1.0) for entry in own.values())
-            largest = float(np.max(np.abs(total)))
-            if largest > ROUNDING_MM:
-                found.append(
-                    f"the positioning of {settings.axis_names[axis]} is in its encoder table and, with up to "
-                    f"{largest / MM_PER_UM:.3f} um, in the CEC tables {sorted(own)} as well: it would be corrected twice"
-                )
-        return found
