@@ -179,10 +179,23 @@ class Plot:
     def heat(self, x: tuple[float, float], y: tuple[float, float], shares: Values, colours: Sequence[str]) -> None:
         """Fill a rectangle with cells; ``shares`` (rows from ``y[0]`` up, columns) are 0 for the first colour, 1 the last."""
         (left, right), (bottom, top) = self._px(x, y)
+        # a picture (rows, columns, 3) as PNG in base64 (ISO/IEC 15948: 8 bits, true colour, no filter)
+        rgb = _colours(shares[::-1], colours)
+        rows = b"".join(b"\0" + row.tobytes() for row in rgb)
+        chunks = (
+            (b"IHDR", struct.pack(">IIBBBBB", rgb.shape[1], rgb.shape[0], 8, 2, 0, 0, 0)),
+            (b"IDAT", zlib.compress(rows, 9)),
+            (b"IEND", b""),
+        )
+        body = b"".join(
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+            for name, data in chunks
+        )
+        png = base64.b64encode(b"\x89PNG\r\n\x1a\n" + body).decode()
         self.drawn.append(
             f'<image x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}" height="{bottom - top:.2f}" '
             f'preserveAspectRatio="none" style="image-rendering:pixelated" '
-            f'href="data:image/png;base64,{_png(_colours(shares[::-1], colours))}"/>'
+            f'href="data:image/png;base64,{png}"/>'
         )
 
     def coloured_dots(self, x: Values, y: Values, shares: Values, colours: Sequence[str], size: float = 3.0) -> None:
@@ -353,17 +366,3 @@ def _colours(shares: Values, colours: Sequence[str]) -> NDArray[np.uint8]:
     at = np.clip(shares, 0.0, 1.0) * (len(rgb) - 1)
     found = np.stack([np.interp(at, np.arange(len(rgb)), rgb[:, k]) for k in range(3)], axis=-1)
     return np.rint(found).astype(np.uint8)
-
-
-def _png(rgb: NDArray[np.uint8]) -> str:
-    """A picture (rows, columns, 3) as PNG in base64 (ISO/IEC 15948: 8 bits, true colour, no filter)."""
-    rows = b"".join(b"\0" + row.tobytes() for row in rgb)
-    chunks = (
-        (b"IHDR", struct.pack(">IIBBBBB", rgb.shape[1], rgb.shape[0], 8, 2, 0, 0, 0)),
-        (b"IDAT", zlib.compress(rows, 9)),
-        (b"IEND", b""),
-    )
-    body = b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
-    )
-    return base64.b64encode(b"\x89PNG\r\n\x1a\n" + body).decode()

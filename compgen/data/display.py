@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 #: Colours that people with any kind of colour vision tell apart (Okabe and Ito 2008).
@@ -140,27 +139,25 @@ def drawn(panels: Sequence[Panel], title: str, figure: Figure | None = None) -> 
 
         figure = plt.figure(figsize=(across * PANEL_SIZE_INCH[0], down * PANEL_SIZE_INCH[1]), layout="constrained")
     for place, panel in enumerate(panels, start=1):
-        _draw(figure.add_subplot(down, across, place), panel)
+        axes = figure.add_subplot(down, across, place)
+        for line, colour in zip(panel.lines, COLOURS * len(panel.lines), strict=False):
+            marker = "." if len(line.x) < 60 else ""
+            axes.plot(line.x, line.y, color=colour, label=line.label, linewidth=1.4, marker=marker)
+            if line.u is not None and np.isfinite(line.u).all():
+                low, high = line.y - 2 * line.u, line.y + 2 * line.u
+                axes.fill_between(line.x, low, high, color=colour, alpha=0.18, linewidth=0)
+        width = 0.8 / max(1, len(panel.bars))
+        for k, (item, colour) in enumerate(zip(panel.bars, COLOURS, strict=False)):
+            at = np.arange(len(item.names)) + (k - 0.5 * (len(panel.bars) - 1)) * width
+            axes.bar(at, item.values, width, color=colour, label=item.label)
+            axes.set_xticks(range(len(item.names)), item.names)
+        axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label, xscale=panel.x_scale)
+        axes.grid(visible=True, axis="both" if panel.lines else "y", alpha=0.3)
+        axes.set_axisbelow(True)
+        if any([*(line.label for line in panel.lines), *(item.label for item in panel.bars)]):
+            axes.legend(fontsize="small", frameon=False)
     figure.suptitle(title, fontsize="medium", wrap=True)
     return figure
-
-
-def _draw(axes: Axes, panel: Panel) -> None:
-    """Draw one panel."""
-    for line, colour in zip(panel.lines, COLOURS * len(panel.lines), strict=False):
-        axes.plot(line.x, line.y, color=colour, label=line.label, linewidth=1.4, marker="." if len(line.x) < 60 else "")
-        if line.u is not None and np.isfinite(line.u).all():
-            axes.fill_between(line.x, line.y - 2 * line.u, line.y + 2 * line.u, color=colour, alpha=0.18, linewidth=0)
-    width = 0.8 / max(1, len(panel.bars))
-    for k, (item, colour) in enumerate(zip(panel.bars, COLOURS, strict=False)):
-        at = np.arange(len(item.names)) + (k - 0.5 * (len(panel.bars) - 1)) * width
-        axes.bar(at, item.values, width, color=colour, label=item.label)
-        axes.set_xticks(range(len(item.names)), item.names)
-    axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label, xscale=panel.x_scale)
-    axes.grid(visible=True, axis="both" if panel.lines else "y", alpha=0.3)
-    axes.set_axisbelow(True)
-    if any([*(line.label for line in panel.lines), *(item.label for item in panel.bars)]):
-        axes.legend(fontsize="small", frameon=False)
 
 
 def shortened(names: Sequence[str], most: int = 6) -> str:

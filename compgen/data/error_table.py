@@ -572,7 +572,15 @@ def fitted_line(position_mm: FloatArray, value: FloatArray, kind: str = "ls") ->
     points = np.column_stack([position_mm, value])[np.lexsort((value, position_mm))]
     best = (np.inf, 0.0, 0.0)
     for sign in (1.0, -1.0):
-        for (q1, y1), (q2, y2) in pairwise(_lower_hull(points * [1.0, sign])):
+        hull: list[FloatArray] = []  # the lower one, by Andrew's monotone chain
+        for point in points * [1.0, sign]:
+            while len(hull) > 1:
+                (q1, y1), (q2, y2) = hull[-2], hull[-1]
+                if (q2 - q1) * (point[1] - y1) - (y2 - y1) * (point[0] - q1) > 0.0:  # a left turn
+                    break
+                hull.pop()
+            hull.append(point)
+        for (q1, y1), (q2, y2) in pairwise(hull):
             if q2 <= q1:
                 continue
             edge = float(sign * (y2 - y1) / (q2 - q1))
@@ -580,16 +588,3 @@ def fitted_line(position_mm: FloatArray, value: FloatArray, kind: str = "ls") ->
             if (width := float(np.ptp(rest))) < best[0]:
                 best = (width, 0.5 * float(rest.max() + rest.min()), edge)
     return best[1], best[2]
-
-
-def _lower_hull(points: FloatArray) -> list[FloatArray]:
-    """Lower convex hull of points (n, 2) that ascend in their first coordinate (Andrew's monotone chain)."""
-    hull: list[FloatArray] = []
-    for point in points:
-        while len(hull) > 1:
-            (x1, y1), (x2, y2) = hull[-2], hull[-1]
-            if (x2 - x1) * (point[1] - y1) - (y2 - y1) * (point[0] - x1) > 0.0:  # a left turn
-                break
-            hull.pop()
-        hull.append(point)
-    return hull

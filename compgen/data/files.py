@@ -119,7 +119,15 @@ class OutputFolder:
         missing = {folder for target in paths.values() for folder in target.parents if not folder.exists()}
         made = sorted(missing, key=lambda folder: len(folder.parts), reverse=True)
         try:
-            _remove_abandoned_files(paths.values())
+            names: dict[Path, set[str]] = {}  # what processes that were killed left of these files is removed
+            for target in paths.values():
+                names.setdefault(target.parent, set()).add(target.name)
+            for folder, own in names.items():
+                with contextlib.suppress(OSError):
+                    for path in list(folder.iterdir()):
+                        found = re.fullmatch(r"\.(.+)\.[a-z0-9_]{8}" + re.escape(TEMPORARY), path.name, re.DOTALL)
+                        if found and found[1] in own and _abandoned(path):
+                            path.unlink(missing_ok=True)
             for path in paths.values():
                 path.parent.mkdir(parents=True, exist_ok=True)
                 if path.is_dir():
@@ -234,19 +242,6 @@ def _abandoned(path: Path) -> bool:
         return _locked(handle)
     finally:
         os.close(handle)
-
-
-def _remove_abandoned_files(targets: Iterable[Path]) -> None:
-    """Remove what processes that were killed left of files with these names."""
-    names: dict[Path, set[str]] = {}
-    for target in targets:
-        names.setdefault(target.parent, set()).add(target.name)
-    for folder, own in names.items():
-        with contextlib.suppress(OSError):
-            for path in list(folder.iterdir()):
-                found = re.fullmatch(r"\.(.+)\.[a-z0-9_]{8}" + re.escape(TEMPORARY), path.name, re.DOTALL)
-                if found and found[1] in own and _abandoned(path):
-                    path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

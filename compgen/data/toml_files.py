@@ -93,8 +93,24 @@ class Section:
 
     def fail(self, key: str, message: str) -> InputError:
         """Return the error that points at ``key`` of this section."""
+        full = f"{self.name}.{key}" if self.name else key
+        # the line of the key, or of its table's header if the file does not have the key
+        inside, count, own = not self.name, -1, None
+        for number, line in enumerate(self.text.split("\n"), start=1):
+            header = re.match(r"\s*\[\[?\s*([^\[\],]+?)\s*\]\]?\s*(#.*)?$", line)
+            if header:
+                table = re.sub(r"[\"' ]", "", header.group(1))
+                count += table == self.name
+                inside = table == self.name and count == self._nth
+                own = number if inside else own
+                if table == full and max(count, 0) == self._nth:
+                    own = number
+                    break
+            elif inside and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line):
+                own = number
+                break
         place = f"[{self.name}] {key}" if self.name else key
-        return InputError(message, file=self.path, line=self._line_of(key), field=visible_line(place))
+        return InputError(message, file=self.path, line=own, field=visible_line(place))
 
     def __contains__(self, key: str) -> bool:
         """Whether the file holds ``key``; asking makes the key a known one."""
@@ -156,23 +172,6 @@ class Section:
         for key in self.data:
             if key not in self._known:
                 raise self.fail(key, f"is not a known key; {nearest(key, self._known)}")
-
-    def _line_of(self, key: str) -> int | None:
-        """Line of ``key``, or of its table's header if the file does not have the key."""
-        full = f"{self.name}.{key}" if self.name else key
-        inside, count, own = not self.name, -1, None
-        for number, line in enumerate(self.text.split("\n"), start=1):
-            header = re.match(r"\s*\[\[?\s*([^\[\],]+?)\s*\]\]?\s*(#.*)?$", line)
-            if header:
-                table = re.sub(r"[\"' ]", "", header.group(1))
-                count += table == self.name
-                inside = table == self.name and count == self._nth
-                own = number if inside else own
-                if table == full and max(count, 0) == self._nth:
-                    return number
-            elif inside and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line):
-                return number
-        return own
 
 
 def read_toml(path: str | Path) -> Section:

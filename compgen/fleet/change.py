@@ -366,7 +366,17 @@ def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
         raise InputError("the calibrations have no error in common; keep the same errors in the machine file")
     error, position = tuple(newest.error[k] for k in kept), newest.position_mm[kept]
     keep = _gauge_projector(machine, error, position)
-    maps = [keep @ _resampler(error, position, item.covariance) for item in history]
+    names, maps = np.array(error), []
+    for item in history:  # each with a matrix (k, k_i) that takes its values to the common nodes, linear in between
+        given = np.array(item.covariance.error)
+        matrix = np.zeros((len(names), len(given)))
+        for name in dict.fromkeys(error):
+            rows, columns = np.flatnonzero(names == name), np.flatnonzero(given == name)
+            if name in SQUARENESS_NAMES:
+                matrix[np.ix_(rows, columns)] = 1.0
+            else:
+                matrix[np.ix_(rows, columns)] = hat_matrix(item.covariance.position_mm[columns], position[rows])
+        maps.append(keep @ matrix)
     values = [
         each @ values_at_nodes(item.errors, item.covariance.error, item.covariance.position_mm)
         for each, item in zip(maps, history, strict=True)
@@ -376,19 +386,6 @@ def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
     figures, weights = _figures(error, position, keep)
     days = np.array(seconds) / 86400.0
     return Aligned(machine, error, position, days, np.array(values), tuple(factors), figures, weights)
-
-
-def _resampler(error: Sequence[str], position_mm: FloatArray, source: Covariance) -> FloatArray:
-    """Matrix (k, k_i) that takes values of one calibration to the common nodes, linear in between."""
-    names, given = np.array(error), np.array(source.error)
-    matrix = np.zeros((len(names), len(given)))
-    for name in dict.fromkeys(error):
-        rows, columns = np.flatnonzero(names == name), np.flatnonzero(given == name)
-        if name in SQUARENESS_NAMES:
-            matrix[np.ix_(rows, columns)] = 1.0
-        else:
-            matrix[np.ix_(rows, columns)] = hat_matrix(source.position_mm[columns], position_mm[rows])
-    return matrix
 
 
 def _gauge_projector(machine: Machine, error: Sequence[str], position_mm: FloatArray) -> FloatArray:

@@ -151,7 +151,12 @@ def rollback(
             raise DecisionError("a rollback needs a reason")
         if active_id(decisions) is None and not to:
             raise DecisionError(f"{machine.name}: no tables are active, so there is nothing to undo")
-        table_id = before_active(decisions) if to is None else _earlier(connection, machine, decisions, to)
+        table_id = before_active(decisions) if to is None else None
+        if to:
+            table_id, _ = _table_of(connection, machine, to)
+            state = state_of(table_id, decisions)
+            if state not in WAS_ACTIVE:
+                raise DecisionError(f"{_place(machine, to)} is {state}; only a version that was active can come back")
         if table_id is not None:
             files_of(connection, table_id)
         return add_decision(store, connection, machine, "rollback", table_id, actor, reason)
@@ -169,18 +174,6 @@ def check_person(actor: str) -> None:
         raise DecisionError(f"the name of who decides contains control characters or invisible ones: {shown}")
     if plain.strip().casefold() == AUTOMATIC:
         raise DecisionError(f"{AUTOMATIC!r} signs decisions that no person made; give your own name")
-
-
-def _earlier(
-    connection: sa.Connection, machine: MachineRecord, decisions: list[DecisionRecord], version: int
-) -> int | None:
-    if version == 0:
-        return None
-    table_id, _ = _table_of(connection, machine, version)
-    state = state_of(table_id, decisions)
-    if state not in WAS_ACTIVE:
-        raise DecisionError(f"{_place(machine, version)} is {state}; only a version that was active can come back")
-    return table_id
 
 
 def _check_seen(

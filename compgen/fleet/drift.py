@@ -351,8 +351,19 @@ def forecast(
     confidence : of the interval, which leaves equal shares on both sides.
     """
     days = exit_grid(horizon_days)
-    exits = np.concatenate([_exits(trend, k, reference, tolerance, days) for k in range(len(trend.components))])
-    return forecast_of(exits, horizon_days, confidence)
+    exits = []
+    for k, part in enumerate(trend.components):  # the number of exits drawn of each follows its share
+        generator = np.random.default_rng([SEED, k])
+        count = max(int(round(PATHS * part.share)), 1)
+        values, vectors = np.linalg.eigh(part.state_covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        state = part.state + generator.standard_normal((count, 2)) @ root.T
+        path = state[:, :1] - reference + state[:, 1:] * days
+        if part.q > 0.0:
+            steps = generator.standard_normal((count, len(days) - 1)) * np.sqrt(part.q * np.diff(days))
+            path[:, 1:] += np.cumsum(steps, axis=1)
+        exits.append(first_exit(path, tolerance, days))
+    return forecast_of(np.concatenate(exits), horizon_days, confidence)
 
 
 def exit_grid(horizon_days: float) -> FloatArray:
@@ -368,21 +379,6 @@ def forecast_of(exits_days: FloatArray, horizon_days: float, confidence: float) 
     inside = float(np.mean(np.isfinite(ordered)))
     now = float(np.mean(ordered <= 0.0))
     return Forecast(float(median), float(low), float(high), now, inside, confidence, horizon_days)
-
-
-def _exits(trend: Trend, k: int, reference: float, tolerance: float, days: FloatArray) -> FloatArray:
-    """Draw exits of one component; their number follows its share."""
-    part = trend.components[k]
-    generator = np.random.default_rng([SEED, k])
-    count = max(int(round(PATHS * part.share)), 1)
-    values, vectors = np.linalg.eigh(part.state_covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    state = part.state + generator.standard_normal((count, 2)) @ root.T
-    path = state[:, :1] - reference + state[:, 1:] * days
-    if part.q > 0.0:
-        steps = generator.standard_normal((count, len(days) - 1)) * np.sqrt(part.q * np.diff(days))
-        path[:, 1:] += np.cumsum(steps, axis=1)
-    return first_exit(path, tolerance, days)
 
 
 def first_exit(path: FloatArray, tolerance: float, days: FloatArray) -> FloatArray:
@@ -429,7 +425,12 @@ def volume_forecast(
         return None
     state = pull[:2] @ data.value
     field = _field(data)
-    excess = _excess(data, design, pull, root, field)
+    # factor, at least 1, by which the field scatters more about its line than the uncertainties say
+    left = np.eye(len(root)) - design @ pull
+    seen = float(np.sum((root[:, None] * ((left @ data.value) @ field.T)) ** 2))
+    spread = np.array([np.sum((field @ factor) ** 2) for factor in data.factor])
+    expected = float(np.sum((root[:, None] * left) ** 2 @ spread))
+    excess = max(1.0, float(np.sqrt(seen / expected)))
     generator = np.random.default_rng([SEED, 99])
     draws = np.zeros((2, DRAWS, data.value.shape[1]))
     for k, factor in enumerate(data.factor):
@@ -478,15 +479,6 @@ def _field(data: Aligned) -> FloatArray:
     position_mm = volume_points(data.machine)
     design = error_design(data.machine, data.field_covariance(0), position_mm)
     return np.asarray(rigid_free_projector(data.machine, position_mm) @ design.reshape(3 * len(position_mm), -1))
-
-
-def _excess(data: Aligned, design: FloatArray, pull: FloatArray, root: FloatArray, field: FloatArray) -> float:
-    """Factor, at least 1, by which the field scatters more about its line than the uncertainties say."""
-    left = np.eye(len(root)) - design @ pull
-    seen = float(np.sum((root[:, None] * ((left @ data.value) @ field.T)) ** 2))
-    spread = np.array([np.sum((field @ factor) ** 2) for factor in data.factor])
-    expected = float(np.sum((root[:, None] * left) ** 2 @ spread))
-    return max(1.0, float(np.sqrt(seen / expected)))
 
 
 #: Mean length of a month.
@@ -774,6 +766,12 @@ def drift_report(
         notes.append("a trend needs three calibrations")
     figures = _figures(data, chosen, temperature)
     volume = [_volume(machine, history, k, chosen.reference, chosen.confidence) for k in range(len(history))]
+    tolerance, in_volume = chosen.tolerances.get("volume"), None
+    if tolerance is not None:
+        steps = sorted({step.after for item in figures if item.trend is not None for step in item.trend.steps})
+        warm = None if temperature is None else np.array(temperature) - np.mean(temperature)
+        limits = (tolerance, chosen.horizon_days, chosen.confidence)
+        in_volume = volume_forecast(data, chosen.reference, steps, warm, limits)
     return Drift(
         machine=name or machine.name,
         times=tuple(item.at.isoformat(timespec="minutes") for item in history),
@@ -783,7 +781,7 @@ def drift_report(
         volume_since_last=_volume(machine, history, last, last - 1, chosen.confidence) if last else None,
         volume_since_first=_volume(machine, history, last, 0, chosen.confidence) if last else None,
         volume_um=tuple((item.rms_um, item.expected_rms_um) for item in volume),
-        volume_forecast=_volume_forecast(data, chosen, figures, temperature),
+        volume_forecast=in_volume,
         figures=figures,
         temperature_c=temperature,
         notes=tuple(notes),
@@ -824,15 +822,3 @@ def _figures(data: Aligned, chosen: DriftSettings, temperature: tuple[float, ...
         p_value = 1.0 if trend is None else next(adjusted)
         found.append(FigureDrift(figure, series, reference, trend, p_value, tolerance, leaves))
     return tuple(found)
-
-
-def _volume_forecast(
-    data: Aligned, chosen: DriftSettings, figures: Sequence[FigureDrift], temperature: tuple[float, ...] | None
-) -> Forecast | None:
-    tolerance = chosen.tolerances.get("volume")
-    if tolerance is None:
-        return None
-    steps = sorted({step.after for item in figures if item.trend is not None for step in item.trend.steps})
-    warm = None if temperature is None else np.array(temperature) - np.mean(temperature)
-    limits = (tolerance, chosen.horizon_days, chosen.confidence)
-    return volume_forecast(data, chosen.reference, steps, warm, limits)

@@ -371,7 +371,19 @@ def _job_of(root: Section, path: Path) -> Job:
     if not machines:
         _options(_Keys(Section({}, path=path), defaults), folder, "")
     root.finish()
-    _check_folders(every, machines)
+    # folders out may not be the same or lie in each other, whatever links and ".." lead there
+    real = {name: Path(os.path.realpath(machine.out)) for name, machine in machines.items()}
+    known = {path: name for name, path in reversed(real.items())}
+    for name, out in real.items():
+        if known[out] != name:
+            raise every.fail(name, f"has the same folder out as {known[out]} ({out}); give each machine its own")
+        around = next((parent for parent in out.parents if parent in known), None)
+        if around is not None:
+            raise every.fail(
+                name,
+                f"has its folder out ({out}) inside that of {known[around]} ({around}); give each machine its own, beside "
+                "each other",
+            )
     shared: dict[str, list[OtherInbox]] = {}
     for name, machine in machines.items():
         shared.setdefault(os.path.realpath(machine.inbox), []).append(OtherInbox(name, machine.inbox, machine.patterns))
@@ -379,22 +391,6 @@ def _job_of(root: Section, path: Path) -> Job:
         for own in group if len(group) > 1 else ():
             machines[own.name] = replace(machines[own.name], others=tuple(item for item in group if item != own))
     return Job(path, store if "://" in store else f"sqlite:///{folder / store}", machines)
-
-
-def _check_folders(every: Section, machines: Mapping[str, MachineJob]) -> None:
-    """Refuse folders ``out`` that are the same or lie in each other, whatever links and ``..`` lead there."""
-    real = {name: Path(os.path.realpath(machine.out)) for name, machine in machines.items()}
-    known = {path: name for name, path in reversed(real.items())}
-    for name, path in real.items():
-        if known[path] != name:
-            raise every.fail(name, f"has the same folder out as {known[path]} ({path}); give each machine its own")
-        around = next((parent for parent in path.parents if parent in known), None)
-        if around is not None:
-            raise every.fail(
-                name,
-                f"has its folder out ({path}) inside that of {known[around]} ({around}); give each machine its own, beside "
-                "each other",
-            )
 
 
 def _machine(name: str, keys: _Keys, folder: Path) -> MachineJob:

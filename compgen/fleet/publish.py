@@ -84,13 +84,28 @@ def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord |
             tables = store.tables(machine, figures=False)
             _compare(store, machine, tables, folder, seen)
             ledger = _ledger_text(store, machine)
-            _remove_leftovers(store, machine, tables, folder)
+            # what a process that was killed left behind; nobody else works here now
+            (folder / f".{POINTER}.tmp").unlink(missing_ok=True)
+            by_version = {table.version: table for table in tables}
+            for path in [*folder.glob(".*.tmp"), *(folder / PROPOSED).glob(".*.tmp")]:
+                found = _TEMPORARY.fullmatch(path.name)
+                left = None if found is None else by_version.get(int(found[2]))
+                if found is not None and left is not None and path.is_dir() and not path.is_symlink():
+                    _clear(path, _contents(store, machine, left), found[1])
             for table in tables:
                 required = folder / version_name(table)
                 if table.state == "active" or (table.state == "retired" and not required.exists()):
                     _complete(store, machine, table, required)
             active = active_of(tables)
-            _point(folder, active)
+            pointer = folder / POINTER  # swapped in one step
+            if active is None:
+                pointer.unlink(missing_ok=True)
+            elif not pointer.is_symlink() or os.readlink(pointer) != version_name(active):
+                temporary = folder / f".{POINTER}.tmp"
+                temporary.unlink(missing_ok=True)
+                temporary.symlink_to(version_name(active), target_is_directory=True)
+                temporary.replace(pointer)
+            _sync(folder)
             _propose(store, machine, tables, folder / PROPOSED)
             if ledger != seen.ledger_text:
                 write_file(folder / LEDGER, ledger)
@@ -293,17 +308,6 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def _remove_leftovers(store: Store, machine: MachineRecord, tables: Sequence[TableRecord], folder: Path) -> None:
-    """Remove what a process that was killed left behind; nobody else works here now."""
-    (folder / f".{POINTER}.tmp").unlink(missing_ok=True)
-    by_version = {table.version: table for table in tables}
-    for path in [*folder.glob(".*.tmp"), *(folder / PROPOSED).glob(".*.tmp")]:
-        found = _TEMPORARY.fullmatch(path.name)
-        table = None if found is None else by_version.get(int(found[2]))
-        if found is not None and table is not None and path.is_dir() and not path.is_symlink():
-            _clear(path, _contents(store, machine, table), found[1])
-
-
 def _clear(folder: Path, contents: Mapping[str, bytes], name: str) -> None:
     """Delete the files that this program wrote into a folder, then the folder; what others put there stays as LEFT-NAME."""
     for path in sorted(folder.rglob("*"), reverse=True):  # what lies inside a folder comes before the folder
@@ -376,19 +380,6 @@ def _make(target: Path, contents: dict[str, bytes]) -> None:
         _sync(inner)
     temporary.rename(target)
     _sync(target.parent)
-
-
-def _point(folder: Path, active: TableRecord | None) -> None:
-    """Swap the pointer in one step."""
-    pointer = folder / POINTER
-    if active is None:
-        pointer.unlink(missing_ok=True)
-    elif not pointer.is_symlink() or os.readlink(pointer) != version_name(active):
-        temporary = folder / f".{POINTER}.tmp"
-        temporary.unlink(missing_ok=True)
-        temporary.symlink_to(version_name(active), target_is_directory=True)
-        temporary.replace(pointer)
-    _sync(folder)
 
 
 def _proposed(tables: Sequence[TableRecord]) -> dict[str, TableRecord]:

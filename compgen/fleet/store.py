@@ -643,23 +643,21 @@ def _copy(source: Store, target: Store) -> dict[str, int]:
         if source.engine.dialect.name == "postgresql":
             reading = reading.execution_options(isolation_level="REPEATABLE READ")
         with reading, target.engine.begin() as writing:
-            return {table.name: _copy_table(reading, writing, table) for table in database.ALL}
+            counts = dict.fromkeys((table.name for table in database.ALL), 0)
+            for table in database.ALL:
+                keys = [table.c.id] if "id" in table.c else list(table.primary_key)
+                rows = reading.execution_options(yield_per=ROWS).execute(sa.select(table).order_by(*keys))
+                for part in rows.partitions(ROWS):
+                    if table is database.blobs:
+                        for row in part:
+                            inflated(row.sha256, row.deflated)
+                    writing.execute(sa.insert(table), [dict(row._mapping) for row in part])
+                    counts[table.name] += len(part)
+                if writing.dialect.name == "postgresql" and "id" in table.c and counts[table.name]:
+                    sequence = sa.func.pg_get_serial_sequence(table.name, "id")
+                    newest = sa.select(sa.func.max(table.c.id)).scalar_subquery()
+                    writing.execute(sa.select(sa.func.setval(sequence, newest)))
+            return counts
     except sa.exc.DBAPIError as error:
         place = f"{shown(source.url)} to {shown(target.url)}"
         raise StoreError(f"nothing was copied from {place}: {first_line(error)}") from error
-
-
-def _copy_table(reading: sa.Connection, writing: sa.Connection, table: sa.Table) -> int:
-    count = 0
-    keys = [table.c.id] if "id" in table.c else list(table.primary_key)
-    rows = reading.execution_options(yield_per=ROWS).execute(sa.select(table).order_by(*keys))
-    for part in rows.partitions(ROWS):
-        if table is database.blobs:
-            for row in part:
-                inflated(row.sha256, row.deflated)
-        writing.execute(sa.insert(table), [dict(row._mapping) for row in part])
-        count += len(part)
-    if writing.dialect.name == "postgresql" and "id" in table.c and count:
-        sequence = sa.func.pg_get_serial_sequence(table.name, "id")
-        writing.execute(sa.select(sa.func.setval(sequence, sa.select(sa.func.max(table.c.id)).scalar_subquery())))
-    return count

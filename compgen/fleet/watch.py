@@ -90,7 +90,19 @@ class Watch:
         logs.info("watching", job=str(self.path), machines=len(self.job.machines) if self.job else 0)
         try:
             while not self.stopped.wait(self.poll_s):
-                self._reload()
+                # take an edited job file; one that is wrong is reported once, and what was known before stays
+                try:
+                    content = read_bytes(self.path)
+                    if content == self._content:
+                        continue
+                    self._content = content
+                    self._load()
+                    logs.info("job file read anew", job=str(self.path))
+                except CompgenError as error:
+                    if self._content != b"":
+                        logs.error("job file not taken", job=str(self.path), problem=str(error))
+                    if not self.path.is_file():
+                        self._content = b""
         finally:
             self.stopped.set()
             self._scheduler.shutdown(wait=True)
@@ -101,21 +113,6 @@ class Watch:
         job = job_of_text(content.decode("utf-8-sig", "replace"), self.path).with_notify(self.notify)
         self._schedule(job)
         self.job, self._content = job, content
-
-    def _reload(self) -> None:
-        """Take an edited job file; one that is wrong is reported once, and what was known before stays."""
-        try:
-            content = read_bytes(self.path)
-            if content == self._content:
-                return
-            self._content = content
-            self._load()
-            logs.info("job file read anew", job=str(self.path))
-        except CompgenError as error:
-            if self._content != b"":
-                logs.error("job file not taken", job=str(self.path), problem=str(error))
-            if not self.path.is_file():
-                self._content = b""
 
     def _schedule(self, job: Job) -> None:
         """Add, replace and remove what changed against the job before; new and changed machines run at once."""
@@ -141,18 +138,16 @@ class Watch:
             return
         outcome = self.work(machine, url, self.stopped.is_set)
         if outcome.again:
-            self._look_again(machine.name)
+            # do not wait for the schedule, which may be a week, where something may pass by itself
+            name = machine.name
+            count = self._troubles[name] = self._troubles.get(name, 0) + 1
+            wait_s = min(AGAIN_S * 2.0 ** min(count - 1, 60), AGAIN_AT_MOST_S)
+            when = datetime.now().astimezone() + timedelta(seconds=wait_s)
+            with suppress(JobLookupError):  # the machine was taken out of the job file meanwhile
+                planned = self._scheduler.get_job(name)
+                if planned is not None and planned.next_run_time is not None and when < planned.next_run_time:
+                    self._scheduler.modify_job(name, next_run_time=when)
+                    logs.info("looked at again soon", machine=name, at=when.isoformat(timespec="seconds"))
         else:
             self._troubles.pop(machine.name, None)
         self.on_outcome(outcome)
-
-    def _look_again(self, name: str) -> None:
-        """Do not wait for the schedule, which may be a week, where something may pass by itself."""
-        count = self._troubles[name] = self._troubles.get(name, 0) + 1
-        wait_s = min(AGAIN_S * 2.0 ** min(count - 1, 60), AGAIN_AT_MOST_S)
-        when = datetime.now().astimezone() + timedelta(seconds=wait_s)
-        with suppress(JobLookupError):  # the machine was taken out of the job file meanwhile
-            planned = self._scheduler.get_job(name)
-            if planned is not None and planned.next_run_time is not None and when < planned.next_run_time:
-                self._scheduler.modify_job(name, next_run_time=when)
-                logs.info("looked at again soon", machine=name, at=when.isoformat(timespec="seconds"))

@@ -26,7 +26,7 @@ from compgen.errors import InputError
 from compgen.fleet import database, logs
 from compgen.fleet.dashboard.charts import UNITS, Chart, ChartSeries, chart, time_ticks
 from compgen.fleet.decisions import EXCLUSION
-from compgen.fleet.drift import DAYS_A_MONTH, Drift, DriftSettings, FigureDrift, drift_of_store, following_temperature
+from compgen.fleet.drift import DAYS_A_MONTH, Drift, DriftSettings, drift_of_store, following_temperature
 from compgen.fleet.job import Job, read_job
 from compgen.fleet.recheck import Recheck, RequestedChange, shortest_recheck
 from compgen.fleet.records import IdentificationRecord, MachineRecord
@@ -354,22 +354,19 @@ def drift_charts(drift: Drift) -> Sequence[Chart]:
     known = [item for item in drift.figures if item.trend is not None]
     shown = [item for item in known if item.p_value < level or item.figure.name in warm or item.tolerance is not None]
     shown.sort(key=lambda item: (item.p_value, item.figure.name))
-    found += [_figure_chart(item, seconds, marks) for item in shown[:DRAWN]]
+    for item in shown[:DRAWN]:
+        scale = item.figure.scale
+        value, u = item.series.value * scale, COVERAGE * item.series.u * scale
+        series = [ChartSeries("identified", seconds, value.tolist(), u.tolist())]
+        days, line = item.line()
+        label = "trend with steps" if item.trend is not None and item.trend.steps else "trend"
+        series.append(ChartSeries(label, (seconds[0] + 86400.0 * days).tolist(), (line * scale).tolist(), marked=False))
+        if item.tolerance is not None:
+            ends = np.array([item.reference - item.tolerance, item.reference + item.tolerance]) * scale
+            span = (seconds[0], seconds[-1])
+            series += [ChartSeries("limit of the tolerance", span, (end, end), marked=False) for end in ends.tolist()]
+        found.append(chart(f"{item.figure.name}, {UNITS[item.figure.unit]}", series, marks))
     return [item for item in found if item is not None]
-
-
-def _figure_chart(item: FigureDrift, seconds: Sequence[float], marks: Sequence[tuple[float, str]]) -> Chart | None:
-    scale = item.figure.scale
-    value, u = item.series.value * scale, COVERAGE * item.series.u * scale
-    series = [ChartSeries("identified", seconds, value.tolist(), u.tolist())]
-    days, level = item.line()
-    label = "trend with steps" if item.trend is not None and item.trend.steps else "trend"
-    series.append(ChartSeries(label, (seconds[0] + 86400.0 * days).tolist(), (level * scale).tolist(), marked=False))
-    if item.tolerance is not None:
-        ends = np.array([item.reference - item.tolerance, item.reference + item.tolerance]) * scale
-        span = (seconds[0], seconds[-1])
-        series += [ChartSeries("limit of the tolerance", span, (end, end), marked=False) for end in ends.tolist()]
-    return chart(f"{item.figure.name}, {UNITS[item.figure.unit]}", series, marks)
 
 
 # --- shortest re-check ---------------------------------------------------------------------------------------------

@@ -535,19 +535,17 @@ def file_views(store: Store, table: TableRecord, active: TableRecord | None) -> 
         others = {(file.controller, file.name): file.content for file in store.table_files(active)}
     views = []
     for number, file in enumerate(store.table_files(table), start=1):
-        lines, note = _difference(others.get((file.controller, file.name)), file.content)
-        views.append(FileView(number, file, sha256_of(file.content), lines, note))
+        old, new = others.get((file.controller, file.name)), file.content
+        lines: list[str] = []
+        if old is None:
+            note = "no active file to compare with"
+        elif old == new:
+            note = "the same bytes as the active file"
+        elif max(len(old), len(new)) > DIFF_BYTES or b"\0" in old or b"\0" in new:
+            note = "differs; too large or no text, so the difference is not shown"
+        else:
+            before, after = (content.decode("utf-8", "replace").splitlines() for content in (old, new))
+            lines = list(difflib.unified_diff(before, after, "active", "this version", n=1, lineterm=""))
+            note = "" if len(lines) <= DIFF_LINES else f"the first {DIFF_LINES} of {len(lines)} lines of the difference"
+        views.append(FileView(number, file, sha256_of(new), lines[:DIFF_LINES], note))
     return views
-
-
-def _difference(old: bytes | None, new: bytes) -> tuple[list[str], str]:
-    if old is None:
-        return [], "no active file to compare with"
-    if old == new:
-        return [], "the same bytes as the active file"
-    if max(len(old), len(new)) > DIFF_BYTES or b"\0" in old or b"\0" in new:
-        return [], "differs; too large or no text, so the difference is not shown"
-    before, after = (content.decode("utf-8", "replace").splitlines() for content in (old, new))
-    lines = list(difflib.unified_diff(before, after, "active", "this version", n=1, lineterm=""))
-    note = "" if len(lines) <= DIFF_LINES else f"the first {DIFF_LINES} of {len(lines)} lines of the difference"
-    return lines[:DIFF_LINES], note
