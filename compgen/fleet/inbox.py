@@ -227,7 +227,12 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
             if equals and field in (*TIME_KEYS, ACTIVE_KEY):
                 said[field] = value.decode("utf-8", "replace").strip()[:LONGEST_COMMENT]
         comments = {**said, **comments}
-    times = [found for key in TIME_KEYS if (found := _time(comments.get(key, ""))) is not None]
+    times = []  # in ISO form, and how sure each is: one without a zone is taken as local time
+    for word in TIME_KEYS:
+        with contextlib.suppress(ValueError, OverflowError, OSError):
+            said_at = datetime.fromisoformat(comments.get(word, "").strip())
+            source = "file" if said_at.tzinfo is not None else "file, no zone"
+            times.append((said_at.astimezone(UTC), source))
     temperatures: dict[str, dict[str, float]] = {}
     for content in contents.values():
         temperatures |= _temperatures(content)
@@ -240,15 +245,6 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
         active_table=comments.get(ACTIVE_KEY) or None,
         temperatures_c=temperatures,
     )
-
-
-def _time(text: str) -> tuple[datetime, str] | None:
-    """Read an ISO time and say how sure it is: "file", or "file, no zone" for one that is taken as local time."""
-    try:
-        found = datetime.fromisoformat(text.strip())
-        return found.astimezone(UTC), "file" if found.tzinfo is not None else "file, no zone"
-    except (ValueError, OverflowError, OSError):
-        return None
 
 
 def _temperatures(content: bytes) -> dict[str, dict[str, float]]:
