@@ -315,10 +315,6 @@ def read_covariance(path: str | Path, errors: str | Path | None = None) -> Covar
 
 def parse_covariance(content: bytes, source: Path) -> Covariance:
     """Read the contents of a ``*.covariance.npz`` file; ``source`` is what messages name."""
-    return _checked(source, _members(source, content))
-
-
-def _members(source: Path, content: bytes) -> dict[str, NDArray[np.generic]]:
     if not content.startswith(b"PK"):
         raise InputError("is not a covariance file (*.covariance.npz, written by volcomp identify)", file=source)
     try:
@@ -331,7 +327,7 @@ def _members(source: Path, content: bytes) -> dict[str, NDArray[np.generic]]:
     missing = [name for name in _MEMBERS if name not in members]
     if missing:
         raise InputError(f"lacks {', '.join(missing)}; write it again with volcomp identify", file=source)
-    return members
+    return _checked(source, members)
 
 
 def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covariance:

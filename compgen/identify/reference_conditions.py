@@ -194,7 +194,21 @@ def reading_conditions(machine: Machine, lengths: Lengths, *, temperature: bool 
         file = lengths.origin[0][0] if lengths.origin else None
         raise InputError(f"the comment wavelength_compensated = {text!r} is neither true nor false", file=file)
     if text in ("false", "no", "0"):
-        index, assumed = _refractive_indices(lengths)
+        # index of the air at each reading (n,), and the one that the instrument assumed
+        temperature_c = lengths.covariates.get("temp_ambient_c")
+        if temperature_c is None:
+            file = lengths.origin[0][0] if lengths.origin else None
+            message = "is missing; wavelength_compensated = false needs the air temperature of each reading"
+            raise InputError(message, file=file, field="column temp_ambient_c")
+        _check_complete(lengths, "temp_ambient_c", temperature_c)
+        pressure = _metadata_number(lengths, "pressure_hpa", STANDARD_PRESSURE_HPA, (500.0, 1200.0))
+        humidity = _metadata_number(lengths, "humidity_percent", STANDARD_HUMIDITY_PERCENT, (0.0, 100.0))
+        wavelength = _metadata_number(lengths, "wavelength_nm", HELIUM_NEON_NM, (350.0, 1700.0))
+        standard = float(
+            refractive_index(np.array(REFERENCE_C), STANDARD_PRESSURE_HPA, STANDARD_HUMIDITY_PERCENT, wavelength)
+        )
+        assumed = _metadata_number(lengths, "refractive_index_used", standard, (1.0, 1.001))
+        index = refractive_index(temperature_c, pressure, humidity, wavelength)
         lengths = replace(lengths, length_mm=lengths.length_mm * assumed / index)
         share = float(index.mean()) / index - 1.0
         notes["wavelength"] = {"index_assumed": assumed, "index_mean": float(index.mean())}
@@ -244,24 +258,6 @@ def _check_complete(lengths: Lengths, column: str, values: FloatArray) -> None:
             line=line,
             field=f"column {column}",
         )
-
-
-def _refractive_indices(lengths: Lengths) -> tuple[FloatArray, float]:
-    """Index of the air at each reading (n,), and the one that the instrument assumed."""
-    temperature = lengths.covariates.get("temp_ambient_c")
-    if temperature is None:
-        file = lengths.origin[0][0] if lengths.origin else None
-        message = "is missing; wavelength_compensated = false needs the air temperature of each reading"
-        raise InputError(message, file=file, field="column temp_ambient_c")
-    _check_complete(lengths, "temp_ambient_c", temperature)
-    pressure = _metadata_number(lengths, "pressure_hpa", STANDARD_PRESSURE_HPA, (500.0, 1200.0))
-    humidity = _metadata_number(lengths, "humidity_percent", STANDARD_HUMIDITY_PERCENT, (0.0, 100.0))
-    wavelength = _metadata_number(lengths, "wavelength_nm", HELIUM_NEON_NM, (350.0, 1700.0))
-    standard = float(
-        refractive_index(np.array(REFERENCE_C), STANDARD_PRESSURE_HPA, STANDARD_HUMIDITY_PERCENT, wavelength)
-    )
-    assumed = _metadata_number(lengths, "refractive_index_used", standard, (1.0, 1.001))
-    return refractive_index(temperature, pressure, humidity, wavelength), assumed
 
 
 def _metadata_number(lengths: Lengths, key: str, default: float, allowed: tuple[float, float]) -> float:

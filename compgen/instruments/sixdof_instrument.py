@@ -413,11 +413,27 @@ def read_instrument(path: str | Path) -> SixDofInstrument:
     common = read_systematics(root.section("systematics", required=False))
     u_common = read_systematics(root.section("u_systematics", required=False), check=toml_files.not_negative)
     noise = _read_numbers(root.section("noise", required=False), ("displacement_um", "qd_um", "psd_um"))
+    section = root.section("axes")
+    axes = {}
+    for axis, letter in enumerate(AXES):
+        if letter not in section:
+            continue
+        entry = section.section(letter)
+        mode = entry.take("mode", toml_files.whole(1, 2))
+        direction = entry.take("beam_direction", _beam_direction, 1)
+        own = read_systematics(entry.section("systematics", required=False), axis)
+        known = {name: value for name, value in common.items() if name in known_systematics(axis)}
+        axes[axis] = toml_files.read_settings(
+            AxisSetUp, entry, set_up=SetUp(axis, mode, direction), systematics={**known, **own}
+        )
+    section.finish()
+    if not axes:
+        raise section.fail("X", "no axis is described; give [axes.X], [axes.Y] or [axes.Z]")
     return toml_files.read_settings(
         SixDofInstrument,
         root,
         optics=optics,
-        axes=_read_axes(root.section("axes"), common),
+        axes=axes,
         u_systematics=u_common,
         u_constants=_read_numbers(root.section("u_constants", required=False), U_CONSTANTS),
         noise={name.removesuffix("_um"): value * MM_PER_UM for name, value in noise.items()},
@@ -428,25 +444,6 @@ def read_instrument(path: str | Path) -> SixDofInstrument:
 def _read_numbers(section: toml_files.Section, names: tuple[str, ...]) -> dict[str, float]:
     found = {name: section.take(name, toml_files.not_negative) for name in names if name in section}
     section.finish()
-    return found
-
-
-def _read_axes(section: toml_files.Section, common: Mapping[str, float]) -> dict[int, AxisSetUp]:
-    found = {}
-    for axis, letter in enumerate(AXES):
-        if letter not in section:
-            continue
-        entry = section.section(letter)
-        mode = entry.take("mode", toml_files.whole(1, 2))
-        direction = entry.take("beam_direction", _beam_direction, 1)
-        own = read_systematics(entry.section("systematics", required=False), axis)
-        known = {name: value for name, value in common.items() if name in known_systematics(axis)}
-        found[axis] = toml_files.read_settings(
-            AxisSetUp, entry, set_up=SetUp(axis, mode, direction), systematics={**known, **own}
-        )
-    section.finish()
-    if not found:
-        raise section.fail("X", "no axis is described; give [axes.X], [axes.Y] or [axes.Z]")
     return found
 
 

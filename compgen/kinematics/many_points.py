@@ -99,7 +99,19 @@ def volume_sample(
     anywhere is usually largest there.
     """
     nodes_mm = tuple(np.append(nodes, emphasis.ends_mm(axis)) for axis, nodes in enumerate(nodes_mm))
-    sides = [_between_nodes(machine, axis, nodes, emphasis) for axis, nodes in enumerate(nodes_mm)]
+    sides = []
+    for axis, nodes in enumerate(nodes_mm):
+        # two Gauss-Legendre points in each interval between nodes within the travel; their weights sum to 1; few
+        # intervals are parted, because the errors are not as smooth as the tables
+        low, high = machine.axes[axis].range_mm
+        inside = nodes[(nodes > low + 1e-9) & (nodes < high - 1e-9)]
+        ends = np.concatenate([[low], np.unique(inside), [high]])
+        parts = -(-LEAST_INTERVALS // (len(ends) - 1))
+        ends = np.interp(np.arange(parts * (len(ends) - 1) + 1) / parts, np.arange(len(ends)), ends)
+        middle, half = 0.5 * (ends[1:] + ends[:-1])[:, None], 0.5 * np.diff(ends)[:, None]
+        weighted = emphasis.factor(axis, middle) * half * np.ones(2)
+        points = (middle + half * np.array([-1.0, 1.0]) / np.sqrt(3.0)).ravel()
+        sides.append((points, weighted.ravel() / np.sum(weighted)))
     counts = [len(points) for points, _ in sides]
     every = -(-math.prod(counts) // most)
     if every > 1 and most < LEAST_IN_PLANE * max(counts):
@@ -153,23 +165,6 @@ def _three_grids(
         weights.append(np.einsum("i,j,k->ijk", parts[0][1], parts[1][1], parts[2][1]).ravel())
     joined = np.concatenate(weights)
     return VolumeSample(np.concatenate(positions), joined * (len(joined) / joined.sum()))
-
-
-def _between_nodes(
-    machine: Machine, axis: int, nodes_mm: FloatArray, emphasis: Emphasis
-) -> tuple[FloatArray, FloatArray]:
-    """Two Gauss-Legendre points in each interval between nodes within the travel; their weights sum to 1.
-
-    Few intervals are parted, because the errors are not as smooth as the tables.
-    """
-    low, high = machine.axes[axis].range_mm
-    inside = nodes_mm[(nodes_mm > low + 1e-9) & (nodes_mm < high - 1e-9)]
-    ends = np.concatenate([[low], np.unique(inside), [high]])
-    parts = -(-LEAST_INTERVALS // (len(ends) - 1))
-    ends = np.interp(np.arange(parts * (len(ends) - 1) + 1) / parts, np.arange(len(ends)), ends)
-    middle, half = 0.5 * (ends[1:] + ends[:-1])[:, None], 0.5 * np.diff(ends)[:, None]
-    weighted = emphasis.factor(axis, middle) * half * np.ones(2)
-    return (middle + half * np.array([-1.0, 1.0]) / np.sqrt(3.0)).ravel(), weighted.ravel() / np.sum(weighted)
 
 
 # Curves of one axis on common nodes: one look-up per position, then all values of that axis from neighbouring rows.

@@ -473,13 +473,26 @@ def read_sixdof_measurement(section: toml_files.Section) -> SimulatedSixDof:
     instrument = read_instrument(path)
     positions = section.section("positions_mm", required=False)
     targets = [positions.take(letter, _positions, None) for letter in AXES]
+    uncalibrated = read_systematics(section.section("uncalibrated", required=False))
+    # standard deviations (3, 6) of the readings in the order of ROLES: Table 3 of the paper, given ones, or zero
+    if section.data.get("scatter") == "table3":
+        section.take("scatter", toml_files.choice("table3"))
+        scatter = np.array(TABLE_3) * _UNITS / HALF_RANGE
+    else:
+        given, scatter = section.section("scatter", required=False), np.zeros((3, 6))
+        for axis, letter in enumerate(AXES):
+            entry = given.section(letter, required=False)
+            scatter[axis] = [entry.take(key, toml_files.not_negative, 0.0) for key in _KEYS]
+            entry.finish()
+        given.finish()
+        scatter = scatter * _UNITS
     measurement = toml_files.take_settings(
         SimulatedSixDof,
         section,
         instrument=instrument,
-        uncalibrated=read_systematics(section.section("uncalibrated", required=False)),
+        uncalibrated=uncalibrated,
         positions_mm=tuple(None if value is None else np.asarray(value) for value in targets),
-        scatter=_scatter(section),
+        scatter=np.asarray(scatter),
         noise_mm=_noise(section.section("noise", required=False), instrument),
     )
     positions.finish()
@@ -497,20 +510,6 @@ def _positions(value: Any) -> tuple[float, ...]:
     if not (high > low and step > 0 and (high - low) / step < 10000):
         raise ValueError("from below to, and a step above zero, are expected")
     return tuple((low + step * np.arange(int(np.floor((high - low) / step + 1e-9)) + 1)).tolist())
-
-
-def _scatter(section: toml_files.Section) -> FloatArray:
-    """Standard deviations (3, 6) of the readings in the order of ROLES: Table 3 of the paper, given ones, or zero."""
-    if section.data.get("scatter") == "table3":
-        section.take("scatter", toml_files.choice("table3"))
-        return np.asarray(np.array(TABLE_3) * _UNITS / HALF_RANGE)
-    given, result = section.section("scatter", required=False), np.zeros((3, 6))
-    for axis, letter in enumerate(AXES):
-        entry = given.section(letter, required=False)
-        result[axis] = [entry.take(key, toml_files.not_negative, 0.0) for key in _KEYS]
-        entry.finish()
-    given.finish()
-    return np.asarray(result * _UNITS)
 
 
 def _noise(section: toml_files.Section, instrument: SixDofInstrument) -> FloatArray:

@@ -260,7 +260,23 @@ class EntryCheck:
                 found = self._wrong_numbers(self._sample(self.judge.line_mm[None, None], None, side))
                 if found:
                     return found
-        return self._wrong_beyond_travel() or self._wrong_with_tools(nodes)
+        found = self._wrong_beyond_travel()
+        if found:
+            return found
+        # what the tables add because of the tool: as much as the errors ask for or less, but never more
+        ends = _ends(self.machine)
+        for axis in range(3):
+            levels = [nodes[k] if k == axis else ends[k] for k in range(3)]
+            position_mm = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1)
+            own_tool = self._sample(position_mm, None, None)
+            for tool in self.machine.tool_corners_mm:
+                sample = self._sample(position_mm, np.array(tool), None)
+                if np.array_equal(sample.own_mm, own_tool.own_mm):
+                    break  # these tables do not know the tool
+                found = self._wrong_numbers(sample) or self._spikes(sample) or self._turned(sample, own_tool)
+                if found:
+                    return found
+        return []
 
     @property
     def _numbers_differ(self) -> bool:
@@ -408,22 +424,6 @@ class EntryCheck:
                 sample = _Sample(position_mm, None, own, best, best, np.zeros_like(position_mm))
                 limit = self.judge.goal_mm + 2.0 * self.judge.resolution_mm
                 found = sample.worst(np.abs(sample.miss_mm) - limit)
-                if found:
-                    return found
-        return []
-
-    def _wrong_with_tools(self, nodes: Sequence[FloatArray]) -> list[str]:
-        """Look at what the tables add because of the tool: as much as the errors ask for or less, but never more."""
-        ends = _ends(self.machine)
-        for axis in range(3):
-            levels = [nodes[k] if k == axis else ends[k] for k in range(3)]
-            position_mm = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1)
-            own_tool = self._sample(position_mm, None, None)
-            for tool in self.machine.tool_corners_mm:
-                sample = self._sample(position_mm, np.array(tool), None)
-                if np.array_equal(sample.own_mm, own_tool.own_mm):
-                    break  # these tables do not know the tool
-                found = self._wrong_numbers(sample) or self._spikes(sample) or self._turned(sample, own_tool)
                 if found:
                     return found
         return []

@@ -220,27 +220,18 @@ def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
             if term.zero_at_mm is not None:
                 rows.append(hat_matrix(term.nodes_mm, np.array([term.zero_at_mm]))[0])
             rows += [row for row in hat_matrix(term.nodes_mm, np.array(term.zeros_mm)) if len(term.zeros_mm)]
-            rows += _beyond_travel(term.nodes_mm, *machine.axes[term.axis].range_mm)
+            # nodes beyond the travel continue the line of the two inside, where few points determine them
+            nodes_mm, (low_mm, high_mm) = term.nodes_mm, machine.axes[term.axis].range_mm
+            ends = ((0, 1, 2, low_mm), (-1, -2, -3, high_mm)) if len(nodes_mm) >= 3 else ()
+            for node, next_node, third, end_mm in ends:
+                step = nodes_mm[next_node] - nodes_mm[node]
+                if (nodes_mm[next_node] - end_mm) / step < LEAST_SHARE:
+                    ratio = (nodes_mm[node] - nodes_mm[next_node]) / (nodes_mm[next_node] - nodes_mm[third])
+                    row = np.zeros(len(nodes_mm))
+                    row[node], row[next_node], row[third] = 1.0, -(1.0 + ratio), ratio
+                    rows.append(row)
         blocks.append(free_basis(np.array(rows), len(term.nodes_mm)))
     return csr_array(block_diag(blocks))
-
-
-def _beyond_travel(nodes_mm: FloatArray, low_mm: float, high_mm: float) -> list[FloatArray]:
-    """Rows that make nodes beyond the travel continue the line of the two inside, where few points determine them."""
-    rows: list[FloatArray] = []
-    if len(nodes_mm) < 3:
-        return rows
-    steps = np.diff(nodes_mm)
-    for node, next_node, third, share in (
-        (0, 1, 2, (nodes_mm[1] - low_mm) / steps[0]),
-        (-1, -2, -3, (high_mm - nodes_mm[-2]) / steps[-1]),
-    ):
-        if share < LEAST_SHARE:
-            ratio = (nodes_mm[node] - nodes_mm[next_node]) / (nodes_mm[next_node] - nodes_mm[third])
-            row = np.zeros(len(nodes_mm))
-            row[node], row[next_node], row[third] = 1.0, -(1.0 + ratio), ratio
-            rows.append(row)
-    return rows
 
 
 def synthesize(

@@ -418,36 +418,34 @@ def _parsed(control: AnyController, contents: Sequence[tuple[Path, bytes]], *, f
 def table_files(paths: Sequence[str | Path], controller: str) -> list[Path]:
     """Return the files, and in place of a folder those that its manifest names; InputError where it does not fit."""
     found: list[Path] = []
-    for path in map(Path, paths):
-        found += _files_of_export(path, controller) if path.is_dir() else [path]
+    for given in map(Path, paths):
+        if not given.is_dir():
+            found.append(given)
+            continue
+        # of an export that was made for several controls, the sub-folder of this control
+        place = next((place for place in (given, given / controller) if (place / "manifest.json").is_file()), None)
+        if place is None:
+            message = "is a folder without manifest.json; give the table files, or the folder of an export"
+            raise InputError(message, file=given)
+        path = place / "manifest.json"
+        try:
+            manifest = json.loads(read_bytes(path, MOST_BYTES))
+            made_for, prefix = manifest["controller"], manifest.get("file_prefix", "")
+            names = [(item["name"], item.get("sha256")) for item in manifest["files"]]
+            if not names or not all(isinstance(name, str) and name == Path(name).name for name, _ in names):
+                raise ValueError("no file")
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InputError("is not the manifest of an export", file=path) from error
+        if made_for != controller:
+            message = f"names tables of {one_line(made_for)[:40]}, but {controller} was requested"
+            raise InputError(message, file=path, field="controller")
+        for name, digest in names:
+            table = place / f"{prefix}{name}"
+            if digest != sha256_of(read_bytes(table, MOST_BYTES + 1)):
+                message = f"{table.name} was changed after the export that wrote {path}"
+                warnings.warn(message, CompgenWarning, stacklevel=4)
+        found += [place / f"{prefix}{name}" for name, _ in names]
     return found
-
-
-def _files_of_export(folder: Path, controller: str) -> list[Path]:
-    """The tables of an export; where it was made for several controls, those of its sub-folder of this control."""
-    own = folder / controller
-    place = next((place for place in (folder, own) if (place / "manifest.json").is_file()), None)
-    if place is None:
-        message = "is a folder without manifest.json; give the table files, or the folder of an export"
-        raise InputError(message, file=folder)
-    path = place / "manifest.json"
-    try:
-        manifest = json.loads(read_bytes(path, MOST_BYTES))
-        made_for, prefix = manifest["controller"], manifest.get("file_prefix", "")
-        names = [(item["name"], item.get("sha256")) for item in manifest["files"]]
-        if not names or not all(isinstance(name, str) and name == Path(name).name for name, _ in names):
-            raise ValueError("no file")
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError("is not the manifest of an export", file=path) from error
-    if made_for != controller:
-        message = f"names tables of {one_line(made_for)[:40]}, but {controller} was requested"
-        raise InputError(message, file=path, field="controller")
-    for name, digest in names:
-        table = place / f"{prefix}{name}"
-        if digest != sha256_of(read_bytes(table, MOST_BYTES + 1)):
-            message = f"{table.name} was changed after the export that wrote {path}"
-            warnings.warn(message, CompgenWarning, stacklevel=5)
-    return [place / f"{prefix}{name}" for name, _ in names]
 
 
 #: Every file that this program writes says so in one of its first lines.

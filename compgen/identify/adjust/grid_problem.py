@@ -384,7 +384,17 @@ def moments(grid: LevelGrid, data: ToolData, tip: FloatArray, state: State) -> M
         batch = slice(start, min(start + step, grid.groups))
         sight = tip - state.stations_mm[grid.station_of[batch]][:, None, :, None]
         sight /= lengths_of(sight)[:, :, None, :]
-        products = _outer_products(sight, data.weight[batch], shape)
+        # w u u^T (xx, yy, zz, xy, xz, yz), w u (x, y, z) and w on the grid: (groups, 10, n_out, n_mid, n_in)
+        weight = data.weight[batch]
+        products = np.empty((len(weight), 10, *weight.shape[1:]))
+        products[:, 9] = weight
+        for k in range(3):
+            np.multiply(weight, sight[:, :, k], out=products[:, 6 + k])
+            np.multiply(products[:, 6 + k], sight[:, :, k], out=products[:, k])
+        np.multiply(products[:, 6], sight[:, :, 1], out=products[:, 3])
+        np.multiply(products[:, 6], sight[:, :, 2], out=products[:, 4])
+        np.multiply(products[:, 7], sight[:, :, 2], out=products[:, 5])
+        products = products.reshape(len(weight), 10, *shape)
         weighted += products[:, :6].sum(axis=0) if len(products) > 1 else products[0, :6]
         parts.append(_tables_by_level(grid, products))
     by_level = [np.concatenate(tables) for tables in zip(*parts, strict=True)]
@@ -396,19 +406,6 @@ def moments(grid: LevelGrid, data: ToolData, tip: FloatArray, state: State) -> M
         _contract_first(weighted, out).transpose(1, 0, 2, 3),
     )
     return Moments(by_pair, (by_level[0], by_level[1], by_level[2]))
-
-
-def _outer_products(unit: FloatArray, weight: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Moments w u u^T (xx, yy, zz, xy, xz, yz), w u (x, y, z) and w on the grid: shape (groups, 10, n_out, n_mid, n_in)."""
-    moments = np.empty((len(weight), 10, *weight.shape[1:]))
-    moments[:, 9] = weight
-    for k in range(3):
-        np.multiply(weight, unit[:, :, k], out=moments[:, 6 + k])
-        np.multiply(moments[:, 6 + k], unit[:, :, k], out=moments[:, k])
-    np.multiply(moments[:, 6], unit[:, :, 1], out=moments[:, 3])
-    np.multiply(moments[:, 6], unit[:, :, 2], out=moments[:, 4])
-    np.multiply(moments[:, 7], unit[:, :, 2], out=moments[:, 5])
-    return moments.reshape(len(weight), 10, *shape)
 
 
 def _powers(levels_mm: FloatArray, count: int) -> FloatArray:

@@ -183,11 +183,27 @@ def misfit_of(
     """
     noise_alone = float(chdtri(degrees_of_freedom, FALSE_ALARM)) / degrees_of_freedom
     limit = noise_alone * (ASSUMED_FACTOR**2 if source == "assumed" else 1.0)
-    found = Misfit(reduced_chi_square, degrees_of_freedom, limit, scaled_by, source)
+    misfit = Misfit(reduced_chi_square, degrees_of_freedom, limit, scaled_by, source)
     if not reduced_chi_square > noise_alone:
-        return found
+        return misfit
     readings = series()
-    return replace(found, causes=tuple(_causes(readings)), series=readings)
+    # causes that take away most of the sum of squares, the strongest first
+    whole, count = readings.square_sum(readings.residual_um), len(readings.group)
+    found: dict[str, Cause] = {}
+    for values_um in (readings.residual_um, readings.bare_um):
+        if values_um is None:
+            continue
+        centred_um = readings.without_means(values_um, readings.group)
+        for code, text, parameters, rest_um in _candidates(readings, centred_um):
+            if count < READINGS_PER_PARAMETER * parameters:
+                continue
+            share = 1.0 - readings.square_sum(rest_um) * count / (count - parameters) / max(whole, 1e-30)
+            if share > EXPLAINS and (code not in found or share > found[code].share):
+                found[code] = Cause(code, text, round(share, 4))
+    causes = sorted(found.values(), key=lambda item: -item.share)
+    # a step between runs is a step at one moment, too, and much of a drift: what leaves twice as much is not named
+    named = [item for item in causes if 1.0 - item.share < 2.0 * (1.0 - causes[0].share) + 1e-9]
+    return replace(misfit, causes=tuple(named), series=readings)
 
 
 def warn_of_misfit(reduced_chi_square: float, u_source: str) -> None:
@@ -200,25 +216,6 @@ def warn_of_misfit(reduced_chi_square: float, u_source: str) -> None:
             CompgenWarning,
             stacklevel=4,
         )
-
-
-def _causes(series: ResidualSeries) -> list[Cause]:
-    """Causes that take away most of the sum of squares, the strongest first."""
-    whole, count = series.square_sum(series.residual_um), len(series.group)
-    found: dict[str, Cause] = {}
-    for values_um in (series.residual_um, series.bare_um):
-        if values_um is None:
-            continue
-        centred_um = series.without_means(values_um, series.group)
-        for code, text, parameters, rest_um in _candidates(series, centred_um):
-            if count < READINGS_PER_PARAMETER * parameters:
-                continue
-            share = 1.0 - series.square_sum(rest_um) * count / (count - parameters) / max(whole, 1e-30)
-            if share > EXPLAINS and (code not in found or share > found[code].share):
-                found[code] = Cause(code, text, round(share, 4))
-    causes = sorted(found.values(), key=lambda item: -item.share)
-    # a step between runs is a step at one moment, too, and much of a drift: what leaves twice as much is not named
-    return [item for item in causes if 1.0 - item.share < 2.0 * (1.0 - causes[0].share) + 1e-9]
 
 
 def split_labels(series: ResidualSeries) -> Iterator[tuple[str, str, IntArray]]:
@@ -454,8 +451,21 @@ def check_whiteness(
     stations = _stations(lengths, group, z, used, unknowns)
     far_to_near, distance_message = _distance(z[used], distance_mm[used])
     axes = {name: _axis(lengths, z, used, axis) for axis, name in enumerate(AXES)}
-    messages = [
-        *_station_messages(stations),
+    messages = []
+    for name, item in stations.items():
+        if item.lag_1 > item.limit:
+            messages.append(
+                f"successive residuals of station {name} are alike: autocorrelation {item.lag_1:.2f} (limit "
+                f"{item.limit:.2f}), Durbin-Watson {item.durbin_watson:.2f} where noise has 2; drift, or another effect"
+            )
+        pairs = (_normal_limit(1) / item.limit) ** 2
+        chance = 2.0 * _normal_limit(2 * len(stations)) * np.sqrt(2.0 / pairs)  # of the ratio, with a margin
+        if item.variance_ratio > STATION_RATIO + chance or item.variance_ratio < 1.0 / (STATION_RATIO + chance):
+            messages.append(
+                f"the residuals of station {name} have {item.variance_ratio:.2f} times the variance of all, against the "
+                "stated uncertainty; give it another uncertainty, or look for what disturbs it"
+            )
+    messages += [
         *distance_message,
         *(
             f"the residuals depend on the position of {name}: the means of its levels scatter {ratio:.1f} times as much "
@@ -501,24 +511,6 @@ def _stations(
             durbin_watson=float(changes[k] / pairs[k] / mean),
             variance_ratio=float(mean),
         )
-    return found
-
-
-def _station_messages(stations: Mapping[str, StationWhiteness]) -> list[str]:
-    found = []
-    for name, item in stations.items():
-        if item.lag_1 > item.limit:
-            found.append(
-                f"successive residuals of station {name} are alike: autocorrelation {item.lag_1:.2f} (limit "
-                f"{item.limit:.2f}), Durbin-Watson {item.durbin_watson:.2f} where noise has 2; drift, or another effect"
-            )
-        pairs = (_normal_limit(1) / item.limit) ** 2
-        chance = 2.0 * _normal_limit(2 * len(stations)) * np.sqrt(2.0 / pairs)  # of the ratio, with a margin
-        if item.variance_ratio > STATION_RATIO + chance or item.variance_ratio < 1.0 / (STATION_RATIO + chance):
-            found.append(
-                f"the residuals of station {name} have {item.variance_ratio:.2f} times the variance of all, against the "
-                "stated uncertainty; give it another uncertainty, or look for what disturbs it"
-            )
     return found
 
 

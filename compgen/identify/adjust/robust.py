@@ -124,7 +124,23 @@ def split_at_breaks(
     """
     order = time_order(lengths)
     members = {k: order[group[order] == k] for k in range(int(group.max()) + 1)}
-    series = {k: _without_station(residual_mm[rows], sight[rows]) for k, rows in members.items()}
+    series = {}
+    for k, rows in members.items():
+        series[k] = residual_mm[rows]
+        if len(rows) < 2 * WINDOW:
+            continue
+        # Take a wrong position of the station out, which a beam break leaves behind: differences of successive
+        # residuals show a beam break only once; least absolute deviations against the differences of the lines of
+        # sight therefore give the position's error.
+        change, turn = np.diff(residual_mm[rows]), np.diff(sight[rows], axis=0)
+        weight: FloatArray = np.ones(len(change))
+        moved: FloatArray = np.zeros(3)
+        for _ in range(10):
+            root = np.sqrt(weight)
+            moved = np.asarray(np.linalg.lstsq(turn * root[:, None], change * root, rcond=1e-9)[0], dtype=np.float64)
+            size = np.abs(change - turn @ moved)
+            weight = 1.0 / np.maximum(size, 0.1 * np.median(size) + 1e-12)
+        series[k] = np.asarray(residual_mm[rows] - sight[rows] @ moved)
     steps = _without_common({k: _steps(values) for k, values in series.items()}, members, lengths)
     off = {k: _off_segments(members[k], series[k], found) for k, found in steps.items()}
     largest = max((abs(offset) for found in off.values() for _, offset in found), default=0.0)
@@ -138,25 +154,6 @@ def split_at_breaks(
                 new[rows] = len(offsets)
                 offsets.append(offset)
     return (new, np.array(offsets)) if len(offsets) > len(members) else None
-
-
-def _without_station(residual_mm: FloatArray, sight: FloatArray) -> FloatArray:
-    """Take a wrong position of the station out of a series (n,), which a beam break leaves behind.
-
-    Differences of successive residuals show a beam break only once; least absolute deviations against the
-    differences of the lines of sight (n, 3) therefore give the position's error.
-    """
-    if len(residual_mm) < 2 * WINDOW:
-        return residual_mm
-    change, turn = np.diff(residual_mm), np.diff(sight, axis=0)
-    weight: FloatArray = np.ones(len(change))
-    moved: FloatArray = np.zeros(3)
-    for _ in range(10):
-        root = np.sqrt(weight)
-        moved = np.asarray(np.linalg.lstsq(turn * root[:, None], change * root, rcond=1e-9)[0], dtype=np.float64)
-        size = np.abs(change - turn @ moved)
-        weight = 1.0 / np.maximum(size, 0.1 * np.median(size) + 1e-12)
-    return np.asarray(residual_mm - sight @ moved)
 
 
 def _steps(residual_mm: FloatArray) -> list[int]:
