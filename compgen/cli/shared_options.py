@@ -96,7 +96,7 @@ def mapper(workers: int, cluster: str | None) -> Iterator[Map]:
         yield spread_out
 
 
-# Options that are declared on the fields of a dataclass (compgen/data/declared.py).
+# Options that are declared on the fields of a dataclass (compgen/data/toml_files.py).
 
 
 def options_of(

@@ -4,6 +4,7 @@ import json
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -290,13 +291,24 @@ def _open(connection):
         return False
 
 
-def test_what_the_server_library_says_is_a_line_of_our_log(capsys):
+def test_what_the_server_library_says_is_a_line_of_our_log(capsys, monkeypatch):
     import logging
 
     from compgen.fleet import logs
 
+    class Busy:
+        effective_listen = (("127.0.0.1", 8080),)
+
+        def run(self):
+            logging.getLogger("waitress.queue").warning("Task queue depth is %d", 7)
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(server, "make_server", lambda settings: Busy())
+    monkeypatch.setattr(server.signal, "signal", lambda number, action: None)
     logs.configure("json")
-    server._log_server()
-    logging.getLogger("waitress.queue").warning("Task queue depth is %d", 7)
-    line = json.loads(capsys.readouterr().err)
+    server.run(SimpleNamespace(decide=False))
+    serving, line, stopped = map(json.loads, capsys.readouterr().err.splitlines())
+    assert (serving["event"], stopped["event"]) == ("serving", "stopped serving")
     assert (line["event"], line["problem"], line["level"]) == ("server", "Task queue depth is 7", "warning")
