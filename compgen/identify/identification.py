@@ -102,7 +102,7 @@ class Identification(Drawable):
     errors: ErrorTable
     stations: tuple[StationResult, ...] = ()
     residual_mm: FloatArray
-    accepted: NDArray[np.bool_]
+    accepted: NDArray[np.bool]
     rms_um: float
     degrees_of_freedom: int
     reduced_chi_square: float
