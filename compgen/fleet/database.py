@@ -77,6 +77,11 @@ def _of(table: str, *, optional: bool = False) -> sa.Column[int]:
     return sa.Column(name, sa.Integer, sa.ForeignKey(f"{table}.id"), nullable=optional, index=True)
 
 
+def _contents() -> sa.Column[str]:
+    """The file that a row names, by the SHA-256 of its bytes."""
+    return sa.Column("sha256", sa.String(64), sa.ForeignKey("blobs.sha256"), nullable=False)
+
+
 def _at(name: str = "at") -> sa.Column[datetime]:
     return sa.Column(name, UtcTime, nullable=False)
 
@@ -102,7 +107,7 @@ machine_versions = sa.Table(
     metadata,
     _id(),
     _of("machines"),
-    sa.Column("sha256", sa.String(64), sa.ForeignKey("blobs.sha256"), nullable=False),
+    _contents(),
     _at(),
     sa.UniqueConstraint("machine_id", "sha256"),
 )
@@ -126,7 +131,7 @@ measurement_files = sa.Table(
     _id(),
     _of("measurements"),
     _text("name"),
-    sa.Column("sha256", sa.String(64), sa.ForeignKey("blobs.sha256"), nullable=False),
+    _contents(),
 )
 claims = sa.Table(
     "claims",
@@ -193,7 +198,7 @@ table_files = sa.Table(
     _of("tables"),
     _text("controller"),
     _text("name"),
-    sa.Column("sha256", sa.String(64), sa.ForeignKey("blobs.sha256"), nullable=False),
+    _contents(),
 )
 decisions = sa.Table(
     "decisions",

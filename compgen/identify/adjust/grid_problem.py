@@ -11,7 +11,7 @@ import numpy as np
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import SQUARENESS_NAMES
-from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State
+from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State, TracerUnknowns
 from compgen.kinematics.exact_chain import cross_matrices, level_rotations, passing_order, travel_directions
 from compgen.kinematics.kernel_switch import use_compiled
 
@@ -104,7 +104,7 @@ class ToolData:
 
 
 @dataclass(frozen=True)
-class LevelGrid:
+class LevelGrid(TracerUnknowns):
     """The unknowns and the merged readings on a full grid of levels.
 
     Parameters
@@ -126,21 +126,6 @@ class LevelGrid:
     tools: tuple[ToolData, ...]
     station_of: IntArray
     compiled: bool
-
-    @property
-    def stations(self) -> int:
-        """Number of stations."""
-        return int(self.station_of.max()) + 1
-
-    @property
-    def groups(self) -> int:
-        """Number of dead lengths."""
-        return len(self.station_of)
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.parameters.size + 3 * self.stations + self.groups
 
     @property
     def first_rows(self) -> list[int]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.names import SQUARENESS_NAMES
 from compgen.identify.adjust.grid_problem import ENTRIES, MotionMap, add_own_blocks, lever_directions, motion_map
-from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State
+from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State, TracerUnknowns
 from compgen.kinematics.compiled_kernels import rotation_factors
 from compgen.kinematics.exact_chain import SERIES_BELOW, passing_order, travel_directions
 from compgen.kinematics.kernel_switch import FAST, loop
@@ -269,7 +269,7 @@ class Sums:
 
 
 @dataclass(frozen=True)
-class PathModel:
+class PathModel(TracerUnknowns):
     """The unknowns of a machine with one tool, laid out for the compiled pass; only curves that are linear between nodes.
 
     ``station_of`` (G,) is the station of each dead length.
@@ -279,21 +279,6 @@ class PathModel:
     tool_mm: FloatArray
     station_of: IntArray
     motion: MotionMap
-
-    @property
-    def stations(self) -> int:
-        """Number of stations."""
-        return int(self.station_of.max()) + 1
-
-    @property
-    def groups(self) -> int:
-        """Number of dead lengths."""
-        return len(self.station_of)
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.parameters.size + 3 * self.stations + self.groups
 
     @property
     def nodes_mm(self) -> tuple[FloatArray, FloatArray, FloatArray]:

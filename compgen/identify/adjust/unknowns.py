@@ -151,6 +151,31 @@ def parameters_for_tools(machine: Machine, tool_mm: FloatArray) -> ErrorParamete
 IntArray = NDArray[np.int64]
 
 
+class TracerUnknowns:
+    """Counts of the unknowns of tracer lengths: errors, three coordinates a station, one dead length a group.
+
+    ``station_of`` (G,) is the station of each dead length.
+    """
+
+    parameters: ErrorParameters
+    station_of: IntArray
+
+    @property
+    def stations(self) -> int:
+        """Number of stations."""
+        return int(self.station_of.max()) + 1
+
+    @property
+    def groups(self) -> int:
+        """Number of dead lengths."""
+        return len(self.station_of)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.parameters.size + 3 * self.stations + self.groups
+
+
 @dataclass(frozen=True)
 class State:
     """Current values of the unknowns: errors (size,), stations (S, 3), dead lengths (groups,); mm and rad."""
