@@ -33,6 +33,16 @@ def wait(condition, what):
         time.sleep(0.005)
 
 
+def wait_cycles(count):
+    """Wait for as many servo cycles: on a busy computer the threads of the control may rest for longer than any time."""
+
+    def recorded():
+        return hal.get_value("sampler.0.curr-depth") + hal.get_value("sampler.0.overruns")
+
+    end = recorded() + count
+    wait(lambda: recorded() >= end, f"{count} servo cycles")
+
+
 class Session:
     def __init__(self):
         self.command, self.stat, self.errors = linuxcnc.command(), linuxcnc.stat(), linuxcnc.error_channel()
@@ -72,12 +82,13 @@ class Session:
         """Set a pin, or a signal that nobody writes (its name has no dot)."""
         name, text = name_and_text
         subprocess.run(["halcmd", "setp" if "." in name else "sets", name, text], check=True)
-        time.sleep(0.05)
+        wait_cycles(50)
 
     def rest(self, pin):
-        """Wait until a pin is FALSE and a moment longer."""
+        """Wait until a pin is FALSE, after what came before has reached it, and a moment longer."""
+        wait_cycles(5)
         wait(lambda: not hal.get_value(pin), pin)
-        time.sleep(0.05)
+        wait_cycles(50)
 
     def home(self, joint):
         """Home again, all joints with -1."""
@@ -138,7 +149,7 @@ def run():
     for step in plan["steps"] if result["started"] else ():
         ((kind, given),) = step.items()
         getattr(session, kind)(given)
-    time.sleep(0.05)
+    wait_cycles(50)
     session.polled()
     samples = read_samples(stream)
     result |= {"pins": {name: hal.get_value(name) for name in plan["pins"]}, "messages": session.messages}
