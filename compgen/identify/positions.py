@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,10 +11,10 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import PART, Deviations, aligned, setups_of
-from compgen.data.error_table import hat_matrix
 from compgen.data.machine import Axis, Machine
-from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.identify.adjust.determined import Determined, Observations, least_squares
 from compgen.identify.adjust.problem import SeparationProblem
 from compgen.identify.adjust.propagation import Adjustment
 from compgen.identify.adjust.residual_tests import misfit_of, residual_series
@@ -52,23 +51,10 @@ from compgen.kinematics.kernel_switch import one_thread
 #     d_ij = e_i . (shift_s + turn_s x p_j + scale_s p_j + C(p_j) P)
 #
 # P are the errors of the machine's model, C as in E = C P. The pose (shift, turn) of every set-up is unknown, its scale
-# unknown or given by temperatures. Such data rarely determine the whole model: at one height nothing over Z is seen, without
-# dz no straightness in Z. So directions of the unknowns that no reading shows are found (singular values) and stay zero;
-# errors of which nothing is seen are left out and named. Where only nodes at the ends of a curve see no reading, they are
-# tied to the others by smoothness, and their uncertainty grows as that of an extrapolation.
+# unknown or given by temperatures. Such data rarely determine the whole model (:mod:`compgen.identify.adjust.determined`).
 
 
 IntArray = NDArray[np.int64]
-#: Directions whose singular value is below this share of the largest are not determined; columns have unit length.
-SHOWS, RCOND = 1e-6, 1e-9
-#: Angles are counted in mm at this lever, so that they compare with translations.
-LEVER_MM = 1000.0
-#: Nodes with less than this share of the readings of the median node are tied to their neighbours.
-WEAK = 0.25
-#: An error counts as identified if readings determine this share of its unknowns, or one direction at least.
-SEEN = 1e-6
-#: Curvature of a curve between neighbouring nodes where too few of them are seen to measure it, um and urad.
-USUAL_BEND = 2.0
 
 
 @dataclass(frozen=True)
@@ -148,10 +134,11 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
         machine = _within(machine, deviations.position_mm)
     sigma, source = deviation_sigma(deviations, options)
     readings = _readings(machine, deviations, sigma)
-    free_scale = options.part_scale == "free"
+    layout = error_parameters(machine, modelled_errors(machine))
+    observations = observed_positions(layout, readings, free_scale=options.part_scale == "free")
     solution, accepted = fit_accepted(
-        lambda accepted, _: _solve(machine, readings, accepted, free_scale=free_scale),
-        lambda solution: solution.residual_mm / readings.sigma_mm,
+        lambda accepted, _: least_squares(layout, observations, accepted),
+        lambda solution: solution.residual / readings.sigma_mm,
         len(readings.row),
         "coordinates do not fit the model; check the axis order, signs and units, and which feature is which,",
         reject=options.reject,
@@ -227,230 +214,40 @@ def _readings(machine: Machine, deviations: Deviations, sigma_mm: FloatArray) ->
     )
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """Optimum: unknown errors with a factor F of their covariance (F F^T), poses (set-ups, 7), residuals (all readings, k).
-
-    ``unreached`` are nodes that no reading reaches, by error; ``left_out`` the errors of which nothing is seen; ``partly`` those
-    of which a part is not determined.
-    """
-
-    layout: ErrorParameters
-    unknowns: FloatArray
-    factor: FloatArray
-    poses: FloatArray
-    u_scale: FloatArray
-    residual_mm: FloatArray
-    rank: int
-    condition: float
-    unreached: Mapping[str, FloatArray]
-    left_out: tuple[str, ...]
-    partly: tuple[str, ...]
-
-
-def _solve(
-    machine: Machine,
-    readings: _Readings,
-    accepted: NDArray[np.bool_],
-    *,
-    free_scale: bool,
-    bend: Mapping[str, float] | None = None,
-) -> _Solution:
-    """Least squares in the directions that the readings show; angles only for what translations cannot explain.
-
-    At one height an angle about a horizontal axis is the same as a straightness. The translations and the squareness are
-    therefore taken first, and of the angles what is left of their columns. ``bend`` says how much each curve bends between
-    nodes; without it that is found out first.
-    """
-    names = modelled_errors(machine)
-    layout = error_parameters(machine, names)
-    pose = _pose_columns(readings, free_scale=free_scale)
-    errors = _error_columns(machine, layout, readings)
-    used = accepted / readings.sigma_mm
-    angular, _ = _kinds(layout)
-    shown, _ = _seen_directions(errors * used[:, None], pose * used[:, None], angular)
-    seen = np.einsum("ij,ij->i", shown, shown)  # how much of each unknown is determined, 0 to 1
-    kept = [name for name, columns in _columns_of(layout) if seen[columns].max(initial=0.0) > SEEN]
-    if not kept:
-        raise UndeterminedError("the readings determine none of the machine's errors", [])
-    layout = error_parameters(machine, kept)
-    errors = _error_columns(machine, layout, readings)
-    angular, unit = _kinds(layout)
-    bends, tied = _ties(layout, readings, used, bend)
-    design = np.vstack([errors * used[:, None], bends])
-    frames = np.vstack([pose * used[:, None], np.zeros((len(bends), pose.shape[1]))])
-    shown, rank = _seen_directions(design, frames, angular)
-    whole = np.hstack([design @ shown, frames])
-    target = np.concatenate([readings.deviation_mm * used, np.zeros(len(bends))])
-    scale = np.linalg.norm(whole, axis=0)
-    scale = np.where(scale > 1e-9 * scale.max(), scale, scale.max())  # a column of rounding stays one
-    values = np.linalg.svd(whole / scale, compute_uv=False)
-    inverse = np.linalg.pinv(whole / scale, rcond=RCOND) / scale[:, None]
-    found = inverse @ target
-    unknowns = unit * (shown @ found[: shown.shape[1]])
-    poses = found[shown.shape[1] :]
-    residual = readings.deviation_mm - errors @ (unknowns / unit) - pose @ poses
-    spread = unit[:, None] * shown @ inverse[: shown.shape[1]]
-    size, direction = np.linalg.eigh(spread @ spread.T)
-    factor = direction * np.sqrt(np.maximum(size, 0.0))  # as wide as the unknowns, not as the readings
-    if bend is None and tied:
-        bend = _bends(layout, unknowns, tied)
-        return _solve(machine, readings, accepted, free_scale=free_scale, bend=bend)
-    unreached = {}  # nodes without a reading in the intervals next to them
-    for curve in layout.curves:
-        near = (hat_matrix(curve.nodes_mm, readings.position_mm[accepted, curve.error.axis]) > 1e-6).any(axis=0)
-        if not near.all():
-            unreached[curve.error.name] = curve.nodes_mm[~near]
-    share = np.einsum("ij,ij->i", shown, shown)
-    partly = tuple(name for name, columns in _columns_of(layout) if share[columns].min(initial=1.0) < 1.0 - 1e-4)
-    width = pose.shape[1] // len(np.unique(readings.setup))
-    u_poses = np.linalg.norm(inverse[shown.shape[1] :], axis=1).reshape(-1, width)
-    return _Solution(
-        layout,
-        unknowns,
-        factor,
-        poses.reshape(-1, width),
-        u_poses[:, 6] if free_scale else np.zeros(len(u_poses)),
-        residual,
-        rank,
-        float(values[0] / values[values > RCOND * values[0]][-1]),
-        unreached,
-        left_out=tuple(name for name in names if name not in kept),
-        partly=partly,
-    )
-
-
-def _columns_of(layout: ErrorParameters) -> list[tuple[str, slice]]:
-    first = layout.size - len(layout.squareness)
-    squareness = [(name, slice(first + k, first + k + 1)) for k, name in enumerate(layout.squareness)]
-    return [*((curve.error.name, curve.columns) for curve in layout.curves), *squareness]
-
-
-def _kinds(layout: ErrorParameters) -> tuple[NDArray[np.bool_], FloatArray]:
-    """Which unknowns belong to angular curves, and the unit of each: mm, and for all angles mm at ``LEVER_MM``."""
-    angular, unit = np.zeros(layout.size, dtype=bool), np.ones(layout.size)
-    for name, columns in _columns_of(layout):
-        angular[columns] = error_named(name).kind == "angular"
-        unit[columns] = 1.0 if error_named(name).kind == "linear" else 1.0 / LEVER_MM
-    return angular, unit
-
-
-def _pose_columns(readings: _Readings, *, free_scale: bool) -> FloatArray:
-    """Derivative of the readings by shift, turn and scale of each set-up about its centre, (k, 6 or 7 times set-ups)."""
+def observed_positions(layout: ErrorParameters, readings: _Readings, *, free_scale: bool = False) -> Observations:
+    """The components of positions as readings of the errors, and of shift, turn and scale of each set-up about its centre."""
     unit = np.eye(3)[readings.component]
-    arm = readings.arm_mm
-    turn = np.cross(arm, unit)  # e . (w x p) = w . (p x e)
-    own = [unit, turn, np.einsum("ij,ij->i", unit, arm)[:, None]][: 3 if free_scale else 2]
-    block = np.hstack(own)
+    # e . (w x p) = w . (p x e)
+    own = [unit, np.cross(readings.arm_mm, unit), np.einsum("ij,ij->i", unit, readings.arm_mm)[:, None]]
+    block = np.hstack(own[: 3 if free_scale else 2])
     setups = np.unique(readings.setup)
-    return np.hstack([block * (readings.setup == setup)[:, None] for setup in setups])
-
-
-def _error_columns(machine: Machine, layout: ErrorParameters, readings: _Readings) -> FloatArray:
-    """Derivative of the readings by the unknown errors in the units of :func:`_kinds`, (k, size): rows of C times bases."""
-    columns = c_matrix(machine, readings.position_mm, readings.tool_mm)
+    columns = c_matrix(layout.machine, readings.position_mm, readings.tool_mm)
     design = layout.design(columns, layout.bases(readings.position_mm))
-    return np.asarray(design[np.arange(len(design)), readings.component] * _kinds(layout)[1])
-
-
-def _seen_directions(errors: FloatArray, frames: FloatArray, angular: NDArray[np.bool_]) -> tuple[FloatArray, int]:
-    """Orthonormal directions (size, r) of the unknown errors that the readings tell apart from the poses, and r.
-
-    The angles get what neither poses nor translations explain. Directions without effect stay out: an unknown in them is
-    zero, the smallest value that agrees with the readings.
-    """
-    explained = _range(frames)
-    parts = []
-    for group in (~angular, angular):
-        own = errors[:, group]
-        size = float(np.linalg.norm(own, axis=0).max(initial=0.0))
-        if not size:
-            continue
-        lever = np.maximum(np.linalg.norm(own, axis=0), 1e-9 * size)
-        rest = own / lever
-        rest = rest - explained @ (explained.T @ rest)
-        left, values, right = np.linalg.svd(rest, full_matrices=False)
-        shows = values > SHOWS * max(1.0, float(values[0]))
-        good = right[shows]
-        raw = np.zeros((len(angular), len(good)))
-        raw[np.flatnonzero(group)] = good.T / lever[:, None]
-        parts.append(np.linalg.qr(raw)[0] if len(good) else raw)
-        explained = np.hstack([explained, left[:, shows]])
-    shown = np.hstack(parts) if parts else np.zeros((len(angular), 0))
-    return shown, shown.shape[1]
-
-
-def _range(matrix: FloatArray) -> FloatArray:
-    """Orthonormal basis of the columns, (rows, rank); columns of very different size count alike."""
-    size = np.linalg.norm(matrix, axis=0)
-    matrix = matrix[:, size > 0] / size[size > 0]
-    left, values, _ = np.linalg.svd(matrix, full_matrices=False)
-    return np.asarray(left[:, values > 1e-9 * max(1.0, float(values.max(initial=0.0)))])
-
-
-def _bends(layout: ErrorParameters, unknowns: FloatArray, tied: Mapping[str, FloatArray]) -> dict[str, float]:
-    """Second difference of the tied curves between nodes that readings show, rms, mm and rad; at least what is usual."""
-    found = {}
-    for curve in layout.curves:
-        if curve.error.name in tied:
-            unit = MM_PER_UM if curve.error.kind == "linear" else RAD_PER_URAD
-            bends = np.diff(curve.free @ unknowns[curve.columns], 2)
-            alone = set(tied[curve.error.name].tolist())
-            size = [
-                abs(bend)
-                for k, bend in enumerate(bends.tolist())
-                if not alone & set(curve.nodes_mm[k : k + 3].tolist())
-            ]
-            found[curve.error.name] = max(USUAL_BEND * unit, float(np.sqrt(np.mean(np.square(size)))) if size else 0.0)
-    return found
-
-
-def _ties(
-    layout: ErrorParameters, readings: _Readings, used: FloatArray, bend: Mapping[str, float] | None
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Rows that tie nodes with few readings or none to their neighbours by small second differences; those nodes by error.
-
-    A round plate hardly reaches the ends of the travel: without a tie the noise of a few holes there would turn the whole
-    curve, since a straightness is zero at both ends.
-    """
-    rows, tied = [], {}
-    for curve in layout.curves:
-        along = readings.position_mm[used > 0, curve.error.axis]
-        weight = (layout.basis(curve.error.axis, along) ** 2).sum(axis=0)
-        shown: NDArray[np.bool_] = weight > WEAK * np.median(weight)
-        if shown.all():
-            continue
-        near = (hat_matrix(curve.nodes_mm, along) ** 2).sum(axis=0)
-        tied[curve.error.name] = curve.nodes_mm[near <= WEAK * np.median(near)]
-        unit = MM_PER_UM if curve.error.kind == "linear" else RAD_PER_URAD
-        for k in range(1, len(shown) - 1):
-            if not shown[k - 1 : k + 2].all():
-                second = np.zeros(len(shown))
-                second[k - 1 : k + 2] = [1.0, -2.0, 1.0]
-                row = np.zeros(layout.size)
-                allowed = (bend or {}).get(curve.error.name, USUAL_BEND * unit)
-                row[curve.columns] = second @ curve.free / allowed * _kinds(layout)[1][curve.columns]
-                rows.append(row)
-    return (np.array(rows) if rows else np.zeros((0, layout.size))), tied
+    return Observations(
+        design=np.asarray(design[np.arange(len(design)), readings.component]),
+        others=np.hstack([block * (readings.setup == setup)[:, None] for setup in setups]),
+        value=readings.deviation_mm,
+        sigma=readings.sigma_mm,
+        at_mm=readings.position_mm,
+        shows=np.ones((len(design), len(layout.curves)), dtype=bool),
+    )
 
 
 def _free_pose_result(
     machine: Machine,
     deviations: Deviations,
     readings: _Readings,
-    solution: _Solution,
+    solution: Determined,
     accepted: NDArray[np.bool_],
     source: str,
 ) -> Identification:
-    layout = solution.layout
-    columns = _pose_columns(readings, free_scale=solution.poses.shape[1] == 7)
-    freedom = int(np.count_nonzero(accepted)) - solution.rank - _range(columns).shape[1]
+    layout, freedom = solution.layout, solution.freedom
     used = readings.kept(accepted)
     if freedom < 1:
         raise UndeterminedError(
             f"{np.count_nonzero(accepted)} coordinates for {solution.rank} unknowns and the poses", []
         )
-    standard = (solution.residual_mm / readings.sigma_mm)[accepted]
+    standard = (solution.residual / readings.sigma_mm)[accepted]
     chi_square = float(standard @ standard) / freedom
     u_scale = uncertainty_scale(chi_square, source)
     values, rows = [], {}  # the factor of the covariance of the values goes in the order of the errors file
@@ -463,9 +260,9 @@ def _free_pose_result(
     poses = _poses(deviations, readings, solution, u_scale)
     return Identification(
         errors=errors,
-        residual_mm=-solution.residual_mm,
+        residual_mm=-solution.residual,
         accepted=accepted,
-        rms_um=float(np.sqrt(np.mean(solution.residual_mm[accepted] ** 2))) / MM_PER_UM,
+        rms_um=float(np.sqrt(np.mean(solution.residual[accepted] ** 2))) / MM_PER_UM,
         degrees_of_freedom=freedom,
         reduced_chi_square=chi_square,
         u_source=source,
@@ -479,7 +276,7 @@ def _free_pose_result(
             ]
         ),
         rejected=rejected_components(
-            deviations, readings.row, readings.component, -solution.residual_mm, readings.sigma_mm, accepted
+            deviations, readings.row, readings.component, -solution.residual, readings.sigma_mm, accepted
         ),
         rank=solution.rank,
         unknowns=solution.rank,
@@ -501,9 +298,7 @@ def _free_pose_result(
             freedom,
             u_scale,
             source,
-            lambda: residual_series(
-                deviations, used.row, solution.residual_mm[accepted], used.sigma_mm, used.component
-            ),
+            lambda: residual_series(deviations, used.row, solution.residual[accepted], used.sigma_mm, used.component),
         ),
     )
 
@@ -511,18 +306,20 @@ def _free_pose_result(
 def _poses(
     deviations: Deviations,
     readings: _Readings,
-    solution: _Solution,
+    solution: Determined,
     u_scale: float,
 ) -> list[FramePose]:
     """The pose of each set-up: the rotation that was taken out first, and the small one that was adjusted."""
     from scipy.spatial.transform import Rotation  # imported here: slow to load, and few measurements need it
 
     setups, found = setups_of(deviations), []
+    poses = solution.others.reshape(len(np.unique(setups)), -1)
+    u_poses = solution.u_others.reshape(poses.shape)
     for k, setup in enumerate(np.unique(setups).tolist()):
         own = setups == setup
         components = np.isfinite(deviations.deviation_mm[own]).any(axis=0)
-        shift, small = solution.poses[k][:3], solution.poses[k][3:6]
-        scale = 1.0 + (solution.poses[k][6] if solution.poses.shape[1] == 7 else 0.0)
+        shift, small, stretch = poses[k][:3], poses[k][3:6], poses[k][6:].sum()  # the scale where it was free
+        scale = 1.0 + stretch
         rough = deviations.poses[setup]
         turn = Rotation.from_matrix(rough.rotation) * Rotation.from_rotvec(small)
         offset = rough.measured_mm + rough.rotation @ shift - scale * turn.apply(rough.nominal_mm)
@@ -533,7 +330,7 @@ def _poses(
                 np.where(components, offset, np.nan),
                 np.where(turning, turn.as_rotvec(), np.nan),
                 float(scale),
-                float(solution.u_scale[k] * u_scale),
+                float(u_poses[k][6:].sum() * u_scale),
                 int(np.count_nonzero(readings.setup == setup)),
             )
         )

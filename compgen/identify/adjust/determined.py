@@ -1,0 +1,276 @@
+"""Readings that are linear in the errors of a machine: least squares in what they determine, and no more.
+
+Readings along single axes, circles, plates of unknown pose, or a mixture of them rarely determine the whole model: at one
+height nothing over Z is seen, without dz no straightness in Z. So directions of the unknowns that no reading shows are found
+(singular values) and stay zero; errors of which nothing is seen are left out and named. Where only nodes at the ends of a
+curve see no reading, they are tied to the others by smoothness, and their uncertainty grows as that of an extrapolation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import hat_matrix
+from compgen.data.names import MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.errors import UndeterminedError
+from compgen.identify.adjust.unknowns import CurveParameters, ErrorParameters, error_parameters
+
+#: Directions whose singular value is below this share of the largest are not determined; columns have unit length.
+SHOWS, RCOND = 1e-6, 1e-9
+#: Angles are counted in mm at this lever, so that they compare with translations.
+LEVER_MM = 1000.0
+#: Nodes with less than this share of the readings of the median node are tied to their neighbours.
+WEAK = 0.25
+#: An error counts as identified if readings determine this share of its unknowns, or one direction at least.
+SEEN = 1e-6
+#: A part of an error is not determined if the readings show less than this share of one of its unknowns.
+WHOLLY = 1.0 - 1e-4
+#: Curvature of a curve between neighbouring nodes where too few of them are seen to measure it, um and urad.
+USUAL_BEND = 2.0
+
+
+@dataclass(frozen=True)
+class Observations:
+    """k readings: value = ``design`` times the unknown errors + ``others`` times unknowns of their own + noise.
+
+    Parameters
+    ----------
+    design : (k, size of the layout), per mm and rad of the unknown errors.
+    others : (k, q), per unit of what else is unknown: the pose of a plate, where a laser was set to zero.
+    value, sigma : (k,), in any unit that both share.
+    at_mm : position of each axis, (k, 3), or nan where the reading says nothing about the errors of that axis.
+    shows : which curves of the layout a reading is about, (k, curves).
+    """
+
+    design: FloatArray
+    others: FloatArray
+    value: FloatArray
+    sigma: FloatArray
+    at_mm: FloatArray
+    shows: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.value)
+
+
+def stacked(parts: Sequence[Observations]) -> Observations:
+    """Return several sets of readings as one; each keeps its own other unknowns."""
+    widths = np.cumsum([0, *(part.others.shape[1] for part in parts)])
+    others = [np.pad(part.others, ((0, 0), (widths[k], widths[-1] - widths[k + 1]))) for k, part in enumerate(parts)]
+    return Observations(
+        np.vstack([part.design for part in parts]),
+        np.vstack(others),
+        np.concatenate([part.value for part in parts]),
+        np.concatenate([part.sigma for part in parts]),
+        np.vstack([part.at_mm for part in parts]),
+        np.vstack([part.shows for part in parts]),
+    )
+
+
+@dataclass(frozen=True)
+class Determined:
+    """Optimum: unknown errors with a factor F of their covariance (F F^T), the other unknowns, residuals (all readings).
+
+    ``unreached`` are nodes that no reading reaches, by error; ``left_out`` the errors of which nothing is seen; ``partly`` those
+    of which a part is not determined. ``freedom`` is readings minus what they determine, poses and the like included.
+    """
+
+    layout: ErrorParameters
+    unknowns: FloatArray
+    factor: FloatArray
+    others: FloatArray
+    u_others: FloatArray
+    residual: FloatArray
+    rank: int
+    freedom: int
+    condition: float
+    partly: tuple[str, ...]
+    unreached: Mapping[str, FloatArray] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+
+
+def least_squares(layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_]) -> Determined:
+    """Adjust the errors of a layout and the other unknowns to the accepted readings, (k,).
+
+    Raises
+    ------
+    UndeterminedError
+        where no error at all is determined.
+    """
+    names = [name for name, _ in columns_of(layout)]
+    angular, unit = _kinds(layout)
+    used = (accepted / observations.sigma)[:, None]
+    shown, _ = _seen_directions(observations.design * unit * used, observations.others * used, angular)
+    seen = np.einsum("ij,ij->i", shown, shown)  # how much of each unknown is determined, 0 to 1
+    kept = [name for name, columns in columns_of(layout) if seen[columns].max(initial=0.0) > SEEN]
+    if not kept:
+        raise UndeterminedError("the readings determine none of the machine's errors", [])
+    smaller = error_parameters(layout.machine, kept)
+    columns = np.concatenate([np.arange(span.start, span.stop) for name, span in columns_of(layout) if name in kept])
+    curves = [curve.error.name in kept for curve in layout.curves]
+    observations = replace(observations, design=observations.design[:, columns], shows=observations.shows[:, curves])
+    unreached, tied = _far_nodes(smaller, observations, accepted)
+    found = _optimum(smaller, observations, accepted, _ties(smaller, tied, {}))
+    if tied:  # once more, with the bend that the curves have where they are seen
+        found = _optimum(smaller, observations, accepted, _ties(smaller, tied, _bends(smaller, found.unknowns, tied)))
+    return replace(found, unreached=unreached, left_out=tuple(name for name in names if name not in kept))
+
+
+def _optimum(
+    layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_], bends: FloatArray
+) -> Determined:
+    """Least squares in the directions that the readings show; angles only for what translations cannot explain.
+
+    At one height an angle about a horizontal axis is the same as a straightness. The translations and the squareness are
+    therefore taken first, and of the angles what is left of their columns. ``bends`` are rows that tie nodes to others.
+    """
+    angular, unit = _kinds(layout)
+    used = (accepted / observations.sigma)[:, None]
+    errors, others = observations.design * unit, observations.others
+    design = np.vstack([errors * used, bends * unit])
+    frames = np.vstack([others * used, np.zeros((len(bends), others.shape[1]))])
+    shown, rank = _seen_directions(design, frames, angular)
+    whole = np.hstack([design @ shown, frames])
+    target = np.concatenate([observations.value * used[:, 0], np.zeros(len(bends))])
+    scale = np.linalg.norm(whole, axis=0)
+    scale = np.where(scale > 1e-9 * scale.max(), scale, scale.max())  # a column of rounding stays one
+    values = np.linalg.svd(whole / scale, compute_uv=False)
+    inverse = np.linalg.pinv(whole / scale, rcond=RCOND) / scale[:, None]
+    found = inverse @ target
+    seen, beside = found[: shown.shape[1]], found[shown.shape[1] :]
+    spread = unit[:, None] * shown @ inverse[: shown.shape[1]]
+    size, direction = np.linalg.eigh(spread @ spread.T)
+    share = np.einsum("ij,ij->i", shown, shown)
+    return Determined(
+        layout,
+        unknowns=unit * (shown @ seen),
+        factor=direction * np.sqrt(np.maximum(size, 0.0)),  # as wide as the unknowns, not as the readings
+        others=beside,
+        u_others=np.linalg.norm(inverse[shown.shape[1] :], axis=1),
+        residual=observations.value - errors @ (shown @ seen) - others @ beside,
+        rank=rank,
+        freedom=int(np.count_nonzero(accepted)) - rank - _range(others).shape[1],
+        condition=float(values[0] / values[values > RCOND * values[0]][-1]),
+        partly=tuple(name for name, columns in columns_of(layout) if share[columns].min(initial=1.0) < WHOLLY),
+    )
+
+
+def columns_of(layout: ErrorParameters) -> list[tuple[str, slice]]:
+    """Name and columns of every unknown error."""
+    first = layout.size - len(layout.squareness)
+    squareness = [(name, slice(first + k, first + k + 1)) for k, name in enumerate(layout.squareness)]
+    return [*((curve.error.name, curve.columns) for curve in layout.curves), *squareness]
+
+
+def _kinds(layout: ErrorParameters) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Which unknowns belong to angular curves, and the unit of each: mm, and for all angles mm at ``LEVER_MM``."""
+    angular, unit = np.zeros(layout.size, dtype=bool), np.ones(layout.size)
+    for name, columns in columns_of(layout):
+        angular[columns] = error_named(name).kind == "angular"
+        unit[columns] = 1.0 if error_named(name).kind == "linear" else 1.0 / LEVER_MM
+    return angular, unit
+
+
+def _seen_directions(errors: FloatArray, frames: FloatArray, angular: NDArray[np.bool_]) -> tuple[FloatArray, int]:
+    """Orthonormal directions (size, r) of the unknown errors that the readings tell apart from the poses, and r.
+
+    The angles get what neither poses nor translations explain. Directions without effect stay out: an unknown in them is
+    zero, the smallest value that agrees with the readings.
+    """
+    explained = _range(frames)
+    parts = []
+    for group in (~angular, angular):
+        own = errors[:, group]
+        size = float(np.linalg.norm(own, axis=0).max(initial=0.0))
+        if not size:
+            continue
+        lever = np.maximum(np.linalg.norm(own, axis=0), 1e-9 * size)
+        rest = own / lever
+        rest = rest - explained @ (explained.T @ rest)
+        left, values, right = np.linalg.svd(rest, full_matrices=False)
+        shows = values > SHOWS * max(1.0, float(values[0]))
+        good = right[shows]
+        raw = np.zeros((len(angular), len(good)))
+        raw[np.flatnonzero(group)] = good.T / lever[:, None]
+        parts.append(np.linalg.qr(raw)[0] if len(good) else raw)
+        explained = np.hstack([explained, left[:, shows]])
+    shown = np.hstack(parts) if parts else np.zeros((len(angular), 0))
+    return shown, shown.shape[1]
+
+
+def _range(matrix: FloatArray) -> FloatArray:
+    """Orthonormal basis of the columns, (rows, rank); columns of very different size count alike."""
+    size = np.linalg.norm(matrix, axis=0)
+    matrix = matrix[:, size > 0] / size[size > 0]
+    left, values, _ = np.linalg.svd(matrix, full_matrices=False)
+    return np.asarray(left[:, values > 1e-9 * max(1.0, float(values.max(initial=0.0)))])
+
+
+@dataclass(frozen=True)
+class _Tied:
+    """Nodes of a curve that are tied to others, and the first nodes of the triples whose second difference does so."""
+
+    nodes_mm: FloatArray
+    triples: tuple[int, ...]
+
+
+def _far_nodes(
+    layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_]
+) -> tuple[dict[str, FloatArray], dict[str, _Tied]]:
+    """Nodes without a reading in the intervals next to them, and nodes with few readings or none; both by error.
+
+    A round plate hardly reaches the ends of the travel: without a tie the noise of a few holes there would turn the whole
+    curve, since a straightness is zero at both ends.
+    """
+    unreached, tied = {}, {}
+    for number, curve in enumerate(layout.curves):
+        along = observations.at_mm[accepted & observations.shows[:, number], curve.error.axis]
+        along = along[np.isfinite(along)]
+        hats = hat_matrix(curve.nodes_mm, along)
+        near: NDArray[np.bool_] = (hats > 1e-6).any(axis=0)
+        if not near.all():
+            unreached[curve.error.name] = curve.nodes_mm[~near]
+        weight = (layout.basis(curve.error.axis, along) ** 2).sum(axis=0)
+        shown: NDArray[np.bool_] = weight > WEAK * np.median(weight)
+        if not shown.all():
+            counts = (hats**2).sum(axis=0)
+            nodes = curve.nodes_mm[counts <= WEAK * np.median(counts)]
+            triples = tuple(k for k in range(len(shown) - 2) if not shown[k : k + 3].all())
+            tied[curve.error.name] = _Tied(nodes, triples)
+    return unreached, tied
+
+
+def _bends(layout: ErrorParameters, unknowns: FloatArray, tied: Mapping[str, _Tied]) -> dict[str, float]:
+    """Second difference of the tied curves between nodes that readings show, rms, mm and rad; at least what is usual."""
+    found = {}
+    for curve in layout.curves:
+        if curve.error.name in tied:
+            alone = set(tied[curve.error.name].nodes_mm.tolist())
+            bends = np.diff(curve.free @ unknowns[curve.columns], 2).tolist()
+            size = [bend for k, bend in enumerate(bends) if not alone & set(curve.nodes_mm[k : k + 3].tolist())]
+            measured = float(np.sqrt(np.mean(np.square(size)))) if size else 0.0
+            found[curve.error.name] = max(_usual_bend(curve), measured)
+    return found
+
+
+def _usual_bend(curve: CurveParameters) -> float:
+    return USUAL_BEND * (MM_PER_UM if curve.error.kind == "linear" else RAD_PER_URAD)
+
+
+def _ties(layout: ErrorParameters, tied: Mapping[str, _Tied], bend: Mapping[str, float]) -> FloatArray:
+    """Rows (ties, size) that tie nodes to their neighbours by small second differences, in units of the bend."""
+    rows = []
+    for curve in layout.curves:
+        for k in tied[curve.error.name].triples if curve.error.name in tied else ():
+            second = np.zeros(curve.free.shape[0])
+            second[k : k + 3] = [1.0, -2.0, 1.0]
+            row = np.zeros(layout.size)
+            row[curve.columns] = second @ curve.free / bend.get(curve.error.name, _usual_bend(curve))
+            rows.append(row)
+    return np.array(rows) if rows else np.zeros((0, layout.size))
