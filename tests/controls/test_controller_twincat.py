@@ -325,7 +325,8 @@ def test_damaged_text_is_read_or_refused(place, piece):
             (-30.00004, 50.00004),
             (-300001, 500001),
         ),  # ends move outwards, so that they are covered
-        ((-30.00004, 50.00004), (-10.00004, 20.00004), (-100000, 200000)),  # nodes within are rounded
+        ((-30.00004, 50.00004), (-30.00004, 0.0, 50.00004), (-300001, 0, 500001)),
+        ((-30.00004, 50.00004), (-10.00004, 0.0, 20.00004), (-100000, 0, 200000)),  # nodes within are rounded
     ],
 )
 def test_nodes_in_whole_units_still_cover_the_travel(travel_mm, at_mm, units):
@@ -334,6 +335,24 @@ def test_nodes_in_whole_units_still_cover_the_travel(travel_mm, at_mm, units):
     assert units_outwards(machine, 0, np.array(at_mm)).tolist() == list(units)
 
 
-def test_a_plane_of_one_row_holds_its_value_along_the_second_master():
-    plane = PlaneTable((0, 1), (0.0, 0.0), 10.0, np.array([[4.0, 8.0]]))
-    assert plane.at(np.array([0.0, 5.0, 10.0]), np.array([-3.0, 0.0, 99.0])) == pytest.approx([4.0, 6.0, 8.0])
+@pytest.mark.parametrize(
+    ("low_mm", "high_mm", "first", "last"),
+    [(-30.0, 50.0, -300_000, 500_000), (-30.00004, 50.0, -300_001, 500_000), (-30.0, 50.00004, -300_000, 500_001)],
+)
+def test_an_equidistant_table_covers_the_travel_with_no_node_to_spare(low_mm, high_mm, first, last):
+    """Whole units of 0.1 um by hand; the last node may lie up to a unit for each interval beyond the travel."""
+    axes = (Axis((low_mm, high_mm), np.linspace(low_mm, high_mm, 5)), *PLAIN.axes[1:])
+    machine = replace(PLAIN, axes=axes, reference_point_mm=(10.0, 20.0, -30.0))
+    screw = made(machine, compgen.ErrorTable({}, {"EC0Y": (0.0, np.nan)}))[1].lists[0].screw
+    intervals = len(screw.setpoints) - 1
+    assert np.diff(screw.setpoints).tolist() == [screw.interval] * intervals
+    assert screw.setpoints[0] == first
+    assert last <= screw.setpoints[-1] <= last + intervals
+
+
+def test_a_plane_of_one_row_or_one_column_holds_its_value_along_the_other_master():
+    row = PlaneTable((0, 1), (0.0, 0.0), 10.0, np.array([[4.0, 8.0]]))
+    column = PlaneTable((0, 1), (0.0, 0.0), 10.0, np.array([[4.0], [8.0]]))
+    along, across = np.array([0.0, 5.0, 10.0]), np.array([-3.0, 0.0, 99.0])
+    assert row.at(along, across) == pytest.approx([4.0, 6.0, 8.0])
+    assert column.at(across, along) == pytest.approx([4.0, 6.0, 8.0])
