@@ -605,6 +605,58 @@ def test_switch_and_weight_of_a_table_count(switch, moved):
     assert control(machine, settings).violations(tables) == []
 
 
+@pytest.mark.parametrize(
+    ("mode", "text", "doubled"),
+    [
+        # what the mode leaves of 0.2 mm times 0.3 mm beside the product
+        ("S1", constant(0, "0.2", 2) + constant(1, "0.3"), "with up to 500.000 um, in the CEC tables [0, 1]"),
+        ("S2", constant(0, "0.2", 2) + constant(1, "0.3"), ""),
+        ("S3", constant(0, "0.2", 2) + constant(1, "0.3"), "with up to 200.000 um, in the CEC tables [0]"),
+        ("S4", constant(0, "0.2", 2) + constant(1, "0.3"), "with up to 300.000 um, in the CEC tables [1]"),
+        # the mean of both directions
+        (
+            "S1",
+            constant(0, "0.2") + constant(1, "0.3", direction=-1),
+            "with up to 350.000 um, in the CEC tables [0, 1]",
+        ),
+        ("S1", constant(0, "0.3", direction=1) + constant(1, "-0.3", direction=-1), ""),
+    ],
+)
+def test_positioning_in_both_kinds_of_tables_is_what_the_mode_leaves_of_it(mode, text, doubled):
+    machine = machine_with(own={"siemens-cec-eec": {"sign": "error", "mult_mode": mode}})
+    files = {
+        "NC_CEC.INI": text + "M17\n",
+        "AX_EEC.INI": export(machine, errors_of(machine), "siemens-eec").files["AX_EEC.INI"],
+    }
+    control, settings, tables = parsed(machine, "siemens-cec-eec", files)
+    found = [item for item in control(machine, settings).violations(tables) if "corrected twice" in item]
+    assert len(found) == bool(doubled)
+    assert all("the positioning of AX1 is in its encoder table and, " + doubled in item for item in found)
+
+
+def test_a_switch_or_a_step_is_no_table():
+    """Both kinds must be there with their numbers, also where an archive names something of the missing kind."""
+    machine = machine_with(own={"siemens-cec-eec": {"sign": "error"}})
+    made = export(machine, errors_of(machine), "siemens-cec-eec").files
+    control = controller_named("siemens-cec-eec")
+    of_control = control(machine, control.read_settings(machine))
+    for file, other, missing in (
+        ("AX_EEC.INI", "$SN_CEC_TABLE_ENABLE[0]=1", "cross"),
+        ("NC_CEC.INI", "$AA_ENC_COMP_STEP[0,AX1]=1.0", "encoder"),
+    ):
+        with pytest.raises(
+            InputError, match=f"other: the files hold no {missing} tables .* give both AX_EEC and NC_CEC"
+        ):
+            parsed(machine, "siemens-cec-eec", {file: made[file], "other": f"{other}\nM17\n"})
+        with pytest.raises(
+            InputError, match=f"{file}: the files hold no {missing} tables .* give all that the control"
+        ):
+            of_control.parse_foreign([SourceFile(Path(file), made[file])])
+        both = [SourceFile(Path(file), made[file]), SourceFile(Path("other"), f"{other}\nM17\n")]
+        with pytest.raises(InputError, match=f"other: the files hold no {missing} tables .* give all that the control"):
+            of_control.parse_foreign(both)
+
+
 @pytest.mark.parametrize("switch", ["$SN_CEC_TABLE_ENABLE[1]=0", "$SN_CEC_TABLE_WEIGHT[0]=2.0"])
 def test_a_factor_that_is_switched_off_or_weighted_is_a_violation(switch):
     machine = machine_with()
