@@ -21,15 +21,13 @@ from compgen.data.deviations import Deviations, join_deviations, read_deviations
 from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.lengths import Lengths, join_lengths, read_lengths
 from compgen.data.machine import Machine
-from compgen.data.names import ERROR_NAMES
 from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions, fit
 from compgen.foreign.detect import import_file
 from compgen.foreign.findings import Imported, ImportOptions
 from compgen.foreign.laser_files import Capture
 from compgen.identify import Identification
-from compgen.identify.adjust.unknowns import error_parameters
-from compgen.identify.identification import metadata_of, worst_uncertainty
+from compgen.identify.identification import metadata_of, without_adjustment
 from compgen.identify.single_axes import positioning_errors
 from compgen.instruments.sixdof_readings import read_sixdof
 
@@ -155,24 +153,13 @@ def given_errors(machine: Machine, table: ErrorTable) -> Identification:
     errors = zeroed.errors.replace(
         metadata={**metadata_of(machine, table.metadata), "source": "given by another program"}
     )
-    missing = [name for name in ERROR_NAMES if name not in errors.names]
     values = sum(len(curve.value) for curve in errors.curves.values()) + len(errors.squareness)
     known = bool(errors.curves) and all(np.isfinite(curve.u).all() for curve in errors.curves.values())
-    return Identification(
-        errors=errors,
-        residual_mm=np.zeros(values),
-        accepted=np.ones(values, dtype=bool),
-        rms_um=0.0,
-        degrees_of_freedom=0,
-        reduced_chi_square=1.0,
-        u_source="given" if known else "unknown",
-        u_length_um=0.0,
-        unobservable=tuple(f"{name}: not in the file" for name in missing),
+    return replace(
+        without_adjustment(machine, errors, np.zeros(values), "given" if known else "unknown", "not in the file"),
         rank=values,
         unknowns=values,
         iterations=0,
-        worst_u=worst_uncertainty(errors) if known else {},
-        layout=error_parameters(machine, errors.names),
         method="given",
         details={
             "file": table.metadata.get("source", ""),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -15,10 +15,11 @@ from compgen.data.display import Drawable, Overview, Panel, PlottedLine
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES
+from compgen.errors import UndeterminedError
 from compgen.identify.adjust.propagation import Adjustment, Systematic
-from compgen.identify.adjust.residual_tests import Misfit, Whiteness, warn_of_residuals
+from compgen.identify.adjust.residual_tests import Misfit, ResidualSeries, Whiteness, misfit_of, warn_of_residuals
 from compgen.identify.adjust.robust import Rejected, Segment
-from compgen.identify.adjust.unknowns import ErrorParameters
+from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
 from compgen.identify.reversal_errors import Reversal
 from compgen.kinematics.first_order import observable_errors
 
@@ -254,6 +255,166 @@ def worst_uncertainty(errors: ErrorTable) -> dict[str, tuple[float, str]]:
         if u * 1e6 > worst["urad"][0]:
             worst["urad"] = (u * 1e6, name)
     return worst
+
+
+# What the methods of identification share: from residuals to a result, with or without an adjustment.
+
+
+@dataclass(frozen=True)
+class AdjustedReadings:
+    """Readings at the optimum of an adjustment, n of them, and what their residuals say about all uncertainties.
+
+    Parameters
+    ----------
+    residual_mm, sigma_mm : model minus reading, and the standard uncertainty of the reading, (n,).
+    accepted : which readings were used, (n,).
+    u_source : "stated" or "assumed".
+    unknowns, degrees_of_freedom : of the adjustment.
+    known_square_sum : weighted sum of squares of what was known of the unknowns beforehand.
+    too_few : message with the numbers of readings and unknowns where no degree of freedom is left.
+
+    Raises
+    ------
+    UndeterminedError
+        without a degree of freedom.
+    """
+
+    residual_mm: FloatArray
+    sigma_mm: FloatArray
+    accepted: NDArray[np.bool_]
+    u_source: str
+    unknowns: int
+    degrees_of_freedom: int
+    known_square_sum: float = 0.0
+    too_few: str = "{} readings for {} unknowns"
+
+    def __post_init__(self) -> None:
+        """Check that the readings are more than the unknowns."""
+        if self.degrees_of_freedom < 1:
+            raise UndeterminedError(self.too_few.format(np.count_nonzero(self.accepted), self.unknowns), [])
+
+    @cached_property
+    def reduced_chi_square(self) -> float:
+        """Weighted sum of squares of the residuals over the degrees of freedom."""
+        standardised = self.used(self.residual_mm) / self.used(self.sigma_mm)
+        return (float(standardised @ standardised) + self.known_square_sum) / self.degrees_of_freedom
+
+    @property
+    def u_scale(self) -> float:
+        """Factor of all standard uncertainties: an assumed one follows the residuals, a stated one only where they exceed it."""
+        return uncertainty_scale(self.reduced_chi_square, self.u_source)
+
+    def used(self, values: FloatArray) -> FloatArray:
+        """Values (n,) of the readings that were used; no copy where all of them were."""
+        return values if self.accepted.all() else values[self.accepted]
+
+    def identification(
+        self,
+        errors: ErrorTable,
+        layout: ErrorParameters,
+        metadata: Mapping[str, str],
+        u_length_um: float,
+    ) -> Identification:
+        """Return the result with what every adjustment says; ``metadata`` is that of the measurement."""
+        used_mm = self.used(self.residual_mm)
+        return Identification(
+            errors=errors.replace(metadata=metadata_of(layout.machine, metadata)),
+            residual_mm=self.residual_mm,
+            accepted=self.accepted,
+            rms_um=float(np.sqrt(used_mm @ used_mm / len(used_mm))) / MM_PER_UM,
+            degrees_of_freedom=self.degrees_of_freedom,
+            reduced_chi_square=self.reduced_chi_square,
+            u_source=self.u_source,
+            u_length_um=u_length_um,
+            u_scale=self.u_scale,
+            unobservable=unobservable(layout),
+            rank=self.unknowns,
+            unknowns=self.unknowns,
+            worst_u=worst_uncertainty(errors),
+            layout=layout,
+        )
+
+
+def station_results(
+    names: Sequence[str],
+    of_group: Sequence[tuple[int, int]],
+    adjustment: Adjustment,
+    errors: int,
+    used: NDArray[Any],
+    square_sum: NDArray[Any],
+) -> tuple[StationResult, ...]:
+    """Return position and dead length of every station and set-up, with standard uncertainties.
+
+    Parameters
+    ----------
+    names : of the stations.
+    of_group : index of the station, and the set-up, of each dead length.
+    adjustment, errors : the optimum, and how many of its unknowns are errors; stations and dead lengths follow them.
+    used, square_sum : readings of each dead length that were used, and the sum of their squared residuals, mm^2, (G,).
+    """
+    state, factor = adjustment.state, adjustment.covariance_factor()
+    u = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    u_stations_mm = u[errors : errors + state.stations_mm.size].reshape(-1, 3)
+    u_dead_length_mm = u[errors + state.stations_mm.size :]
+    results: list[StationResult] = []
+    for group, (k, setup) in enumerate(of_group):
+        x, y, z = state.stations_mm[k].tolist()
+        u_x, u_y, u_z = u_stations_mm[k].tolist()
+        results.append(
+            StationResult(
+                station=names[k],
+                setup=setup,
+                position_mm=(x, y, z),
+                u_position_mm=(u_x, u_y, u_z),
+                dead_length_mm=float(state.dead_length_mm[group]),
+                u_dead_length_mm=float(u_dead_length_mm[group]),
+                readings=int(used[group]),
+                rms_um=float(np.sqrt(square_sum[group] / max(used[group], 1.0))) / MM_PER_UM,
+                segment=list(of_group[:group]).count((k, setup)),
+            )
+        )
+    return tuple(results)
+
+
+def judged(found: Identification, series: Callable[[], ResidualSeries]) -> Identification:
+    """Add whether the residuals are larger than their uncertainty allows; ``series`` makes those used, if they are looked at."""
+    misfit = misfit_of(found.reduced_chi_square, found.degrees_of_freedom, found.u_scale, found.u_source, series)
+    return replace(found, misfit=misfit)
+
+
+def without_adjustment(
+    machine: Machine, errors: ErrorTable, residual_mm: FloatArray, u_source: str, missing: str
+) -> Identification:
+    """Return errors that were evaluated directly: every reading counts, and no unknown is adjusted.
+
+    Parameters
+    ----------
+    machine, errors : the machine, and its errors with the comments of the errors file.
+    residual_mm : of the readings (n,); empty or zero where there are none.
+    u_source : where the uncertainties come from; "unknown" if there are none.
+    missing : why the other errors are not among them.
+    """
+    rms_um = float(np.sqrt(np.mean(residual_mm**2))) / MM_PER_UM
+    return Identification(
+        errors=errors,
+        residual_mm=residual_mm,
+        accepted=np.ones(len(residual_mm), dtype=bool),
+        rms_um=rms_um,
+        degrees_of_freedom=0,
+        reduced_chi_square=1.0,
+        u_source=u_source,
+        u_length_um=rms_um,
+        unobservable=not_among(errors, missing),
+        rank=len(errors.names),
+        unknowns=len(errors.names),
+        worst_u={} if u_source == "unknown" else worst_uncertainty(errors),
+        layout=error_parameters(machine, errors.names),
+    )
+
+
+def not_among(errors: ErrorTable, why: str) -> tuple[str, ...]:
+    """Say of each of the 21 errors that a table does not contain why that is so."""
+    return tuple(f"{name}: {why}" for name in ERROR_NAMES if name not in errors.names)
 
 
 # What every method of identification returns: error curves with uncertainties, and notes about them.

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import PART, Deviations, aligned, setups_of
+from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Axis, Machine
-from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM
-from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import CompgenWarning, InputError
 from compgen.identify.adjust.determined import Determined, Observations, least_squares
 from compgen.identify.adjust.problem import SeparationProblem
 from compgen.identify.adjust.propagation import Adjustment
-from compgen.identify.adjust.residual_tests import misfit_of, residual_series
+from compgen.identify.adjust.residual_tests import residual_series
 from compgen.identify.adjust.robust import fit_accepted, rejected_components
 from compgen.identify.adjust.solver import LeastSquaresSolution, determined_factor, factorise, solve
 from compgen.identify.adjust.unknowns import (
@@ -30,13 +31,12 @@ from compgen.identify.adjust.unknowns import (
 )
 from compgen.identify.covariance import error_values
 from compgen.identify.identification import (
+    AdjustedReadings,
     Identification,
     error_table,
-    metadata_of,
+    judged,
+    not_among,
     table_of_values,
-    uncertainty_scale,
-    unobservable,
-    worst_uncertainty,
 )
 from compgen.identify.options import IdentifyOptions, deviation_sigma
 from compgen.identify.reference_conditions import without_effects
@@ -100,9 +100,6 @@ class _Readings:
     sigma_mm: FloatArray
     setup: IntArray
 
-    def kept(self, mask: NDArray[np.bool_]) -> _Readings:
-        return _Readings(*(getattr(self, name)[mask] for name in self.__dataclass_fields__))
-
 
 def needs_free_pose(deviations: Deviations) -> bool:
     """Whether readings are features of parts, lack a component or an axis, or come from several set-ups."""
@@ -143,7 +140,7 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
         "coordinates do not fit the model; check the axis order, signs and units, and which feature is which,",
         reject=options.reject,
     )
-    result = _free_pose_result(machine, deviations, readings, solution, accepted, source)
+    result = _free_pose_result(deviations, readings, solution, accepted, source)
     texts = [f"{name} at {', '.join(f'{value:g}' for value in nodes)} mm" for name, nodes in solution.unreached.items()]
     if texts:
         warnings.warn(
@@ -234,72 +231,55 @@ def observed_positions(layout: ErrorParameters, readings: _Readings, *, free_sca
 
 
 def _free_pose_result(
-    machine: Machine,
-    deviations: Deviations,
-    readings: _Readings,
-    solution: Determined,
-    accepted: NDArray[np.bool_],
-    source: str,
+    deviations: Deviations, readings: _Readings, solution: Determined, accepted: NDArray[np.bool_], source: str
 ) -> Identification:
-    layout, freedom = solution.layout, solution.freedom
-    used = readings.kept(accepted)
-    if freedom < 1:
-        raise UndeterminedError(
-            f"{np.count_nonzero(accepted)} coordinates for {solution.rank} unknowns and the poses", []
-        )
-    standard = (solution.residual / readings.sigma_mm)[accepted]
-    chi_square = float(standard @ standard) / freedom
-    u_scale = uncertainty_scale(chi_square, source)
+    too_few = "{} coordinates for {} unknowns and the poses"
+    adjusted = AdjustedReadings(
+        -solution.residual, readings.sigma_mm, accepted, source, solution.rank, solution.freedom, too_few=too_few
+    )
     values, rows = [], {}  # the factor of the covariance of the values goes in the order of the errors file
-    for name, position_mm, span, matrix in error_values(layout):
-        rows[name] = matrix @ (solution.factor * u_scale)[span]
+    for name, position_mm, span, matrix in error_values(solution.layout):
+        rows[name] = matrix @ (solution.factor * adjusted.u_scale)[span]
         values.append((name, position_mm, matrix @ solution.unknowns[span], np.linalg.norm(rows[name], axis=1)))
     errors = table_of_values(values)
-    values_factor = np.vstack([rows[name] for name in errors.names])
-    errors = errors.replace(metadata=metadata_of(machine, deviations.metadata))
-    poses = _poses(deviations, readings, solution, u_scale)
-    return Identification(
-        errors=errors,
-        residual_mm=-solution.residual,
-        accepted=accepted,
-        rms_um=float(np.sqrt(np.mean(solution.residual[accepted] ** 2))) / MM_PER_UM,
-        degrees_of_freedom=freedom,
-        reduced_chi_square=chi_square,
-        u_source=source,
-        u_length_um=float(np.median(readings.sigma_mm)) / MM_PER_UM,
-        u_scale=u_scale,
-        unobservable=tuple(
-            [f"{name}: no reading shows it" for name in ERROR_NAMES if name not in errors.names]
-            + [
-                f"{name}: a part of it is not told apart from the pose, the scale or other errors"
-                for name in solution.partly
-            ]
+    ambiguous = "a part of it is not told apart from the pose, the scale or other errors"
+    return replace(
+        _result(adjusted, errors, solution.layout, deviations, readings.row, readings.component),
+        unobservable=(
+            *not_among(errors, "no reading shows it"),
+            *(f"{name}: {ambiguous}" for name in solution.partly),
         ),
-        rejected=rejected_components(
-            deviations, readings.row, readings.component, -solution.residual, readings.sigma_mm, accepted
-        ),
-        rank=solution.rank,
-        unknowns=solution.rank,
         condition=solution.condition,
-        worst_u=worst_uncertainty(errors),
-        layout=layout,
-        method="deviations",
-        values_factor=values_factor,
+        values_factor=np.vstack([rows[name] for name in errors.names]),
         details={
-            "poses": [pose.summary() for pose in poses],
+            "poses": [pose.summary() for pose in _poses(deviations, readings, solution, adjusted.u_scale)],
             "range_mm": {
                 letter: [float(column.min()), float(column.max())]
                 for letter, column in zip(AXES, deviations.position_mm.T, strict=True)
             },
             "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
         },
-        misfit=misfit_of(
-            chi_square,
-            freedom,
-            u_scale,
-            source,
-            lambda: residual_series(deviations, used.row, solution.residual[accepted], used.sigma_mm, used.component),
-        ),
+    )
+
+
+def _result(
+    adjusted: AdjustedReadings,
+    errors: ErrorTable,
+    layout: ErrorParameters,
+    deviations: Deviations,
+    row: IntArray,
+    component: IntArray,
+) -> Identification:
+    """The result of adjusted components (k,) with those that were rejected, and the verdict about the residuals."""
+    residual, sigma, accepted = adjusted.residual_mm, adjusted.sigma_mm, adjusted.accepted
+    found = replace(
+        adjusted.identification(errors, layout, deviations.metadata, float(np.median(sigma)) / MM_PER_UM),
+        rejected=rejected_components(deviations, row, component, residual, sigma, accepted),
+        method="deviations",
+    )
+    return judged(
+        found,
+        lambda: residual_series(deviations, row[accepted], residual[accepted], sigma[accepted], component[accepted]),
     )
 
 
@@ -427,52 +407,29 @@ def _separation_result(
     accepted: NDArray[np.bool_],
 ) -> Identification:
     layout = problem.parameters
-    residual = problem.residuals(solution.state)[index]
-    freedom = int(np.count_nonzero(accepted)) - problem.size
-    if freedom < 1:
-        raise UndeterminedError(f"{np.count_nonzero(accepted)} deviations for {problem.size} unknowns", [])
-    chi_square = float(np.sum((residual / sigma_mm)[accepted] ** 2)) / freedom
-    u_scale = uncertainty_scale(chi_square, source)
+    adjusted = AdjustedReadings(
+        problem.residuals(solution.state)[index],
+        sigma_mm,
+        accepted,
+        source,
+        problem.size,
+        int(np.count_nonzero(accepted)) - problem.size,
+        too_few="{} deviations for {} unknowns",
+    )
     # normal matrix of the errors, the placement of the frame eliminated
     whole, size = solution.factor.matrix, layout.size
     reduced = whole[:size, :size] - whole[size:, :size].T @ np.linalg.solve(whole[size:, size:], whole[size:, :size])
-    row, component = np.divmod(index, 3)
     adjustment = Adjustment(
         state=State(solution.state.errors, np.zeros((0, 3)), np.zeros(0)),
         factor=factorise(0.5 * (reduced + reduced.T)),
         weight=accepted / sigma_mm**2,
         group=np.zeros(0, dtype=np.int64),
-        sigma_mm=u_scale,
+        sigma_mm=adjusted.u_scale,
     )
     errors = error_table(layout, solution.state.errors, adjustment.covariance_factor())
-    errors = errors.replace(metadata=metadata_of(layout.machine, deviations.metadata))
-    return Identification(
-        errors=errors,
-        residual_mm=residual,
-        accepted=accepted,
-        rms_um=float(np.sqrt(np.mean(residual[accepted] ** 2))) / MM_PER_UM,
-        degrees_of_freedom=freedom,
-        reduced_chi_square=chi_square,
-        u_source=source,
-        u_length_um=float(np.median(sigma_mm)) / MM_PER_UM,
-        u_scale=u_scale,
-        unobservable=unobservable(layout),
-        rejected=rejected_components(deviations, row, component, residual, sigma_mm, accepted),
-        rank=problem.size,
-        unknowns=problem.size,
+    return replace(
+        _result(adjusted, errors, layout, deviations, *np.divmod(index, 3)),
         condition=1.0 / solution.factor.rcond,
         iterations=solution.iterations,
-        worst_u=worst_uncertainty(errors),
-        layout=layout,
         adjustment=adjustment,
-        method="deviations",
-        misfit=misfit_of(
-            chi_square,
-            freedom,
-            u_scale,
-            source,
-            lambda: residual_series(
-                deviations, row[accepted], residual[accepted], sigma_mm[accepted], component[accepted]
-            ),
-        ),
     )

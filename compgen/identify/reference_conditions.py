@@ -17,19 +17,17 @@ from compgen.data.names import AXES
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify.adjust.propagation import Adjustment
 from compgen.identify.adjust.residual_tests import (
-    Misfit,
     ResidualSeries,
     Whiteness,
     check_whiteness,
-    misfit_of,
     residual_series,
     warn_of_misfit,
     warn_of_weakness,
 )
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State
-from compgen.identify.identification import Identification
+from compgen.identify.identification import Identification, judged
 from compgen.identify.options import number_in_comment
-from compgen.identify.reversal_errors import Reversal, ReversalStops, approach_signs, estimate_reversal, stop_cells
+from compgen.identify.reversal_errors import ReversalStops, approach_signs, estimate_reversal, stop_cells
 from compgen.instruments.interferometer import (
     HELIUM_NEON_NM,
     REFERENCE_C,
@@ -328,8 +326,8 @@ def identify_at_reference(
         found = adjust(used)
     if reversal is not None:
         reversal = replace(reversal, removed=removed)
-    tested = _tested(machine, used, found, conditions, reversal)
-    return replace(tested, misfit=_misfit(used, tested, taken_mm if removed else None))
+    found = replace(found, reversal=reversal, corrections=conditions.notes)
+    return _tested(machine, used, found, taken_mm if removed else None)
 
 
 def _added(lengths: Lengths, correction_mm: FloatArray) -> Lengths:
@@ -348,39 +346,31 @@ def _stops(machine: Machine, lengths: Lengths, difference_mm: FloatArray, adjust
     return ReversalStops(stop_cells(lengths, adjustment.group), difference_mm, sight, adjustment.weight)
 
 
-def _tested(
-    machine: Machine, used: Lengths, found: Identification, conditions: Conditions, reversal: Reversal | None
-) -> Identification:
-    """Add what was corrected, and the tests of the residuals, which are made when somebody looks at them."""
+def _tested(machine: Machine, used: Lengths, found: Identification, reversal_mm: FloatArray | None) -> Identification:
+    """Add the verdict about the size of the residuals, and their tests, which are made when somebody looks at them.
+
+    ``reversal_mm`` (n,) is what was added to each reading for a reversal.
+    """
     adjustment = found.adjustment
-    if adjustment is not None:
-        if adjustment.known_weight is None:  # known stations bring their own uncertainty in
-            typical = adjustment.sigma_mm / float(np.sqrt(max(adjustment.weight.mean(), 1e-12)))
-            warn_of_weakness(machine, found.errors, found.worst_u, typical)
-        warn_of_misfit(found.reduced_chi_square, found.u_source)
+    assert adjustment is not None
+    if adjustment.known_weight is None:  # known stations bring their own uncertainty in
+        typical = adjustment.sigma_mm / float(np.sqrt(max(adjustment.weight.mean(), 1e-12)))
+        warn_of_weakness(machine, found.errors, found.worst_u, typical)
+    warn_of_misfit(found.reduced_chi_square, found.u_source)
+
+    def sigma_mm() -> FloatArray:
+        weight = np.where(found.accepted, adjustment.weight, 1.0)
+        return np.asarray(adjustment.sigma_mm / found.u_scale / np.sqrt(weight))
 
     def tests() -> Whiteness:
-        if adjustment is None:
-            return Whiteness({}, 1.0, {}, ())
-        sigma = adjustment.sigma_mm / found.u_scale / np.sqrt(np.where(found.accepted, adjustment.weight, 1.0))
-        standardised = np.where(found.accepted, found.residual_mm / sigma, np.nan)
+        standardised = np.where(found.accepted, found.residual_mm / sigma_mm(), np.nan)
         _, distance = _sight(machine, used, adjustment.state.stations_mm)
         return check_whiteness(used, adjustment.group, standardised, distance, found.unknowns)
 
-    return replace(found, residual_tests=tests, reversal=reversal, corrections=conditions.notes)
-
-
-def _misfit(used: Lengths, found: Identification, reversal_mm: FloatArray | None) -> Misfit | None:
-    """Judge the size of the residuals; ``reversal_mm`` (n,) is what was added to each reading for a reversal."""
-    adjustment = found.adjustment
-    if adjustment is None:
-        return None
-    rows = found.accepted
-    residual_mm = found.residual_mm[rows]
-
     def series() -> ResidualSeries:
-        sigma_mm = adjustment.sigma_mm / found.u_scale / np.sqrt(adjustment.weight[rows])
+        rows = found.accepted
+        residual_mm = found.residual_mm[rows]
         bare_mm = None if reversal_mm is None else residual_mm + reversal_mm[rows]
-        return residual_series(used, rows, residual_mm, sigma_mm, adjustment.group[rows], bare_mm)
+        return residual_series(used, rows, residual_mm, sigma_mm()[rows], adjustment.group[rows], bare_mm)
 
-    return misfit_of(found.reduced_chi_square, found.degrees_of_freedom, found.u_scale, found.u_source, series)
+    return judged(replace(found, residual_tests=tests), series)

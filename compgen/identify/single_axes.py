@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,10 +12,10 @@ from compgen.data.axis_runs import AxisRuns
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM
+from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenWarning
-from compgen.identify.adjust.unknowns import check_axis_travel, error_parameters
-from compgen.identify.identification import Identification, metadata_of, worst_uncertainty
+from compgen.identify.adjust.unknowns import check_axis_travel
+from compgen.identify.identification import Identification, metadata_of, without_adjustment
 from compgen.identify.reversal_errors import SIGNIFICANT
 
 #: Targets closer than this are the same one, mm.
@@ -130,24 +131,11 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
             "to_mm": float(runs.position_mm[rows].max()),
             "taken_off_um": offsets[POSITIONING[axis]] / MM_PER_UM,
         }
-    rms_um = float(np.sqrt(np.mean(residual**2))) / MM_PER_UM
     known = all(np.isfinite(curve.u).all() for curve in errors.curves.values())
-    return Identification(
-        errors=errors,
-        residual_mm=-residual,
-        accepted=np.ones(len(runs), dtype=bool),
-        rms_um=rms_um,
+    missing = "runs along single axes do not show it"
+    return replace(
+        without_adjustment(machine, errors, -residual, "scatter" if known else "unknown", missing),
         degrees_of_freedom=len(runs) - len(cells),
-        reduced_chi_square=1.0,
-        u_source="scatter" if known else "unknown",
-        u_length_um=rms_um,
-        unobservable=tuple(
-            f"{name}: runs along single axes do not show it" for name in ERROR_NAMES if name not in errors.names
-        ),
-        rank=len(errors.names),
-        unknowns=len(errors.names),
-        worst_u=worst_uncertainty(errors) if known else {},
-        layout=error_parameters(machine, errors.names),
         reversal_curves=reversal,
         method="axis-runs",
         details={"axes": summaries},

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves
+from compgen.data.error_table import WORTH_MM, Curve, ReversalCurves
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, error_named
+from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import CompgenWarning
-from compgen.identify.adjust.unknowns import check_axis_travel, error_parameters
-from compgen.identify.identification import Identification, metadata_of, worst_uncertainty
+from compgen.identify.adjust.unknowns import check_axis_travel
+from compgen.identify.identification import Identification, metadata_of, without_adjustment
 from compgen.identify.reversal_errors import SIGNIFICANT
 from compgen.instruments.interferometer import compensated, summary_of
 from compgen.instruments.sixdof_evaluation import (
@@ -196,41 +196,16 @@ def identify_sixdof(machine: Machine, measurement: SixDofMeasurement) -> Identif
         metadata=metadata_of(machine, readings.metadata)
     )
     reversal = None if budget is None else _reversal(machine, readings, instrument, evaluation)
-    return _result(machine, runs, errors, budget, details, objections, reversal, summary_of(machine, readings, notes))
-
-
-def _result(
-    machine: Machine,
-    runs: Sequence[AxisRun],
-    errors: ErrorTable,
-    budget: SixDofBudget | None,
-    details: dict[str, Any],
-    objections: tuple[str, ...],
-    reversal: ReversalCurves | None,
-    corrections: dict[str, Any],
-) -> Identification:
-    residual, freedom = _residuals(runs)
-    missing = [name for name in ERROR_NAMES if name not in errors.names]
     known = budget is not None and budget.factor.size > 0
-    size = len(residual)
-    rms_um = float(np.sqrt(np.mean(residual**2))) / MM_PER_UM
-    return Identification(
-        errors=errors,
-        residual_mm=residual,
-        accepted=np.ones(size, dtype=bool),
-        rms_um=rms_um,
+    residual, freedom = _residuals(runs)
+    missing = "its axis was not measured"
+    return replace(
+        without_adjustment(machine, errors, residual, "propagated" if known else "unknown", missing),
         degrees_of_freedom=freedom,
         reduced_chi_square=float("nan"),  # nothing is adjusted
-        u_source="propagated" if known else "unknown",
-        u_length_um=rms_um,
-        unobservable=tuple(f"{name}: its axis was not measured" for name in missing),
-        rank=len(errors.names),
-        unknowns=len(errors.names),
-        worst_u=worst_uncertainty(errors) if known else {},
-        layout=error_parameters(machine, errors.names),
         values_factor=budget.factor if known and budget is not None else None,
         reversal_curves=reversal,
-        corrections=corrections,
+        corrections=summary_of(machine, readings, notes),
         method="sixdof",
         details=details,
         objections=objections,

@@ -26,11 +26,18 @@ from compgen.errors import ConvergenceError, InputError
 from compgen.identify.adjust.path_problem import Chunk, DistanceNoise, PathModel, Sums, chunk_of, path_model
 from compgen.identify.adjust.problem import LengthProblem
 from compgen.identify.adjust.propagation import SystematicInputs
-from compgen.identify.adjust.residual_tests import misfit_of, residual_series
+from compgen.identify.adjust.residual_tests import residual_series
 from compgen.identify.adjust.robust import LIMIT, MOST_REJECTED, Rejected, standardised_spread
 from compgen.identify.adjust.solver import Factor, Rank, determined_factor, step_levers, unknown_names
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State, check_travel, common_tool
-from compgen.identify.identification import Identification, error_table, uncertainty_scale, worst_uncertainty
+from compgen.identify.identification import (
+    Identification,
+    error_table,
+    judged,
+    station_results,
+    uncertainty_scale,
+    worst_uncertainty,
+)
 from compgen.identify.options import IdentifyOptions
 from compgen.identify.reference_conditions import reading_conditions
 from compgen.identify.tracer_lengths import identify
@@ -244,30 +251,17 @@ def _with_all(
     chi_square = 2.0 * sums.cost / scale_mm**2 / freedom
     u_scale = uncertainty_scale(chi_square, found.u_source)
     adjustment = replace(found.adjustment, state=state, factor=factor, sigma_mm=scale_mm * u_scale)
-    u = np.sqrt(np.einsum("ij,ij->i", adjustment.covariance_factor(), adjustment.covariance_factor()))
     errors = error_table(layout, state.errors, adjustment.covariance_factor()[: layout.size])
     errors = errors.replace(metadata=found.errors.metadata)
-    stations = []
-    for k, item in enumerate(found.stations):
-        at = layout.size + 3 * int(setups[k, 0])
-        (x, y, z), (u_x, u_y, u_z) = state.stations_mm[setups[k, 0]].tolist(), u[at : at + 3].tolist()
-        count, squares = sums.by_group[k, 0], sums.by_group[k, 1]
-        stations.append(
-            replace(
-                item,
-                position_mm=(x, y, z),
-                u_position_mm=(u_x, u_y, u_z),
-                dead_length_mm=float(state.dead_length_mm[k]),
-                u_dead_length_mm=float(u[layout.size + 3 * len(archive.stations) + k]),
-                readings=int(count),
-                rms_um=float(np.sqrt(squares / max(count, 1.0))) / MM_PER_UM,
-            )
-        )
+    of_group = [(k, setup) for k, setup in setups.tolist()]
+    stations = station_results(
+        archive.stations, of_group, adjustment, layout.size, sums.by_group[:, 0], sums.by_group[:, 1]
+    )
     kept, group = found.accepted, found.adjustment.group
-    return replace(
+    everything = replace(
         found,
         errors=errors,
-        stations=tuple(stations),
+        stations=stations,
         counted=(len(archive), used),
         rms_um=float(np.sqrt(sums.by_group[:, 1].sum() / used)) / MM_PER_UM,
         degrees_of_freedom=freedom,
@@ -279,21 +273,18 @@ def _with_all(
         iterations=optimum.passes,
         worst_u=worst_uncertainty(errors),
         adjustment=adjustment,
-        misfit=misfit_of(
-            chi_square,
-            freedom,
-            u_scale,
-            found.u_source,
-            lambda: residual_series(
-                sample, np.flatnonzero(kept), found.residual_mm[kept], scale_mm * np.ones(int(kept.sum())), group[kept]
-            ),
-        ),
         details={
             "sample_readings": len(sample),
             "passes": optimum.passes,
             "robust_limit": limit if np.isfinite(limit) else None,
             "from_the_sample": "residuals, whiteness, causes of a misfit, beam breaks",
         },
+    )
+    return judged(
+        everything,
+        lambda: residual_series(
+            sample, kept, found.residual_mm[kept], np.full(np.count_nonzero(kept), scale_mm), group[kept]
+        ),
     )
 
 

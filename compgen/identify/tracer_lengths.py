@@ -40,13 +40,11 @@ from compgen.identify.adjust.unknowns import (
 )
 from compgen.identify.covariance import with_systematic
 from compgen.identify.identification import (
+    AdjustedReadings,
     Identification,
     StationResult,
     error_table,
-    metadata_of,
-    uncertainty_scale,
-    unobservable,
-    worst_uncertainty,
+    station_results,
 )
 from compgen.identify.options import (
     IdentifyOptions,
@@ -258,19 +256,13 @@ def assemble(
         if fewer readings than unknowns are left.
     """
     problem, layout = task.problem, task.problem.parameters
-    solution, accepted, residual = fit.solution, fit.accepted, fit.residual_mm
-    known = problem.known
-    freedom = int(np.count_nonzero(accepted)) - problem.size + (len(known) if known else 0)
-    if freedom < 1:
-        raise UndeterminedError(f"{np.count_nonzero(accepted)} readings for {problem.size} unknowns", [])
-    everything = bool(accepted.all())
-    used = residual if everything else residual[accepted]
-    standardised = used / (sigma_mm if everything else sigma_mm[accepted])
-    square_sum = float(standardised @ standardised)
-    square_sum += known.square_sum(solution.state) / float(sigma_mm.min()) ** 2 if known else 0.0
-    chi_square = square_sum / freedom
-    u_scale = uncertainty_scale(chi_square, noise.source)
+    solution, accepted, known = fit.solution, fit.accepted, problem.known
     least = float(sigma_mm.min())
+    freedom = int(np.count_nonzero(accepted)) - problem.size + (len(known) if known else 0)
+    known_square_sum = known.square_sum(solution.state) / least**2 if known else 0.0
+    adjusted = AdjustedReadings(
+        fit.residual_mm, sigma_mm, accepted, noise.source, problem.size, freedom, known_square_sum
+    )
     known_weight = None
     if known:
         known_weight = np.zeros(problem.size)
@@ -280,35 +272,22 @@ def assemble(
         factor=solution.factor,
         weight=(least / sigma_mm) ** 2 * accepted,
         group=task.group,
-        sigma_mm=least * u_scale,
+        sigma_mm=least * adjusted.u_scale,
         known_weight=known_weight,
     )
     errors = error_table(layout, solution.state.errors, adjustment.covariance_factor()[: layout.size])
-    errors = errors.replace(metadata=metadata_of(task.machine, task.lengths.metadata))
     rejected = np.flatnonzero(~accepted)
-    return Identification(
-        errors=errors,
-        stations=_stations(task, adjustment, residual, accepted),
-        residual_mm=residual,
-        accepted=accepted,
-        rms_um=float(np.sqrt(used @ used / len(used))) / MM_PER_UM,
-        degrees_of_freedom=freedom,
-        reduced_chi_square=chi_square,
-        u_source=noise.source,
-        u_length_um=noise.constant_um,
+    return replace(
+        adjusted.identification(errors, layout, task.lengths.metadata, noise.constant_um),
+        stations=_stations(task, adjustment, fit.residual_mm, accepted),
         u_length_um_per_m=noise.proportional_um_per_m,
-        u_scale=u_scale,
-        unobservable=unobservable(layout),
         rejected=explain_rejected(
-            task.lengths, layout, solution.state, task.group, rejected, residual, sigma_mm, fit.segments
+            task.lengths, layout, solution.state, task.group, rejected, fit.residual_mm, sigma_mm, fit.segments
         ),
         segments=fit.segments,
         rank=problem.size if rank is None else problem.size - (rank.size - rank.rank),
-        unknowns=problem.size,
         condition=1.0 / solution.factor.rcond,
         iterations=solution.iterations,
-        worst_u=worst_uncertainty(errors),
-        layout=layout,
         adjustment=adjustment,
     )
 
@@ -316,36 +295,15 @@ def assemble(
 def _stations(
     task: Task, adjustment: Adjustment, residual: FloatArray, accepted: NDArray[np.bool_]
 ) -> tuple[StationResult, ...]:
-    state, factor = adjustment.state, adjustment.covariance_factor()
-    u = np.sqrt(np.einsum("ij,ij->i", factor, factor))
-    first = task.problem.parameters.size
-    second = first + state.stations_mm.size
-    groups = len(state.dead_length_mm)
+    groups = len(adjustment.state.dead_length_mm)
     everything = bool(accepted.all())
     used = np.bincount(task.group, None if everything else accepted, groups)
     squares = np.bincount(task.group, residual**2 if everything else residual**2 * accepted, groups)
     setups = task.lengths.labels.get("setup", np.zeros(len(task.lengths), dtype=np.int64))
     row_of = np.zeros(groups, dtype=np.int64)
     row_of[task.group] = np.arange(len(task.group))
-    results: list[StationResult] = []
-    for group in range(groups):
-        k = int(task.station[row_of[group]])
-        x, y, z = state.stations_mm[k].tolist()
-        u_x, u_y, u_z = u[first + 3 * k : first + 3 * k + 3].tolist()
-        results.append(
-            StationResult(
-                station=task.lengths.stations[k],
-                setup=int(setups[row_of[group]]),
-                position_mm=(x, y, z),
-                u_position_mm=(u_x, u_y, u_z),
-                dead_length_mm=float(state.dead_length_mm[group]),
-                u_dead_length_mm=float(u[second + group]),
-                readings=int(used[group]),
-                rms_um=float(np.sqrt(squares[group] / max(used[group], 1.0))) / MM_PER_UM,
-                segment=sum((r.station, r.setup) == (task.lengths.stations[k], setups[row_of[group]]) for r in results),
-            )
-        )
-    return tuple(results)
+    of_group = list(zip(task.station[row_of].tolist(), setups[row_of].tolist(), strict=True))
+    return station_results(task.lengths.stations, of_group, adjustment, task.problem.parameters.size, used, squares)
 
 
 # Joint identification of error curves, squareness, stations and dead lengths from tracer lengths.
