@@ -9,14 +9,17 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import click
 
 from compgen.data.files import json_text
+from compgen.data.names import AXES
 from compgen.errors import CompgenError, CompgenWarning, InputError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -176,3 +179,115 @@ def stopped_by_signals() -> Iterator[threading.Event]:
     finally:
         for known, handler in before.items():
             signal.signal(known, handler)
+
+
+# Options that are declared on the fields of a dataclass (compgen/data/toml_files.py).
+
+
+def options_of(
+    kind: type[Any],
+    argument: str,
+    *,
+    only: Sequence[str] = (),
+    without: Sequence[str] = (),
+    read: Mapping[str, Callable[[Any], Any]] | None = None,
+    build: Callable[..., Any] | None = None,
+) -> Callable[[Command], Command]:
+    """Add an option for each declared field of the dataclass ``kind``; the command receives ``argument``, one of it.
+
+    Parameters
+    ----------
+    only, without : the fields that become options (default: all), and those that do not.
+    read : by field, what makes the value from the text on the command line, where one is given.
+    build : makes the object from the values by field, in place of ``kind``.
+    """
+    hints = get_type_hints(kind)
+    chosen = [item for item in fields(kind) if item.name not in without and (not only or item.name in only)]
+    nested = [item.name for item in chosen if is_dataclass(hints[item.name])]
+    plain = {item.name: item for item in chosen if item.metadata and item.name not in nested}
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def wrapper(*args: Any, **options: Any) -> Any:
+            values = {name: options.pop(f"{argument}__{name}") for name in (*plain, *nested)}
+            values |= {name: not values[name] for name, item in plain.items() if item.default is True}
+            values |= {name: reader(values[name]) for name, reader in (read or {}).items() if values[name] is not None}
+            # an option that was not given leaves its field as it is by default, whatever that is; a file its key out
+            unset = [name for name, item in plain.items() if values[name] is None and "check" not in item.metadata]
+            left = [name for name in unset if plain[name].default is not MISSING]
+            values |= {name: plain[name].default for name in left}
+            return command(*args, **{argument: (build or kind)(**values)}, **options)
+
+        decorated: Any = wrapper
+        for name in nested:
+            decorated = options_of(hints[name], f"{argument}__{name}")(decorated)
+        for name, item in reversed(plain.items()):
+            decorated = click.option(option_name(item), f"{argument}__{name}", **_how(item, hints[name]))(decorated)
+        return decorated  # type: ignore[no-any-return]
+
+    return decorate
+
+
+def option_name(item: Field[Any]) -> str:
+    """Return the name of the option that a field of an options dataclass becomes."""
+    return item.metadata["name"] or f"--{item.name.replace('_', '-')}"
+
+
+def _how(item: Field[Any], hint: Any) -> dict[str, Any]:
+    """How click reads an option: the type of the field, its default and what was declared say it."""
+    declared, text = item.metadata, item.metadata["text"]
+    kind = (
+        next(part for part in get_args(hint) if part is not NoneType)
+        if get_origin(hint) in (Union, UnionType)
+        else hint
+    )
+    if kind is bool:  # a field that is True by default has an option that denies it
+        return {"is_flag": True, "help": text}
+    required = item.default is MISSING and item.default_factory is MISSING
+    how: dict[str, Any] = {"metavar": declared["metavar"], "help": text, "required": required}
+    if get_origin(kind) is Mapping:
+        number = get_args(kind)[1] is float
+        return {**how, "multiple": True, "callback": functools.partial(_pairs, number=number)}
+    choices = declared["choices"] or (get_args(kind) if get_origin(kind) is Literal else ())
+    if get_origin(kind) in (tuple, Sequence):
+        how["multiple"] = declared["metavar"] != "NAME,..."
+    elif choices:
+        how["type"] = click.Choice(choices, case_sensitive=choices != AXES)
+    elif "check" in declared:  # a setting of a file: whatever reads the file reads this text as well
+        how["type"] = kind if kind in (float, int) else str
+    elif kind in (float, int):
+        how["type"] = NUMBER if declared["within"] is None else click.IntRange(*declared["within"])
+    elif kind is Path:
+        how["type"] = PATH
+    if item.default not in (None, (), MISSING):
+        shown = f"{item.default:g}" if isinstance(item.default, float) else str(item.default)
+        how["help"] = f"{text} Default: {shown}."
+        if "check" not in declared:
+            how["default"] = shown
+    return how
+
+
+def _pairs(
+    context: click.Context, parameter: click.Parameter, given: Sequence[str], *, number: bool
+) -> dict[str, str] | dict[str, float]:
+    """Read NAME=VALUE, given any number of times; a VALUE alone, where the help allows one, belongs to "value"."""
+    option, form = parameter.opts[0], str(parameter.metavar)
+    found: dict[str, str] = {}
+    for text in given:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if form.startswith("[") and not equals:
+            name, value = "value", name
+        if not (name and value):
+            example = ", for example EXX=20" if number else ""
+            raise InputError(f"{text!r} is not of the form {form}{example}", field=option)
+        if name in found:
+            raise InputError(f"{name} is given twice; give it once", field=option)
+        found[name] = value
+    return {name: _number(option, name, value) for name, value in found.items()} if number else found
+
+
+def _number(option: str, name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{text!r} for {name} is not a number; give one above 0", field=option) from None

@@ -9,8 +9,8 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import fleet_options, json_option, out_option, print_json
-from compgen.cli.shared_options import instrument_option, machine_argument, mapper, measurements_argument, options_of
+from compgen.cli.common import fleet_options, json_option, options_of, out_option, print_json
+from compgen.cli.shared_options import instrument_option, machine_argument, mapper, measurements_argument
 from compgen.cli.terminal import progress, say
 from compgen.controls.isg_kernel import read_error_file
 from compgen.data.files import OutputFolder, json_text

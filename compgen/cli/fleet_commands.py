@@ -21,16 +21,17 @@ from compgen.cli.common import (
     Command,
     fleet_options,
     json_option,
+    options_of,
     print_json,
     stopped_by_signals,
 )
 from compgen.cli.terminal import answer, complain, say, stdout
 from compgen.errors import InputError
+from compgen.fleet.job import Job, MachineJob, add_machine, command_words, read_job, units
 
 if TYPE_CHECKING:
     from compgen.fleet.dashboard.settings import Users
     from compgen.fleet.drift import Drift
-    from compgen.fleet.job import Job
     from compgen.fleet.store import Store
 
 
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 
 
 JOB = "recal.toml"
-_PATH = click.Path(path_type=Path)
 #: Modules that only this command group needs, by the name of their distribution.
 NEEDED = {"sqlalchemy": "SQLAlchemy", "alembic": "alembic", "apscheduler": "APScheduler", "structlog": "structlog"}
 
@@ -76,7 +76,6 @@ def job_option(command: Command) -> Command:
     def wrapper(*args: Any, job_file: Path, log: str, **options: Any) -> Any:
         needed()
         from compgen.fleet import logs
-        from compgen.fleet.job import read_job
 
         logs.configure(log)  # type: ignore[arg-type]
         return command(*args, job=read_job(job_file), **options)
@@ -150,8 +149,6 @@ def run_command(
 
 
 def _words(command: str | None) -> tuple[str, ...]:
-    from compgen.fleet.job import command_words
-
     try:
         return () if command is None else command_words(command)
     except ValueError as error:
@@ -633,7 +630,10 @@ def reprocess_command(
 # ``volcomp recal add``, ``export-units``, ``backup`` and ``restore``: the job file, its units, the store as a whole.
 
 
-_STORE_PATH = click.Path(path_type=Path)
+#: Keys of a machine that ``recal add`` takes; the others are written into the job file by hand.
+ADDED_KEYS = (
+    "machine", "inbox", "controllers", "out", "measured_with", "schedule", "every_minutes", "approval", "instrument"
+)  # fmt: skip
 
 
 @recal_command.command("export-units")
@@ -648,7 +648,6 @@ def export_units_command(job: Job, out: Path, program: str | None, as_json: bool
     Example:
       volcomp recal export-units --out units/
     """
-    from compgen.fleet.job import units
     from compgen.pipeline import write_all
 
     paths = write_all(out, units(job, program or str(Path(sys.argv[0]).absolute())))
@@ -703,25 +702,10 @@ def _copied(counts: dict[str, int], as_json: bool) -> int:
 
 @recal_command.command("add")
 @click.argument("name")
-@click.option("--machine", required=True, metavar="MACHINE", help="Machine TOML, or the name of a machine.")
-@click.option("--inbox", required=True, metavar="DIR", help="Folder where measurements arrive.")
-@click.option(
-    "--controller", "controllers", required=True, multiple=True, metavar="NAME", help="May be given several times."
-)
-@click.option("--out", required=True, metavar="DIR", help="Folder for the tables of this machine.")
-@click.option(
-    "--measured-with",
-    required=True,
-    type=click.Choice(["active", "bare"]),
-    help="Whether the compensation stays on (active) or is switched off (bare) while the machine is measured.",
-)
-@click.option("--schedule", default=None, metavar="CRON", help="Cron expression of five fields, local time.")
-@click.option("--every-minutes", default=None, type=int, help="In place of --schedule: an interval in minutes.")
-@click.option("--approval", default=None, type=click.Choice(["manual", "auto"]), help="Default: manual.")
-@click.option("--instrument", default=None, metavar="FILE", help="Instrument TOML of six-DOF readings.")
+@options_of(MachineJob, "keys", only=ADDED_KEYS, build=dict)
 @click.option("--job", "job_file", default=JOB, show_default=True, type=PATH, metavar="FILE", help="Job file.")
 @json_option
-def add_command(name: str, job_file: Path, as_json: bool, controllers: tuple[str, ...], **keys: Any) -> int:
+def add_command(name: str, job_file: Path, as_json: bool, keys: dict[str, Any]) -> int:
     """Add the machine NAME to the job file, which is made if it does not exist; paths are relative to it.
 
     \b
@@ -730,9 +714,7 @@ def add_command(name: str, job_file: Path, as_json: bool, controllers: tuple[str
                     --measured-with bare --schedule "30 6 * * mon"
     """
     needed()
-    from compgen.fleet.job import add_machine
-
-    added = add_machine(job_file, name, {**keys, "controllers": list(controllers)})
+    added = add_machine(job_file, name, keys)
     if as_json:
         print_json({"accepted": True, "job": str(job_file), "machine": added.name})
     else:
@@ -820,7 +802,6 @@ def _store_url(store: str | None, job: Path | None) -> str:
             raise click.UsageError("give --store URL or --job FILE")
         return store
     from compgen.fleet.database import shown
-    from compgen.fleet.job import read_job
 
     url = read_job(job).store
     given = url if store is None else store if "://" in store else f"sqlite:///{Path(store).absolute()}"

@@ -11,8 +11,8 @@ from typing import Any, cast
 import click
 import numpy as np
 
-from compgen.cli.common import NUMBER, PATH, json_option, out_option, print_json
-from compgen.cli.shared_options import machine_argument, options_of
+from compgen.cli.common import NUMBER, PATH, json_option, options_of, out_option, print_json
+from compgen.cli.shared_options import machine_argument
 from compgen.cli.terminal import answer, progress, say, say_paths, stdout
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import format_errors

@@ -6,21 +6,19 @@ import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import MISSING, Field, fields, is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from compgen import effects
-from compgen.cli.common import NUMBER, PATH, Command
+from compgen.cli.common import PATH, Command, options_of
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import read_bytes, sha256_of
 from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
 from compgen.data.messages import nearest
-from compgen.data.names import AXES
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
 from compgen.resources import data_folder
@@ -96,108 +94,7 @@ def mapper(workers: int, cluster: str | None) -> Iterator[Map]:
         yield spread_out
 
 
-# Options that are declared on the fields of a dataclass (compgen/data/toml_files.py).
-
-
-def options_of(
-    kind: type[Any],
-    argument: str,
-    *,
-    only: Sequence[str] = (),
-    without: Sequence[str] = (),
-    read: Mapping[str, Callable[[Any], Any]] | None = None,
-    build: Callable[..., Any] | None = None,
-) -> Callable[[Command], Command]:
-    """Add an option for each declared field of the dataclass ``kind``; the command receives ``argument``, one of it.
-
-    Parameters
-    ----------
-    only, without : the fields that become options (default: all), and those that do not.
-    read : by field, what makes the value from the text on the command line, where one is given.
-    build : makes the object from the values by field, in place of ``kind``.
-    """
-    hints = get_type_hints(kind)
-    chosen = [item for item in fields(kind) if item.name not in without and (not only or item.name in only)]
-    nested = [item.name for item in chosen if is_dataclass(hints[item.name])]
-    plain = {item.name: item for item in chosen if item.metadata and item.name not in nested}
-
-    def decorate(command: Command) -> Command:
-        @functools.wraps(command)
-        def wrapper(*args: Any, **options: Any) -> Any:
-            values = {name: options.pop(f"{argument}__{name}") for name in (*plain, *nested)}
-            values |= {name: not values[name] for name, item in plain.items() if item.default is True}
-            values |= {name: reader(values[name]) for name, reader in (read or {}).items() if values[name] is not None}
-            # an option that was not given leaves its field as it is by default, whatever that is
-            left = [name for name, item in plain.items() if values[name] is None and item.default is not MISSING]
-            values |= {name: plain[name].default for name in left}
-            return command(*args, **{argument: (build or kind)(**values)}, **options)
-
-        decorated: Any = wrapper
-        for name in nested:
-            decorated = options_of(hints[name], f"{argument}__{name}")(decorated)
-        for name, item in reversed(plain.items()):
-            decorated = click.option(option_name(item), f"{argument}__{name}", **_how(item, hints[name]))(decorated)
-        return decorated  # type: ignore[no-any-return]
-
-    return decorate
-
-
-def option_name(item: Field[Any]) -> str:
-    """Return the name of the option that a field of an options dataclass becomes."""
-    return item.metadata["name"] or f"--{item.name.replace('_', '-')}"
-
-
-def _how(item: Field[Any], hint: Any) -> dict[str, Any]:
-    """How click reads an option: the type of the field, its default and what was declared say it."""
-    declared, text = item.metadata, item.metadata["text"]
-    kind = (
-        next(part for part in get_args(hint) if part is not NoneType)
-        if get_origin(hint) in (Union, UnionType)
-        else hint
-    )
-    if kind is bool:  # a field that is True by default has an option that denies it
-        return {"is_flag": True, "help": text}
-    how: dict[str, Any] = {"metavar": declared["metavar"], "help": text}
-    if get_origin(kind) is Mapping:
-        number = get_args(kind)[1] is float
-        return {**how, "multiple": True, "callback": functools.partial(_pairs, number=number)}
-    choices = declared["choices"] or (get_args(kind) if get_origin(kind) is Literal else ())
-    if get_origin(kind) in (tuple, Sequence):
-        how["multiple"] = declared["metavar"] != "NAME,..."
-    elif choices:
-        how["type"] = click.Choice(choices, case_sensitive=choices != AXES)
-    elif kind in (float, int):
-        how["type"] = NUMBER if declared["within"] is None else click.IntRange(*declared["within"])
-    if item.default not in (None, (), MISSING):
-        shown = f"{item.default:g}" if isinstance(item.default, float) else str(item.default)
-        how |= {"default": shown, "help": f"{text} Default: {shown}."}
-    return how
-
-
-def _pairs(
-    context: click.Context, parameter: click.Parameter, given: Sequence[str], *, number: bool
-) -> dict[str, str] | dict[str, float]:
-    """Read NAME=VALUE, given any number of times; a VALUE alone, where the help allows one, belongs to "value"."""
-    option, form = parameter.opts[0], str(parameter.metavar)
-    found: dict[str, str] = {}
-    for text in given:
-        name, equals, value = (part.strip() for part in text.partition("="))
-        if form.startswith("[") and not equals:
-            name, value = "value", name
-        if not (name and value):
-            example = ", for example EXX=20" if number else ""
-            raise InputError(f"{text!r} is not of the form {form}{example}", field=option)
-        if name in found:
-            raise InputError(f"{name} is given twice; give it once", field=option)
-        found[name] = value
-    return {name: _number(option, name, value) for name, value in found.items()} if number else found
-
-
-def _number(option: str, name: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"{text!r} for {name} is not a number; give one above 0", field=option) from None
+# Options that are declared on the fields of a dataclass: see options_of of compgen/cli/common.py.
 
 
 #: The options of an identification: noise of the readings, inputs that they share, and the method.

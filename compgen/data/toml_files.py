@@ -31,6 +31,7 @@ def option(
     choices: tuple[Any, ...] = (),
     within: tuple[int, int] | None = None,
     factory: Callable[[], Any] | None = None,
+    required: bool = False,
 ) -> Any:
     """Return the field of an options dataclass; the command line makes an option of it.
 
@@ -42,9 +43,11 @@ def option(
     metavar : what the help shows for the value.
     choices : the values that the command line allows, where the type of the field does not list them.
     within : the lowest and the highest whole number.
+    required : the field has no default, and the option must be given.
     """
     declared: Mapping[str, Any] = {"text": text, "name": name, "metavar": metavar, "choices": choices, "within": within}
-    return field(metadata=declared, **({"default_factory": factory} if factory is not None else {"default": default}))
+    start: dict[str, Any] = {} if required else {"default": default}
+    return field(metadata=declared, **({"default_factory": factory} if factory is not None else start))
 
 
 T = TypeVar("T")
@@ -83,11 +86,20 @@ class DeclaredKey:
 class Section:
     """One table of a TOML file whose keys are taken one by one.
 
-    ``take`` checks and returns a value, ``section`` descends, ``finish`` raises for a key that nobody took.
+    ``take`` checks and returns a value, ``section`` descends, ``finish`` raises for a key that nobody took. A key that
+    the section does not have is taken from that of its ``defaults``, where these are given.
     """
 
-    def __init__(self, data: Mapping[str, Any], *, path: Path | None, text: str = "", name: str = "") -> None:
-        self.data, self.path, self.text, self.name = dict(data), path, text, name
+    def __init__(
+        self,
+        data: Mapping[str, Any],
+        *,
+        path: Path | None,
+        text: str = "",
+        name: str = "",
+        defaults: Section | None = None,
+    ) -> None:
+        self.data, self.path, self.text, self.name, self.defaults = dict(data), path, text, name, defaults
         self._nth = 0  # which of the tables of that name, for an array of tables
         self._known: set[str] = set()
 
@@ -115,7 +127,8 @@ class Section:
     def __contains__(self, key: str) -> bool:
         """Whether the file holds ``key``; asking makes the key a known one."""
         self._known.add(key)
-        return key in self.data
+        usual = self.defaults is not None and key in self.defaults
+        return usual or key in self.data
 
     @overload
     def take(self, key: str, check: Callable[[Any], T]) -> T: ...
@@ -123,7 +136,10 @@ class Section:
     def take(self, key: str, check: Callable[[Any], T], default: D) -> T | D: ...
     def take(self, key: str, check: Callable[[Any], Any], default: Any = _REQUIRED) -> Any:
         """Return the checked value of ``key``; ``check`` raises ValueError with what is expected."""
-        if key not in self:
+        self._known.add(key)
+        if self.defaults is not None and key in self.defaults:  # checked even if the section has a value of its own
+            default = self.defaults.take(key, check)
+        if key not in self.data:
             if default is _REQUIRED:
                 # a key of the file that was probably meant: another case, the unit left out, a slip
                 present = [name for name in self.data if name not in self._known]
@@ -141,7 +157,10 @@ class Section:
         """Return the sub-section ``key`` (an empty one if it is absent and not required)."""
         full = f"{self.name}.{key}" if self.name else key
         value = self.take(key, table) if required else self.take(key, table, {})
-        return Section(value, path=self.path, text=self.text, name=full)
+        usual = None
+        if self.defaults is not None:
+            usual, value = self.defaults.section(key, required=False), self.data.get(key, {})
+        return Section(value, path=self.path, text=self.text, name=full, defaults=usual)
 
     def sections(self, key: str) -> list[Section]:
         """Return the sub-sections of an array of tables (``[[key]]``), empty if absent."""
@@ -172,6 +191,8 @@ class Section:
         for key in self.data:
             if key not in self._known:
                 raise self.fail(key, f"is not a known key; {nearest(key, self._known)}")
+        if self.defaults is not None:
+            self.defaults.finish()
 
 
 def read_toml(path: str | Path) -> Section:
@@ -214,6 +235,8 @@ def setting(
     required: bool = False,
     stated: Any = None,
     meaning: str = "",
+    name: str = "",
+    metavar: str | None = None,
 ) -> Any:
     """Declare a field of a dataclass as a setting.
 
@@ -226,11 +249,14 @@ def setting(
     key : the key of the file if it is not the name of the field.
     unit : factor from the numbers of the file to those of the field.
     required : the file must have the key though the field has a default for programs.
+    name, metavar : as for :func:`option`, where a command takes the setting; the option gives the value as the file
+        would have it.
     """
     if stated is not None:
         default = check(stated) if unit == 1.0 else unit * check(stated)
     metadata = {"check": check, "key": key, "unit": unit, "required": required or default is _REQUIRED}
     metadata |= {"stated": default if stated is None and unit == 1.0 else stated, "meaning": meaning}
+    metadata |= {"text": meaning, "name": name, "metavar": metavar, "choices": (), "within": None}
     return field(metadata=metadata) if default is _REQUIRED else field(default=default, metadata=metadata)
 
 

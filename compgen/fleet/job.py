@@ -1,7 +1,10 @@
 """The job file ``recal.toml``: which machines are recalibrated, from which files, when and by which rules.
 
-Schedules come first, then the file itself (each key is declared once, with its check, as a field of :class:`Policy` or
-:class:`MachineJob`), then what is made from a job: an added machine, and the files of the system's own scheduler.
+Schedules come first, then the file itself (each key is declared once, with its check, default and meaning, as a field of
+:class:`Policy` or :class:`MachineJob`; reader, ``volcomp recal add`` and documentation take it from there), then what is
+made from a job: an added machine, and the files of the system's own scheduler.
+
+``volcomp recal --help`` loads this module, so what needs numpy is imported where it is used.
 """
 
 from __future__ import annotations
@@ -10,22 +13,18 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal
 
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.files import read_bytes, read_text, sha256_of, write_file
-from compgen.data.machine import load_machine
 from compgen.data.messages import nearest
 from compgen.data.names import ERROR_NAMES, MM_PER_UM, error_named
-from compgen.data.toml_files import Section
+from compgen.data.toml_files import Section, setting, table_setting, take_settings
 from compgen.errors import InputError
-
-T = TypeVar("T")
-D = TypeVar("D")
 
 # --- schedules -----------------------------------------------------------------------------------------------------
 #
@@ -192,36 +191,52 @@ def command_words(value: Any) -> tuple[str, ...]:
     return tuple(words)
 
 
-def _key(check: Callable[[Any], Any], default: Any = None) -> Any:
-    """A key of the job file: its default, and the check that returns the clean value."""
-    return field(default=default, metadata={"check": check})
+def _path(value: Any) -> Path:
+    return Path(toml_files.text_of_path(value))
 
 
 @dataclass(frozen=True)
 class Policy:
-    """What new tables must fulfil to be proposed; lengths in um.
+    """What new tables must fulfil to be proposed; lengths in um. None: no limit."""
 
-    Parameters
-    ----------
-    max_age_days : a measurement may be at most this old when it is judged.
-    temperature_c : lowest and highest temperature that any logged channel may show; without a log it is held back.
-    confidence : with which the change must exceed its uncertainty.
-    min_shrink_um : by how much the remaining rms must shrink against the active tables; more than 0 in any case.
-    max_change_um : largest change of the correction anywhere, against the active tables.
-    max_reference_um : largest change of the correction at the reference point; for a first table against none.
-    max_step_um : largest step of the correction between neighbouring table nodes.
-    clock_minutes : how near to a decision that changed the active tables a measurement may be made without saying itself
-        which tables were on; for clocks that differ.
-    """
-
-    max_age_days: float | None = _key(toml_files.positive, 30.0)
-    temperature_c: tuple[float, float] | None = _key(toml_files.interval)
-    confidence: float = _key(_confidence, 0.95)
-    min_shrink_um: float = _key(toml_files.not_negative, 0.0)
-    max_change_um: float | None = _key(toml_files.positive)
-    max_reference_um: float | None = _key(toml_files.positive)
-    max_step_um: float | None = _key(toml_files.positive)
-    clock_minutes: float = _key(toml_files.not_negative, 30.0)
+    max_age_days: float | None = setting(
+        toml_files.positive, 30.0, meaning="The measurement is older than this, in days, when it is judged."
+    )
+    temperature_c: tuple[float, float] | None = setting(
+        toml_files.interval, None, meaning="A logged channel leaves the window [low, high], or none was logged."
+    )
+    confidence: float = setting(
+        _confidence,
+        0.95,
+        meaning="The change against the active tables does not exceed its uncertainty with this confidence.",
+    )
+    min_shrink_um: float = setting(
+        toml_files.not_negative,
+        0.0,
+        meaning="The remaining rms, rigid motion removed, does not shrink by more than this against the active tables.",
+    )
+    max_change_um: float | None = setting(
+        toml_files.positive,
+        None,
+        meaning="The correction changes by more than this anywhere, against the active tables.",
+    )
+    max_reference_um: float | None = setting(
+        toml_files.positive,
+        None,
+        meaning="The correction changes by more than this at the reference point; for first tables against none.",
+    )
+    max_step_um: float | None = setting(
+        toml_files.positive,
+        None,
+        meaning="Not held back but refused: a step between neighbouring nodes exceeds it, as with `volcomp run "
+        "--max-step-um`.",
+    )
+    clock_minutes: float = setting(
+        toml_files.not_negative,
+        30.0,
+        meaning="It was measured within this time of a decision that changed the active tables, and does not say which "
+        "were active.",
+    )
 
 
 @dataclass(frozen=True)
@@ -239,33 +254,68 @@ class OtherInbox:
 
 @dataclass(frozen=True)
 class MachineJob:
-    """How one machine is recalibrated; paths are absolute.
+    """How one machine is recalibrated; the fields up to ``policy`` are the keys of its section, paths are absolute.
 
     ``measured_with`` says what was active while the machine was measured: the tables that were active then ("active")
-    or none ("bare"); a measurement file may say otherwise for itself. ``tolerances`` are those of the drift, mm or rad,
-    by error or "volume". ``others`` are the machines whose
+    or none ("bare"); a measurement file may say otherwise for itself. ``schedule`` is also what ``every_minutes`` of the
+    file says. ``tolerances`` are those of the drift, mm or rad, by error or "volume". ``others`` are the machines whose
     inbox is the same, or holds a file of this one's as well (:func:`compgen.fleet.inbox.with_twins`). Where
     the files that the settings name are copies (:class:`compgen.fleet.runner.Parcel`), ``settings`` is the hash of the
     settings, and ``original`` the machine file.
     """
 
     name: str
-    machine: str
-    inbox: Path
-    controllers: tuple[str, ...]
-    out: Path
-    measured_with: str
-    patterns: tuple[str, ...] = _key(_patterns, PATTERNS)
-    schedule: Schedule | None = None
-    approval: str = _key(toml_files.choice("manual", "auto"), "manual")
-    instrument: Path | None = None
-    templates: Path | None = None
-    allow_unverified: bool = _key(toml_files.flag, False)
-    notify: tuple[str, ...] = _key(command_words, ())
-    settle_s: float = _key(toml_files.not_negative, 0.0)
-    max_size_mb: float = _key(toml_files.positive, 100.0)
-    max_minutes: float = _key(toml_files.positive, 60.0)
-    policy: Policy = Policy()
+    machine: str = setting(
+        toml_files.text_of_path, metavar="MACHINE", meaning="Machine TOML, or the name of a machine."
+    )
+    inbox: Path = setting(_path, metavar="DIR", meaning="Folder where measurements arrive.")
+    controllers: tuple[str, ...] = setting(
+        _controllers,
+        name="--controller",
+        metavar="NAME",
+        meaning="Control to export, by the name that `volcomp controllers` lists; may be several.",
+    )
+    out: Path = setting(_path, metavar="DIR", meaning="Folder for the tables, one for each machine.")
+    measured_with: Literal["active", "bare"] = setting(
+        toml_files.choice("active", "bare"),
+        meaning="active: the compensation stays on while the machine is measured; bare: it is switched off. There is no "
+        "default: the wrong one compensates twice or not at all.",
+    )
+    patterns: tuple[str, ...] = setting(_patterns, PATTERNS, meaning="Name patterns of measurement files.")
+    schedule: Schedule | None = setting(
+        cron, None, metavar="CRON", meaning="Cron expression in local time, for `watch` and `export-units`."
+    )
+    every_minutes: int | None = setting(
+        toml_files.whole(1, 527040), None, meaning="In place of a schedule: an interval in minutes."
+    )
+    approval: Literal["manual", "auto"] = setting(
+        toml_files.choice("manual", "auto"),
+        "manual",
+        meaning="manual: new tables wait until a person approves them; auto: they become active if nothing holds them "
+        "back.",
+    )
+    instrument: Path | None = setting(_path, None, metavar="FILE", meaning="Instrument TOML of six-DOF readings.")
+    templates: Path | None = setting(_path, None, meaning="Folder of your own templates, as for `volcomp run`.")
+    allow_unverified: bool = setting(
+        toml_files.flag, False, meaning="Export formats that no public document fully describes."
+    )
+    notify: tuple[str, ...] = setting(
+        command_words, (), meaning="Command, as a list of words, that is told of decisions and failures."
+    )
+    settle_s: float = setting(
+        toml_files.not_negative,
+        0.0,
+        meaning="A file changed less than this many seconds ago is left for the next pass.",
+    )
+    max_size_mb: float = setting(
+        toml_files.positive, 100.0, meaning="A measurement whose files together exceed this many MB is not read."
+    )
+    max_minutes: float = setting(
+        toml_files.positive,
+        60.0,
+        meaning="A measurement that takes longer is stopped and set aside; by `run` and `watch`.",
+    )
+    policy: Policy = table_setting(Policy)
     identify: Mapping[str, Any] = field(default_factory=dict)
     tolerances: Mapping[str, float] = field(default_factory=dict)
     others: tuple[OtherInbox, ...] = field(default=(), compare=False, repr=False)
@@ -279,6 +329,8 @@ class MachineJob:
         """
         if self.settings:
             return self.settings
+        from compgen.data.machine import load_machine
+
         machine: Path | None = Path(self.machine)
         if not (known and Path(self.machine).is_file() and len(Path(self.machine).parts) > 1):
             machine = load_machine(self.machine).source
@@ -315,34 +367,6 @@ class Job:
         return self.machines[name]
 
 
-class _Keys:
-    """Takes each key from the machine's section, else from ``[defaults]``."""
-
-    def __init__(self, own: Section, defaults: Section) -> None:
-        self.own, self.defaults = own, defaults
-
-    def take(self, key: str, check: Callable[[Any], T], default: D) -> T | D:
-        fallback = self.defaults.take(key, check, default)
-        return self.own.take(key, check, fallback) if key in self.own else fallback
-
-    def need(self, key: str, check: Callable[[Any], T]) -> T:
-        """Take a key that one of the two sections must contain."""
-        found = self.take(key, check, None)
-        return self.own.take(key, check) if found is None else found
-
-    def section(self, key: str) -> _Keys:
-        return _Keys(self.own.section(key, required=False), self.defaults.section(key, required=False))
-
-    def fields(self, declared: type[Policy | MachineJob]) -> dict[str, Any]:
-        """Take every key that the fields of a dataclass declare by :func:`_key`."""
-        known = [item for item in fields(declared) if "check" in item.metadata]
-        return {item.name: self.take(item.name, item.metadata["check"], item.default) for item in known}
-
-    def finish(self) -> None:
-        self.own.finish()
-        self.defaults.finish()
-
-
 def read_job(path: str | Path) -> Job:
     """Read a job file strictly; InputError with file, line and key for whatever is unknown, missing or impossible."""
     return _job_of(toml_files.read_toml(path), Path(path).absolute())
@@ -367,9 +391,13 @@ def _job_of(root: Section, path: Path) -> Job:
     for name in every.data:
         if not MACHINE_NAME.fullmatch(name):
             raise every.fail(name, "is not a name: letters, digits, '.', '_' and '-', at most 64, are allowed")
-        machines[name] = _machine(name, _Keys(every.section(name), defaults), folder)
-    if not machines:
-        _options(_Keys(Section({}, path=path), defaults), folder, "")
+        section = every.section(name)
+        keys = Section(section.data, path=root.path, text=root.text, name=section.name, defaults=defaults)
+        machines[name] = _machine(name, keys, folder)
+    if not machines:  # the defaults are checked before there is one
+        required = dict.fromkeys((item.name for item in fields(MachineJob) if item.metadata.get("required")), "")
+        keys = Section({}, path=path, defaults=defaults)
+        take_settings(MachineJob, keys, name="", **_mappings(keys), **required)
     root.finish()
     # folders out may not be the same or lie in each other, whatever links and ".." lead there
     real = {name: Path(os.path.realpath(machine.out)) for name, machine in machines.items()}
@@ -393,72 +421,58 @@ def _job_of(root: Section, path: Path) -> Job:
     return Job(path, store if "://" in store else f"sqlite:///{folder / store}", machines)
 
 
-def _machine(name: str, keys: _Keys, folder: Path) -> MachineJob:
-    def path(value: Any) -> str:
-        return toml_files.text_of_path(value).replace("{name}", name)
-
-    options = _options(keys, folder, name)
-    machine = keys.need("machine", path)
-    is_file = machine.endswith(".toml") or len(Path(machine).parts) > 1
-    active_or_bare = toml_files.choice("active", "bare")
-    if keys.take("measured_with", active_or_bare, None) is None:
-        raise keys.own.fail(
+def _machine(name: str, keys: Section, folder: Path) -> MachineJob:
+    if "measured_with" not in keys:
+        raise keys.fail(
             "measured_with",
             "is missing; say 'active' if the compensation stays on while the machine is measured, 'bare' if it is "
             "switched off. The wrong one compensates twice or not at all",
         )
-    job = MachineJob(
-        name=name,
-        machine=str(folder / machine) if is_file else machine,
-        inbox=folder / keys.need("inbox", path),
-        controllers=keys.need("controllers", _controllers),
-        out=folder / keys.need("out", path),
-        measured_with=keys.need("measured_with", active_or_bare),
-        **options,
-    )
+    job = take_settings(MachineJob, keys, name=name, **_mappings(keys))
     keys.finish()
-    return job
+
+    def placed(path: str | Path) -> Path:
+        return folder / str(path).replace("{name}", name)
+
+    is_file = job.machine.endswith(".toml") or len(Path(job.machine).parts) > 1
+    return replace(
+        job,
+        machine=str(placed(job.machine)) if is_file else job.machine.replace("{name}", name),
+        inbox=placed(job.inbox),
+        out=placed(job.out),
+        schedule=_schedule(job, keys),
+        instrument=None if job.instrument is None else placed(job.instrument),
+        templates=None if job.templates is None else placed(job.templates),
+    )
 
 
-def _options(keys: _Keys, folder: Path, name: str) -> dict[str, Any]:
-    def path(value: Any) -> Path:
-        return folder / toml_files.text_of_path(value).replace("{name}", name)
+def _schedule(job: MachineJob, keys: Section) -> Schedule | None:
+    """When, from either key; a machine's own key of the two counts more than the other one of the defaults."""
+    own = {"every_minutes", "schedule"} & set(keys.data)
+    if job.every_minutes is None or (job.schedule is not None and own == {"schedule"}):
+        return job.schedule
+    if job.schedule is not None and own != {"every_minutes"}:
+        raise keys.fail("schedule", "cannot be combined with every_minutes; give one of the two")
+    return Every(job.every_minutes)
 
-    options = keys.fields(MachineJob) | {
-        "schedule": _schedule(keys),
-        "instrument": keys.take("instrument", path, None),
-        "templates": keys.take("templates", path, None),
-    }
-    policy = keys.section("policy")
-    options["policy"] = Policy(**policy.fields(Policy))
-    policy.finish()
-    tolerances = keys.section("tolerances")
+
+def _mappings(keys: Section) -> dict[str, Mapping[str, Any]]:
+    """The sections ``identify``, in the units of the file, and ``tolerances``, in mm and rad by error or "volume"."""
+    section = keys.section("tolerances", required=False)
     units = {f"{name}_{error_named(name).unit}": (name, error_named(name).si_per_unit) for name in ERROR_NAMES}
     units["volume_um"] = ("volume", MM_PER_UM)
-    given = {key: tolerances.take(key, toml_files.positive, None) for key in units}
-    tolerances.finish()
-    limits = {units[key][0]: size * units[key][1] for key, size in given.items() if size is not None}
-    return options | {"identify": _identify(keys.section("identify")), "tolerances": limits}
-
-
-def _schedule(keys: _Keys) -> Schedule | None:
-    every = keys.take("every_minutes", toml_files.whole(1, 527040), None)
-    expression = keys.take("schedule", cron, None)
-    both_own = "every_minutes" in keys.own and "schedule" in keys.own
-    if both_own or (every and expression and not {"every_minutes", "schedule"} & set(keys.own.data)):
-        raise keys.own.fail("schedule", "cannot be combined with every_minutes; give one of the two")
-    if every is not None and (expression is None or "every_minutes" in keys.own):
-        return Every(every)
-    return expression
-
-
-def _identify(keys: _Keys) -> dict[str, Any]:
+    given = {key: section.take(key, toml_files.positive, None) for key in units}
+    section.finish()
+    tolerances = {units[key][0]: size * units[key][1] for key, size in given.items() if size is not None}
+    section = keys.section("identify", required=False)
     names = ("u_length_um", "u_length_um_per_m", "u_deviation_um")
-    found: dict[str, Any] = {name: keys.take(name, toml_files.not_negative, None) for name in names}
-    found["temperature"] = keys.take("temperature", toml_files.flag, True)
-    found["small_deviations"] = keys.take("small_deviations", toml_files.flag, False) or None  # so that the hash stays
-    keys.finish()
-    return {name: value for name, value in found.items() if value is not None}
+    found: dict[str, Any] = {name: section.take(name, toml_files.not_negative, None) for name in names}
+    found["temperature"] = section.take("temperature", toml_files.flag, True)
+    found["small_deviations"] = (
+        section.take("small_deviations", toml_files.flag, False) or None
+    )  # so that the hash stays
+    section.finish()
+    return {"tolerances": tolerances, "identify": {name: item for name, item in found.items() if item is not None}}
 
 
 # --- what is made from a job ---------------------------------------------------------------------------------------
@@ -481,6 +495,8 @@ def add_machine(path: Path, name: str, keys: Mapping[str, Any]) -> MachineJob:
     gap = "" if not before else "\n" if before.endswith("\n") else "\n\n"
     text = before + gap + "\n".join([f"[machines.{head}]", *lines]) + "\n"
     added = job_of_text(text, path).machine(name)
+    from compgen.data.machine import load_machine
+
     load_machine(added.machine)
     write_file(path, text)
     return added

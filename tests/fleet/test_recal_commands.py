@@ -20,9 +20,10 @@ from apscheduler.triggers.base import BaseTrigger
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.deviations import Deviations, format_deviations
+from compgen.data.toml_files import declared_settings
 from compgen.errors import InputError
 from compgen.fleet import publish
-from compgen.fleet.job import Every, cron, cron_expression, job_of_text, read_job, systemd_lines, units
+from compgen.fleet.job import Every, MachineJob, cron, cron_expression, job_of_text, read_job, systemd_lines, units
 from compgen.fleet.runner import MachineOutcome, run_jobs
 from compgen.fleet.store import open_store
 from compgen.fleet.watch import Watch, trigger_of
@@ -106,6 +107,47 @@ def test_defaults_count_for_all_machines_and_a_machine_may_differ(tmp_path):
     assert (a.machine, a.inbox, str(a.out)) == (str(tmp_path / "machines/a.toml"), tmp_path / "in/a", "/srv/a")
     assert (a.schedule.hours, b.schedule) == ((0,), Every(20))
     assert (a.policy.max_age_days, b.policy.max_age_days, b.policy.max_change_um) == (5.0, 9.0, 20.0)
+
+
+def test_a_key_of_the_defaults_is_checked_even_where_every_machine_has_its_own(tmp_path):
+    (tmp_path / "recal.toml").write_text("[defaults]\nsettle_s = -1\n" + MACHINE + "settle_s = 2\n")
+    with pytest.raises(InputError, match=r"\[defaults\] settle_s: .*not negative") as caught:
+        read_job(tmp_path / "recal.toml")
+    assert caught.value.line == 2
+    (tmp_path / "recal.toml").write_text("[defaults]\nsettle_s = -1\n")  # and where there is no machine yet
+    with pytest.raises(InputError, match="not negative"):
+        read_job(tmp_path / "recal.toml")
+
+
+def test_of_schedule_and_interval_a_machine_s_own_one_counts(tmp_path):
+    both = MACHINE + "schedule = '@daily'\n" + MACHINE.replace("mill]", "saw]").replace('"out"', '"o2"')
+    (tmp_path / "recal.toml").write_text("[defaults]\nevery_minutes = 30\n" + both)
+    mill, saw = read_job(tmp_path / "recal.toml").machines.values()
+    assert (mill.schedule, saw.schedule) == (cron("0 0 * * *"), Every(30))
+    (tmp_path / "recal.toml").write_text("[defaults]\nevery_minutes = 30\nschedule = '@daily'\n" + MACHINE)
+    with pytest.raises(InputError, match="give one of the two"):
+        read_job(tmp_path / "recal.toml")
+
+
+def cell(value):
+    """A default as the page shows it."""
+    if value is None:
+        return "none"
+    if isinstance(value, list):
+        return ", ".join(f"`{item}`" for item in value)
+    return f"`{json.dumps(value)}`" if isinstance(value, str | bool) else f"{value:g}"
+
+
+def test_the_page_lists_every_key_of_the_job_file_as_it_is_declared():
+    page = (EXAMPLE.parents[1] / "docs" / "recal.md").read_text(encoding="utf-8")
+    section = page.partition("## Job file\n")[2].partition("\n## ")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| `") and "machines.NAME" not in line]
+    declared = [(item.key.removeprefix("policy."), item, meaning) for item, meaning in declared_settings(MachineJob)]
+    assert rows[1:] == [
+        f"| `{key}` | {'required' if item.required else cell(item.shown)} | {meaning} |"
+        for key, item, meaning in declared
+    ]
+    assert rows[0].startswith("| `store` | `recal.sqlite` |")
 
 
 # --- schedules -----------------------------------------------------------------------------------------------------
