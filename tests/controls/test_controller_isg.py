@@ -631,6 +631,48 @@ def test_wrong_settings_are_refused(name, wrong, words):
         CONTROLLERS[name].read_settings(machine_with(**wrong))
 
 
+@pytest.mark.parametrize(
+    ("path", "written"),
+    [
+        ("", "volcomp0.csv"),
+        ("CNC/vc", "CNC/vc/volcomp0.csv"),
+        ("CNC/vc/", "CNC/vc/volcomp0.csv"),
+        ("C:\\vc", "C:\\vc\\volcomp0.csv"),
+        ("C:\\vc\\", "C:\\vc\\volcomp0.csv"),
+        ("C:", "C:\\volcomp0.csv"),
+        ("p" * 200, "p" * 200 + "/volcomp0.csv"),
+    ],
+)
+def test_a_folder_of_the_control_ends_with_one_slash_of_its_kind(path, written):
+    machine = machine_with(path=path)
+    assert f" {written}\n" in exported("isg-csv", machine, random_errors(machine))["volcomp0.lis"]
+
+
+def test_a_folder_of_the_control_has_at_most_200_characters():
+    with pytest.raises(InputError, match="a folder on the control is expected"):
+        CONTROLLERS["isg-csv"].read_settings(machine_with(path="p" * 201))
+
+
+@pytest.mark.parametrize("name", BOTH)
+def test_the_quantum_is_half_a_digit_of_three_lengths_and_of_eight_angles_at_the_longest_lever(name):
+    """Nanometres have 9 digits in mm, angles 12 in rad; the longest lever is 700.5 mm of Y and 40 mm of the tool."""
+    due = 0.5 * (3e-9 + 8e-12 * 740.5)
+    assert CONTROLLERS[name](machine_with()).resolution_mm() == pytest.approx(due, rel=1e-12)
+
+
+def test_ten_parameter_files_are_allowed_and_file_9_is_the_last():
+    names = [name for name in CURVE_NAMES if name[2] in "XY"]
+    texts = {}
+    for name in names[:10]:
+        low, high = TRAVELS["XYZ".index(name[2])]
+        texts[f"{name}.csv"] = f"{name[2]} {name}\n{low} 0\n{high} 0\n"
+    assert complaints("isg-csv", machine_with(), texts) == []
+    machine = machine_with()
+    texts = exported("isg-csv", machine, random_errors(machine))
+    last = texts["volcomp0.lis"].replace("file[0]  ", "file[9]  ").replace("file_format[0]", "file_format[9]")
+    assert complaints("isg-csv", machine, texts | {"volcomp0.lis": last}) == []
+
+
 @pytest.mark.parametrize("name", BOTH)
 def test_the_preflight_states_what_must_be_set_and_checked(name):
     machine = machine_with(max_records=700, path="C:\\vc", logical_axes={"X": 4})

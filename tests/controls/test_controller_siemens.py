@@ -2,6 +2,7 @@
 
 import re
 import time
+from dataclasses import replace
 from decimal import Decimal
 from itertools import product
 from pathlib import Path
@@ -14,9 +15,27 @@ from hypothesis import strategies as st
 from compgen.controls import SourceFile, controller_named
 from compgen.controls.shared.base import Monomial, Term
 from compgen.controls.siemens_cec import CecTables
-from compgen.controls.siemens_cec_tables import folded_tables
-from compgen.controls.siemens_machine_data import largest_slopes, largest_sums
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.controls.siemens_cec_tables import (
+    CecTable,
+    around_kept,
+    folded_tables,
+    reversal_statement,
+    sum_into_axes,
+    term_names,
+    with_reversal_tables,
+)
+from compgen.controls.siemens_machine_data import (
+    cec_overwrites,
+    cec_reservations,
+    cec_usage,
+    cec_warnings,
+    largest_slopes,
+    largest_sums,
+    set_violations,
+    stated_limit_violations,
+)
+from compgen.controls.siemens_text import LinearTable
+from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import CHAINS, Machine, read_machine
 from compgen.data.names import CURVE_NAMES, error_named
@@ -413,6 +432,76 @@ def test_tables_of_different_outputs_share_no_lever(tmp_path):
         assert lever.table.start_mm == Decimal(repr(machine.axes[lever.input_axis].range_mm[0]))
 
 
+def table_of(output: int, axis: int, number: float, multiplier: int = 0, direction: int = 0) -> CecTable:
+    """A table of one value from -1 to 1 mm of its input axis."""
+    linear = LinearTable(Decimal(-1), Decimal(2), Decimal(1), (Decimal(str(number)),) * 2)
+    return CecTable(axis, output, linear, direction, multiplier)
+
+
+#: X(x) for one direction, X(z), the scaled angle X(y) with the lever z of X, and that lever.
+MIXED = {0: table_of(0, 0, 0.1, 0, 1), 2: table_of(0, 2, 0.2), 3: table_of(0, 1, 0.3, 6), 5: table_of(0, 2, 0.4)}
+
+
+def test_tables_around_kept_ones_keep_their_order_and_their_multiplier():
+    moved = around_kept(MIXED, {1, 2, 4})
+    assert {index: float(entry.table.values[0]) for index, entry in moved.items()} == {0: 0.1, 3: 0.2, 5: 0.3, 6: 0.4}
+    assert {index: entry.multiplier for index, entry in moved.items()} == {0: 0, 3: 0, 5: 7, 6: 0}
+
+
+def test_tables_are_the_terms_of_both_directions_and_their_products():
+    assert term_names(MIXED) == {"X(z)", "X(y)*z"}
+    assert term_names({0: table_of(1, 0, 0.1, direction=-1)}) == set()
+
+
+@pytest.mark.parametrize(("mode", "total"), [("S1", 1.12), ("S2", 0.42), ("S3", 0.72), ("S4", 0.82)])
+def test_factors_act_as_the_mode_has_them_whatever_the_order_of_their_indices(mode, total):
+    """0.1 + 0.2 + 0.3 x 0.4, and what the mode leaves of 0.3 and 0.4."""
+    turned = {0: table_of(0, 2, 0.4), 3: table_of(0, 1, 0.3, 1), 4: table_of(0, 2, 0.2), 7: table_of(0, 0, 0.1)}
+    for tables in (MIXED, turned):
+        sums = sum_into_axes(tables, mode, {index: entry.at(np.zeros(1)) for index, entry in tables.items()})
+        assert sums[0] == pytest.approx([total])
+        assert not np.any(sums[1]) and not np.any(sums[2])
+
+
+@pytest.mark.parametrize(("angle_rad", "written"), [(0.9e-9, False), (1.1e-9, True)])
+def test_a_product_below_half_of_the_last_decimal_is_left_out(angle_rad, written):
+    """The lever goes from -250 to 500 mm around its origin: 0.5 nm are reached at 1e-9 rad."""
+    x, z = np.array([0.0, 100.0]), np.array([0.0, 750.0])
+    product_term = Term("X(x)*z", 0, x, (Monomial(0, 1, 2, 250.0),), np.array([0.0, angle_rad]))
+    straight = Term("X(z)", 2, z, (Monomial(0),), np.array([0.001, 0.0]))
+    terms = [straight, product_term]
+    tables = folded_tables(terms, {term.name: term.start for term in terms}, flip=False, mode="S2")
+    assert any(entry.multiplier for entry in tables.values()) is written
+
+
+@pytest.mark.parametrize(("sign", "plus"), [("error", +0.004), ("correction", -0.004)])
+def test_a_reversal_is_a_pair_of_halves_that_says_when_it_acts(tmp_path, sign, plus):
+    """+8 um: the tool is 4 um too far after positive travel; an error table holds +4 um there, a correction -4 um."""
+    machine = make_machine(tmp_path, f'sign = "{sign}"\nmult_mode = "S1"')
+    reversal = ReversalCurves({(1, 2): Curve(np.zeros(1), np.array([0.008]), np.zeros(1))})
+    options = {"subtracts": sign == "error", "max_points": 100, "step_mm": (None, None, None)}
+    pair = with_reversal_tables(machine, {}, reversal, **options)
+    assert {index: (entry.direction, entry.input_axis, entry.output_axis) for index, entry in pair.items()} == {
+        0: (1, 1, 2),
+        1: (-1, 1, 2),
+    }
+    assert [entry.table.numbers.tolist() for entry in pair.values()] == [[plus] * 2, [-plus] * 2]
+    assert [entry.label for entry in pair.values()] == [
+        f"reversal Y in Z, after {words} travel of Y" for words in ("positive", "negative")
+    ]
+    assert pair[0].table.nodes_mm.tolist() == list(machine.axes[1].range_mm)
+    behind = with_reversal_tables(machine, {0: MIXED[0], 4: MIXED[2]}, reversal, **options)
+    assert sorted(behind) == [0, 4, 5, 6]
+    names = ("AX1", "AX2", "AX3")
+    assert reversal_statement(pair, names) == (
+        f" Direction: table 0 acts after positive travel of AX2 only; it puts {plus:+.6f} mm into the sum of AX3 there, "
+        "its partner with DIRECTION -1 the opposite after negative travel."
+    )
+    assert reversal_statement({2: MIXED[2]}, names) == ""
+    tiny = ReversalCurves({(1, 2): Curve(np.zeros(1), np.array([0.00009]), np.zeros(1))})
+    assert with_reversal_tables(machine, {}, tiny, **options) == {}
+
+
 # --- cross-error compensation: run-time rules ----------------------------------------------------------------------
 
 
@@ -543,6 +632,122 @@ def test_folds_do_not_count_in_the_rate_because_the_control_limits_the_sum(simpl
     tables = folded_tables(terms, {term.name: term.start for term in terms}, flip=False, mode="S1")
     slopes = largest_slopes(machine, tables, "S1")
     np.testing.assert_allclose(slopes[0], [2e-5 / 2000.0 * 1000.0, 0.0, 1e-5], atol=1e-11)
+
+
+def fine_table(output: int, axis: int, heights: dict[int, float], nodes: int = 201) -> CecTable:
+    """A table every 10 mm from -1000 mm, zero but at some nodes."""
+    values = tuple(Decimal(str(heights.get(n, 0.0))) for n in range(nodes))
+    return CecTable(axis, output, LinearTable(Decimal(-1000), Decimal(10), Decimal(-1000 + 10 * (nodes - 1)), values))
+
+
+@pytest.mark.parametrize("node", [1, 57, 199])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_one_steep_interval_of_a_fine_table_is_found_wherever_it_is(simple, node, axis):
+    machine, _, _ = simple()
+    slopes = largest_slopes(machine, {0: fine_table(2, axis, {node: 0.004, 100: 0.001})}, "S1")
+    expected = np.zeros((3, 3))
+    expected[2, axis] = 0.004 / 10.0
+    np.testing.assert_allclose(slopes, expected, atol=1e-15)
+    ((value, place),) = largest_sums(machine, {0: fine_table(2, axis, {node: -0.004, 100: 0.001})}, "S1")[2:]
+    assert (value, place[axis]) == pytest.approx((-0.004, -1000.0 + 10.0 * node))
+
+
+def test_the_slope_along_one_axis_counts_where_the_other_factor_is_largest(simple):
+    """(0.1 mm of X at node 57) times (0.2 mm of Y at node 3): 0.1 x 0.2 / 10 mm along either."""
+    machine, _, _ = simple()
+    lever = fine_table(0, 1, {3: 0.2})
+    tables = {0: replace(fine_table(0, 0, {57: 0.1}), multiplier=2), 1: lever}
+    slopes = largest_slopes(machine, tables, "S2")
+    np.testing.assert_allclose(slopes[0], [0.002, 0.002, 0.0], atol=1e-15)
+    assert largest_sums(machine, tables, "S2")[0] == (pytest.approx(0.02), (-430.0, -970.0, pytest.approx(-1000.0)))
+
+
+@pytest.mark.parametrize(
+    ("indices", "words"),
+    [
+        ((0,), "0"),
+        ((0, 1), "0 ... 1"),
+        ((2, 3, 4, 6), "2 ... 4, 6"),
+        ((0, 2, 4, 5, 8, 9), "0, 2, 4 ... 5, 8 ... 9"),
+    ],
+)
+def test_indices_are_named_without_those_of_other_axes(indices, words):
+    tables = {index: table_of(0, 0, 0.1) for index in indices}
+    assert cec_overwrites(tables, ())[1] == f"Tables {words}, whatever they hold now."
+
+
+@pytest.mark.parametrize(
+    ("data", "usable"),
+    [
+        ("", None),
+        ("tables_available = 8", 8),
+        ("tables_available = 8\ntables_reserved = 2", 6),
+        ("tables_available = 8\ntables_reserved = 2\nkept_tables = [7, 8, 900]", 5),
+        ("tables_available = 2\ntables_reserved = 5", 1),
+    ],
+)
+def test_tables_for_the_errors_are_those_that_nobody_else_needs(simple, data, usable):
+    _, _, own = simple(data)
+    assert own.tables_usable == usable
+
+
+def test_equal_indices_and_two_active_encoders_are_refused(simple, tmp_path):
+    with pytest.raises(InputError, match="a list of different table indices"):
+        simple("kept_tables = [6, 6]")
+    both = simple_machine(tmp_path, "encoder = [0, 1]\nactive_encoder = [0, 1]", "siemens-eec")
+    with pytest.raises(InputError, match="active_encoder: one of the encoders of X"):
+        controller_named("siemens-eec").read_settings(both)
+
+
+def test_a_step_may_use_every_node_that_the_control_takes(simple):
+    """2000 mm: 41 nodes at 50 mm."""
+    assert simple("max_points = 41\nstep_mm = { X = 50.0 }")[2].step_mm == (50.0, None, None)
+    with pytest.raises(InputError, match="50 mm gives more than the 40 nodes"):
+        simple("max_points = 40\nstep_mm = { X = 50.0 }")
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        (table_of(0, 0, 0.00049), ""),
+        (table_of(0, 0, 0.00051), "AX1: the sum at the reference point is +0.000510 mm (X); the axis jumps by it"),
+        (fine_table(1, 0, {57: 0.99}), ""),
+        (
+            fine_table(1, 0, {57: 1.01}),
+            "AX2: the sum changes by up to 0.101 mm per mm of travel; the usual MD32730 is 10",
+        ),
+        (table_of(2, 0, -1.01), "AX3: the sum reaches -1.0100 mm; the usual MD32720 is 1 mm"),
+    ],
+)
+def test_usual_limits_and_jumps_are_warned_of(simple, table, words):
+    machine, control, own = simple()
+    found = cec_warnings(machine, own.axis_names, {0: table}, own, largest_sums(machine, {0: table}, "S1"))
+    assert any(text.startswith(words) for text in found) if words else found == []
+
+
+@pytest.mark.parametrize(("tables", "nodes", "said"), [(6, 200, False), (7, 2, True), (6, 201, True)])
+def test_what_the_smallest_controls_hold_needs_no_statement(simple, tables, nodes, said):
+    """840D sl with three axes: six tables; 828D: 200 nodes. The machine file says nothing of either."""
+    _, _, own = simple()
+    held = {index: fine_table(0, 1, {}, nodes) for index in range(tables)}
+    found = [text for text in cec_reservations(held, own) if "how many the control has is not stated" in text]
+    assert [f"these are {tables} tables with up to {nodes} nodes" in text for text in found] == [True] * said
+
+
+@pytest.mark.parametrize(("available", "broken"), [(3, True), (4, False)])
+def test_the_highest_index_is_the_number_of_tables(simple, available, broken):
+    machine, _, own = simple(f"tables_available = {available}")
+    tables = {3: fine_table(0, 1, {5: 0.1})}
+    found = set_violations(machine, tables, 2000, own.tables_available)
+    assert found == ([f"4 tables are needed, the control has {available}"] if broken else [])
+    (use,) = [item for item in cec_usage(machine, tables, own) if item.name == "tables"]
+    assert (use.used, use.allowed) == (4, available)
+
+
+@pytest.mark.parametrize(("limit_mm", "broken"), [(0.0999, True), (0.1001, False)])
+def test_a_stated_limit_is_broken_only_beyond_it(simple, limit_mm, broken):
+    machine, _, own = simple(f"max_sum_mm = {limit_mm}")
+    assert len(stated_limit_violations(machine, {0: table_of(0, 1, -0.1)}, own)) == broken
 
 
 @pytest.mark.parametrize(

@@ -216,6 +216,12 @@ def test_settings_of_the_two_kinds_are_taken_where_the_own_section_is_silent():
         control.read_settings(machine_with(own={"siemens-cec-eec": {"eec_max_pints": 4}}))
 
 
+def test_the_rounding_of_both_kinds_adds_up():
+    machine = machine_with(own={"siemens-cec-eec": {"sign": "error", "eec_decimals": 3}})
+    cross, both = (controller_named(name)(machine).resolution_mm() for name in ("siemens-cec", "siemens-cec-eec"))
+    assert both - cross == pytest.approx(0.5e-3)  # half of the last of three decimals of an encoder table
+
+
 def test_the_preflight_list_of_both_covers_both(tmp_path):
     machine = machine_with()
     page = export(machine, errors_of(machine), "siemens-cec-eec").preflight
