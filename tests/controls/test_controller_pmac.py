@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import compgen
 from compgen.controls import CONTROLLERS, SourceFile
-from compgen.controls.pmac import CompTable1D, CompTable2D
+from compgen.controls.pmac import CompTable1D, CompTable2D, Ring, rolled, table_context
 from compgen.data import toml_files
 from compgen.data.error_table import ReversalCurves
 from compgen.data.machine import Axis, Chain, Machine
@@ -222,6 +222,97 @@ def test_a_varying_reversal_leaves_minus_half_of_it_after_either_direction(count
             assert moved == pytest.approx(-1e-5 * (x - home) - 0.5 * sign * reversal, abs=3 / 16000), (x, sign)
 
 
+# --- rings of nodes --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "first", "last", "numbers"),
+    [
+        # nodes over the travel, one more on either side with the value of the end, the negative ones behind
+        (-3, 4, -4, 5, [0, 1, 2, 3, 4, 4, -3, -3, -2, -1]),
+        # zero is in the table where the travel does not hold it
+        (2, 4, -1, 5, [2, 2, 2, 3, 4, 4, 2]),
+        (-4, -2, -5, 1, [-2, -2, -4, -4, -3, -2, -2]),
+    ],
+)
+@pytest.mark.parametrize("counts", [1000.0, -1000.0])
+def test_a_ring_holds_the_travel_and_one_node_beyond_it_negative_ones_at_the_far_end(
+    counts, low, high, first, last, numbers
+):
+    settings_ = CONTROL.read_settings(machine_with(counts_per_mm=counts, home_mm={"X": 120.0}))
+    ring = Ring(0, 500, low, high)
+    assert (ring.first, ring.last, ring.size) == (first, last, len(numbers))
+    sign = np.sign(counts)
+    assert ring.positions_mm(settings_) == pytest.approx([120.0 + sign * 0.5 * number for number in numbers])
+    assert ring.nodes_mm(settings_) == pytest.approx(
+        sorted(120.0 + sign * 0.5 * number for number in range(low, high + 1))
+    )
+
+
+def test_the_seam_of_a_table_belongs_to_zero():
+    """A position that rounding moves just below zero is the end of the last cell, and nothing lies behind it."""
+    entries = np.array([160, 80, 0, 16])
+    assert rolled(np.array([-1e-20, 0.0, 4000.0 - 1e-12]), 4000, entries) == pytest.approx([16.0, 0.0, 16.0])
+
+
+@pytest.mark.parametrize("home", [0.0, 0.2, -900.0])
+def test_nodes_of_read_tables_cover_the_travel(home):
+    """Eight entries over 4000 counts are one for each 0.5 mm of X; so are three columns over 1500; two rows one for 2 mm of Y."""
+    machine = machine_with(home_mm={"X": home, "Y": home})
+    text = (
+        "#4\nDEFINE COMP 2.3,#1D,#2D,#3,1500,8000\n16 32 0\n160 176 192 160\n0 16 32 0\n#1\nDEFINE BLCOMP 2,1000\n0 0\n"
+    )
+    for tables, steps in ((parsed(GOLDEN, machine), (0.5,)), (parsed(text, machine), (0.5, 2.0))):
+        for axis, step in enumerate(steps):
+            nodes = CONTROL(machine).table_nodes_mm(tables)[axis]
+            low, high = TRAVELS[axis]
+            assert low - step < nodes[0] <= low and high <= nodes[-1] < high + step
+            assert np.diff(nodes) == pytest.approx(np.full(len(nodes) - 1, step))
+            assert (nodes - home) / step == pytest.approx(np.rint((nodes - home) / step), abs=1e-6)
+
+
+@pytest.mark.parametrize(("own", "tables"), [({}, 3), ({"two_dimensional": True}, 6)])
+def test_the_quantum_is_half_of_a_sixteenth_of_the_coarsest_count_in_every_table(own, tables):
+    assert CONTROL(machine_with(**own)).resolution_mm() == pytest.approx(tables * 0.5 / 16.0 / 500.0)
+
+
+@pytest.mark.parametrize(("home", "needed"), [(0.0, 800_000), (-400.0, 900_000), (600.0, 900_000)])
+def test_a_table_spans_the_travel_and_the_zero_of_the_motor(home, needed):
+    machine = machine_with(home_mm={"X": home})
+    for length, named in ((needed, False), (needed - 2, True)):
+        found = CONTROL(machine).violations(parsed(f"#1 DEFINE COMP 2,{length}\n0 0\nI51=1\n", machine))
+        assert [f"the travel needs {needed}" in text for text in found] == [True] * named
+
+
+def test_the_one_motor_that_is_free_takes_the_largest_function():
+    machine = machine_with(tool=(0.0, 0.0, 0.0), motors_available=4)
+    errors = errors_of(EZX=1e-5, EYX=4e-5, EXZ=1e-5, EXY=2e-5)  # over 800, 800, 500 and 800 mm
+    (table,) = (table for table in made(machine, errors)[1].tables if table.motor == 4)
+    assert (table.source, table.target) == (1, 2)
+    # EBY acts as z EBY(y) on X and as -x EBY(y) on Z: X has the longest travel, and 800 mm times 320 urad are most
+    flat = machine_with("WFYXZT", tool=(0.0, 0.0, 0.0), motors_available=4, two_dimensional=True)
+    (table,) = (t for t in made(flat, errors_of(EZX=1e-5, EBY=4e-7))[1].tables if t.motor == 4)
+    assert isinstance(table, CompTable2D)
+    assert table.target == 3 and {table.row, table.column} == {1, 2}
+
+
+@pytest.mark.parametrize(("slope", "count"), [(0.6e-7, 3), (1.2e-7, 4)])
+def test_a_function_of_less_than_a_fiftieth_of_a_micrometre_has_no_table(slope, count):
+    """A slope over 800 mm in nine even nodes has a standard deviation of 258 mm times the slope: 0.015 and 0.031 um."""
+    machine = machine_with(tool=(0.0, 0.0, 0.0), loss_um=1e-3)
+    assert len(made(machine, errors_of(EZX=slope))[1].tables) == count
+
+
+def test_entries_stand_ten_to_a_line_and_rows_without_the_zero_at_their_corner():
+    line = table_context(CompTable1D(4, 1, 3, 2500, np.arange(25)), {1: "X", 3: "Z"})
+    assert line["command"] == "DEFINE COMP 25,#1D,#3,2500"
+    assert line["rows"] == [list(range(10)), list(range(10, 20)), list(range(20, 25))]
+    assert line["title"] == "Z over X"
+    sheet = table_context(CompTable2D(4, 1, 2, 3, 3000, 4000, np.arange(12).reshape(3, 4), False, True), {1: "X"})
+    assert sheet["command"] == "DEFINE COMP 2.3,#1,#2D,#3,3000,4000"
+    assert sheet["rows"] == [[1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]]
+
+
 # --- limits and settings ---------------------------------------------------------------------------------------------
 
 
@@ -246,6 +337,31 @@ def test_the_preflight_gives_the_scale_of_an_inch_machine(make_errors):
     for motor, counts in ((1, "1000.000000 counts per mm (25400.0000"), (3, "-500.000000 counts per mm (-12700.0000")):
         assert f"motor {motor} is {'XYZ'[motor - 1]}: {counts} counts per inch)" in text
     assert "Inch machines:" in text
+
+
+def test_numbers_have_24_bits_and_motors_those_that_there_are():
+    largest = 2**23 - 1
+    text = f"#1 DEFINE COMP 2,8000000\n{largest} -{largest}\nI186={largest}\nI51=1\n"
+    assert parsed(text).constants == {1: largest}
+    beyond = (
+        text.replace(f"\n{largest} ", f"\n{largest + 1} "),
+        text.replace(f"I186={largest}", f"I186={largest + 1}"),
+        text.replace("I186=", "I86="),
+        text.replace("I186=", "I3386="),
+        text.replace("I51=1", "I51=2"),
+    )
+    for wrong in beyond:
+        with pytest.raises(InputError):
+            parsed(wrong)
+    assert CONTROL.read_settings(machine_with(motors_available=3)).free_motors == []
+    with pytest.raises(InputError, match="motor 4 does not exist; use 1 to 3"):
+        CONTROL.read_settings(machine_with(motors_available=3, motors={"X": 4}))
+
+
+@pytest.mark.parametrize(("value", "warned"), [(-1, True), (0, False), (1, False)])
+def test_a_negative_backlash_is_said_to_be_one(value, warned):
+    tables = parsed(f"#1 DEFINE COMP 2,8000000\n0 0\nI186={value}\nI51=1\n")
+    assert any("is negative" in text for text in CONTROL(PLAIN).context(tables)["warnings"]) is warned
 
 
 def test_counts_per_mm_are_mandatory_and_say_why():
