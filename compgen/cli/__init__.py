@@ -6,6 +6,7 @@ the command runs, and with it what the command needs; ``volcomp --help`` and the
 
 from __future__ import annotations
 
+import os
 import sys
 from functools import cached_property
 from importlib import import_module
@@ -128,5 +129,12 @@ def cli(context: click.Context) -> None:
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Entry point of the console script.
+
+    A command computes with one thread of the numerical libraries unless the environment says otherwise: its matrices are
+    too small for a second one, which would only wait, at the cost of a processor.
+    """
+    if "OMP_NUM_THREADS" not in os.environ:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        os.environ.setdefault("MKL_NUM_THREADS", "1")
     sys.exit(run_command(cli))

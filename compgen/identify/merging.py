@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import stdtrit
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
@@ -155,6 +154,8 @@ def _compare(
     left_mm: float,
     freedom: float,
 ) -> tuple[InstrumentAgreement, FloatArray, FloatArray]:
+    from scipy.special import stdtrit  # imported here: slow to load, and few measurements have two instruments
+
     (one, root1), (other, root2) = first, second
     u1, u2 = (np.sqrt(np.einsum("ij,ij->i", root, root)) for root in (root1, root2))
     u = np.hypot(u1, u2)

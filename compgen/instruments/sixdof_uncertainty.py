@@ -13,7 +13,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
@@ -363,6 +362,8 @@ def _run_to_run(errors: ErrorTable, random: Sequence[Column], evaluations: Seque
     count = len(evaluations)
     if count < 2:
         return []
+    from scipy.special import chdtri  # imported here: slow to load, and one run needs none of it
+
     tables = []  # the values of each at the positions of the errors
     for item in evaluations:
         curves = {name: item.errors.curves[name].at(curve.position_mm) for name, curve in errors.curves.items()}

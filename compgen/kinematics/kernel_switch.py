@@ -1,4 +1,4 @@
-"""Compiled or plain kernels, and one BLAS thread."""
+"""Compiled or plain kernels, LAPACK, and one BLAS thread."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache
+from importlib.machinery import EXTENSION_SUFFIXES
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -125,16 +127,43 @@ def loop(**options: object) -> Callable[[Function], Function]:
     return lambda function: compile_for(function, **options)
 
 
+# LAPACK without the rest of scipy, which takes longer to load than any identification to compute.
+
+
+@cache
+def lapack() -> Any:
+    """Return the routines of ``scipy.linalg.lapack``: the same functions, so the same bits.
+
+    ``import scipy.linalg`` asks numpy for everything it has, which takes twice as long as to load numpy. The routines are
+    one compiled module of scipy that needs none of that, and it is loaded by itself; where scipy keeps it elsewhere, or
+    has been loaded already, the routines come from ``scipy.linalg.lapack``.
+    """
+    if sys.platform == "win32":
+        importlib.import_module("scipy")  # tells the system where scipy's libraries are
+    name, package = "scipy.linalg._flapack", find_spec("scipy")
+    folders = [] if package is None else [Path(folder) for folder in package.submodule_search_locations or ()]
+    files = (folder / "linalg" / f"_flapack{suffix}" for folder in folders for suffix in EXTENSION_SUFFIXES)
+    path = next((file for file in files if file.is_file()), None)
+    spec = spec_from_file_location(name, path) if path else None
+    if "scipy.linalg" in sys.modules or spec is None or spec.loader is None:
+        return importlib.import_module("scipy.linalg.lapack")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    sys.modules[name] = module  # where scipy.linalg finds it when something else needs that
+    return module
+
+
 # One BLAS thread: for matrices of a few hundred columns a second thread only waits, and another number rounds otherwise.
 
 
 @cache
-def _controller(with_scipy: bool) -> ThreadpoolController:
-    """Libraries found so far: scipy brings one of its own, which is not there before ``scipy.linalg`` is imported."""
+def _controller() -> ThreadpoolController:
+    """Numerical libraries of this process: numpy's, and that of scipy, which comes with its LAPACK."""
+    lapack()
     return ThreadpoolController()
 
 
 def one_thread() -> AbstractContextManager[object]:
     """Limit the numerical libraries to one thread for the duration of a ``with`` block."""
-    limiter: AbstractContextManager[object] = _controller("scipy.linalg" in sys.modules).limit(limits=1)
+    limiter: AbstractContextManager[object] = _controller().limit(limits=1)
     return limiter

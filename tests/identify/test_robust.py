@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import chdtri
 
 import machines
 from compgen.data.error_table import Curve, ErrorTable
@@ -15,7 +16,7 @@ from compgen.data.names import SQUARENESS_NAMES, error_named
 from compgen.data.records import approach_of
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify import IdentifyOptions, identify
-from compgen.identify.adjust.residual_tests import check_whiteness
+from compgen.identify.adjust.residual_tests import check_whiteness, chi_square_limit
 from compgen.instruments.interferometer import refractive_index
 from compgen.kinematics import modelled_errors
 from compgen.kinematics.exact_chain import tip_position
@@ -143,6 +144,12 @@ def row_of(lengths, station, point, run=1):
 
 
 # --- gross errors ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("probability", [1e-6, 0.001, 0.05, 0.3])
+def test_the_limit_of_chi_square_is_that_of_scipy(probability):
+    for freedom in (1, 2, 3, 5, 30, 1000, 10_495, 10**7):
+        assert chi_square_limit(freedom, probability) == pytest.approx(chdtri(freedom, probability), rel=2e-11)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.05, 0.1])

@@ -63,6 +63,24 @@ def test_the_order_of_calls_does_not_change_a_bit():
     assert one[-1] == ("numba", "False"), "compiled kernels were loaded for small data, which costs time"
 
 
+@pytest.mark.parametrize("first", ["", "import scipy.linalg"])
+def test_lapack_is_scipys_own_and_loads_nothing_else_of_it(first):
+    code = f"""if True:
+        import sys, numpy as np
+        {first}
+        from compgen.kinematics.kernel_switch import lapack
+        found = lapack()
+        alone = "scipy.linalg" not in sys.modules
+        from scipy.linalg import cholesky, lapack as whole
+        names = ("dpocon", "dpotrf", "dpotrs", "dtrtri", "dpbsv", "dpbtrs")
+        assert all(getattr(found, name) is getattr(whole, name) for name in names)
+        assert np.array_equal(cholesky([[4.0]]), [[2.0]])
+        print(alone)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.stdout.strip(), done.stderr) == (str(not first), "")
+
+
 SMALL = compgen.load_machine("zha-gantry")
 ERRORS = compgen.ErrorTable({}, {"EC0Y": (1e-3, 0.0)})
 HERE = np.array([[0.0, -1000.0, 0.0]])

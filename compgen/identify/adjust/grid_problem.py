@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from compgen.data.arrays import distinct
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import SQUARENESS_NAMES
@@ -42,6 +43,15 @@ class MotionMap:
         matrix = np.zeros(self.shape)
         np.add.at(matrix, (self.row, self.column), self.value)
         return matrix
+
+    def to_unknowns(self, derivatives: FloatArray) -> FloatArray:
+        """Return M^T d (unknown errors, k) for derivatives d (levels * 6, k) by delta and eps of every level, M this map."""
+        order = np.lexsort((self.row, self.column))  # sums as a matrix in compressed rows makes them
+        columns, starts = np.unique(self.column[order], return_index=True)
+        found = np.zeros((self.shape[1], derivatives.shape[1]))
+        if len(columns):
+            found[columns] = np.add.reduceat(self.value[order, None] * derivatives[self.row[order]], starts, axis=0)
+        return found
 
     def with_squareness(
         self, parameters: ErrorParameters, levels_mm: Sequence[FloatArray], derivatives: FloatArray
@@ -186,7 +196,7 @@ def levels_of(position_mm: FloatArray, *, compiled: bool = False) -> tuple[Float
         if len(levels):
             return levels, index
     position_mm = np.ascontiguousarray(position_mm)
-    sample = np.unique(position_mm[:: max(1, len(position_mm) // 1999) | 1])  # tried first, sorting all is slow
+    sample = distinct(position_mm[:: max(1, len(position_mm) // 1999) | 1])  # tried first, sorting all is slow
     found = np.minimum(np.searchsorted(sample, position_mm), len(sample) - 1)
     if np.array_equal(sample[found], position_mm):
         return sample, found
@@ -463,12 +473,9 @@ def add_normal(grid: LevelGrid, moments: Moments, tool_mm: FloatArray, state: St
             kernels.add_stations(table, np.array(of_axis), along, levers, tool_mm, rows, *entries, by_group)
         kernels.project(*entries, by_levels, matrix)
     else:
-        from scipy.sparse import csr_array  # imported here: slow to load, and compiled kernels do without
-
-        to_unknowns = csr_array((motion.value, (motion.column, motion.row)), shape=motion.shape[::-1])
         _pairs(grid, moments, levers, tool_mm, by_levels)
-        matrix[:first, :first] += np.asarray(to_unknowns @ np.asarray(to_unknowns @ by_levels).T)
-        by_group += np.asarray(to_unknowns @ _stations(grid, moments, levers, tool_mm)).reshape(by_group.shape)
+        matrix[:first, :first] += motion.to_unknowns(motion.to_unknowns(by_levels).T)
+        by_group += motion.to_unknowns(_stations(grid, moments, levers, tool_mm)).reshape(by_group.shape)
     add_own_blocks(matrix, first, grid.station_of, by_group, moments.levels[0][:, :, 0].sum(axis=1))
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arrays import median
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.names import MM_PER_UM
@@ -336,14 +337,14 @@ def standardised_spread(standardised: FloatArray) -> float:
 
     Not let below ``LEAST_SPREAD``, so that rounding in noise-free data rejects nothing.
     """
-    return max(1.4826 * float(np.median(np.abs(standardised - np.median(standardised)))), LEAST_SPREAD)
+    return max(1.4826 * median(np.abs(standardised - median(standardised))), LEAST_SPREAD)
 
 
 def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
     """Mark the readings whose residual over its standard uncertainty (n,) lies within the robust limit."""
     size = np.abs(standardised)
     largest = float(size.max())
-    quick = 1.25 * float(np.median(size[:: max(1, len(size) // 500) | 1]))  # of a sample, and on the safe side
+    quick = 1.25 * median(size[:: max(1, len(size) // 500) | 1])  # of a sample, and on the safe side
     if largest <= LIMIT * max(quick, LEAST_SPREAD):
         return np.ones(len(size), dtype=bool)
     return np.asarray(size <= LIMIT * standardised_spread(standardised))

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.linalg import LinAlgError
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpocon, dpotrf, dpotrs, dtrtri
 
 from compgen.data.csv_files import FloatArray
 from compgen.errors import ConvergenceError, UndeterminedError
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, LeastSquaresProblem, State
+from compgen.kinematics.kernel_switch import lapack
 
 #: The remaining distance to the optimum, estimated from the last two steps, that ends the iteration (mm; angles count
 #: at a lever of one metre).
@@ -42,7 +42,7 @@ class Factor:
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the solution for one right side (size,) or several (size, k)."""
         scale = self.scale if right.ndim == 1 else self.scale[:, None]
-        solution, _ = dpotrs(self.lower, right * scale, lower=1)
+        solution, _ = lapack().dpotrs(self.lower, right * scale, lower=1)
         return np.asarray(scale * solution)
 
     def inverse_root(self) -> FloatArray:
@@ -63,7 +63,7 @@ def _invert_lower(lower: FloatArray, inverse: FloatArray) -> None:
     """Fill in the lower triangle of the inverse of a lower triangular matrix (n, n)."""
     count = len(lower)
     if count <= _WHOLE:
-        inverse[:] = dtrtri(lower, lower=1)[0]
+        inverse[:] = lapack().dtrtri(lower, lower=1)[0]
         return
     half = count // 2
     _invert_lower(lower[:half, :half], inverse[:half, :half])
@@ -81,10 +81,10 @@ def factorise(matrix: FloatArray, damping: float = 0.0) -> Factor:
     if damping:
         scaled[np.diag_indices(len(scaled))] += damping
     norm = float(np.abs(scaled).sum(axis=0).max())
-    lower, failed = dpotrf(scaled.T, lower=1, overwrite_a=1)  # symmetric, and in the order that needs no copy
+    lower, failed = lapack().dpotrf(scaled.T, lower=1, overwrite_a=1)  # symmetric, and in the order that needs no copy
     if failed:
         raise LinAlgError("not positive definite")
-    rcond, _ = dpocon(lower, norm, uplo="L")
+    rcond, _ = lapack().dpocon(lower, norm, uplo="L")
     return Factor(matrix, lower, scale, float(rcond))
 
 
