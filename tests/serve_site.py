@@ -10,10 +10,11 @@ from pathlib import Path
 import serve_factory as factory
 from argon2 import PasswordHasher
 
-from compgen.fleet.dashboard import settings as users
+from compgen.fleet.dashboard import users
 from compgen.fleet.dashboard.app import make_app
 from compgen.fleet.dashboard.server import make_server
-from compgen.fleet.dashboard.settings import DashboardSettings, Users
+from compgen.fleet.dashboard.settings import DashboardSettings
+from compgen.fleet.dashboard.users import Users
 from compgen.fleet.store import open_store
 
 OWN = "http://localhost:8765"

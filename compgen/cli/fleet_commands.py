@@ -27,10 +27,11 @@ from compgen.cli.common import (
 )
 from compgen.cli.terminal import answer, complain, say, stdout
 from compgen.errors import InputError
+from compgen.fleet.dashboard.settings import DashboardSettings, default_users, read_token
 from compgen.fleet.job import Job, MachineJob, add_machine, command_words, read_job, units
 
 if TYPE_CHECKING:
-    from compgen.fleet.dashboard.settings import Users
+    from compgen.fleet.dashboard.users import Users
     from compgen.fleet.drift import Drift
     from compgen.fleet.store import Store
 
@@ -69,6 +70,18 @@ def needed() -> None:
         raise InputError(f"volcomp recal needs {', '.join(missing)}; install compgen[recal]")
 
 
+job_file_option = click.option(
+    "--job", "job_file", default=JOB, show_default=True, type=PATH, metavar="FILE", help="Job file."
+)
+log_option = click.option(
+    "--log",
+    default="auto",
+    show_default=True,
+    type=click.Choice(["auto", "json", "text"]),
+    help="Form of the logs on stderr; auto: words on a terminal, else one JSON object per line.",
+)
+
+
 def job_option(command: Command) -> Command:
     """Add --job and --log; the command receives ``job``, read."""
 
@@ -80,11 +93,7 @@ def job_option(command: Command) -> Command:
         logs.configure(log)  # type: ignore[arg-type]
         return command(*args, job=read_job(job_file), **options)
 
-    form = click.Choice(["auto", "json", "text"])
-    text = "Form of the logs on stderr; auto: words on a terminal, else one JSON object per line."
-    logged: Any = click.option("--log", default="auto", show_default=True, type=form, help=text)(wrapper)
-    file: Any = {"default": JOB, "show_default": True, "type": PATH, "metavar": "FILE", "help": "Job file."}
-    return click.option("--job", "job_file", **file)(logged)  # type: ignore[no-any-return]
+    return job_file_option(log_option(wrapper))  # type: ignore[return-value]
 
 
 notify_option = click.option(
@@ -703,7 +712,7 @@ def _copied(counts: dict[str, int], as_json: bool) -> int:
 @recal_command.command("add")
 @click.argument("name")
 @options_of(MachineJob, "keys", only=ADDED_KEYS, build=dict)
-@click.option("--job", "job_file", default=JOB, show_default=True, type=PATH, metavar="FILE", help="Job file.")
+@job_file_option
 @json_option
 def add_command(name: str, job_file: Path, as_json: bool, keys: dict[str, Any]) -> int:
     """Add the machine NAME to the job file, which is made if it does not exist; paths are relative to it.
@@ -733,36 +742,10 @@ def _missing(error: ImportError) -> InputError:
 @click.option(
     "--store", metavar="URL", help="sqlite:///FILE, a path, or postgresql://HOST/NAME; default: that of --job."
 )
-@click.option("--job", type=PATH, metavar="FILE", help="Job file whose folders follow decisions.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address on which it listens.")
-@click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535), help="Port; 0: any free one.")
-@click.option("--name", "names", multiple=True, metavar="HOST", help="Additional host name that browsers use.")
-@click.option("--decide", is_flag=True, help="Let users who are logged in approve, reject and roll back.")
-@click.option("--private", is_flag=True, help="Reading needs a login too.")
-@click.option("--behind-tls", is_flag=True, help="A proxy in front speaks HTTPS; cookies go over HTTPS only.")
-@click.option("--users", type=PATH, metavar="FILE", help="Users; default: next to the SQLite store.")
-@click.option(
-    "--metrics-token-file",
-    type=PATH,
-    metavar="FILE",
-    help="Holds the token without which /metrics is not shown.",
-)
-@click.option("--log", type=click.Choice(["auto", "json", "text"]), default="auto", help="Form of the logs on stderr.")
+@options_of(DashboardSettings, "given", without=("store_url",), read={"metrics_token": read_token}, build=dict)
+@log_option
 @click.pass_context
-def serve_command(
-    context: click.Context,
-    store: str | None,
-    job: Path | None,
-    host: str,
-    port: int,
-    names: tuple[str, ...],
-    decide: bool,
-    private: bool,
-    behind_tls: bool,
-    users: Path | None,
-    metrics_token_file: Path | None,
-    log: str,
-) -> int:
+def serve_command(context: click.Context, store: str | None, given: dict[str, Any], log: str) -> int:
     """Show the fleet in a browser: history, drift, before and after of proposed tables.
 
     It only reads, and only this computer reaches it, unless options say otherwise. Runs until SIGTERM or Ctrl-C.
@@ -777,21 +760,11 @@ def serve_command(
     try:
         from compgen.fleet import logs
         from compgen.fleet.dashboard.server import run
-        from compgen.fleet.dashboard.settings import DashboardSettings, default_users
     except ImportError as error:
         raise _missing(error) from error
-    url = _store_url(store, job)
-    token = None
-    if metrics_token_file is not None:
-        try:
-            token = metrics_token_file.read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"cannot be read: {error}", file=metrics_token_file) from error
-        if len(token) < 16 or not token.isascii():
-            raise InputError("expected a token of at least 16 ASCII characters", file=metrics_token_file)
-    file = users if users is not None else default_users(url)
+    url = _store_url(store, given["job"])
     logs.configure(log)  # type: ignore[arg-type]  # one of the choices
-    run(DashboardSettings(url, host, port, names, decide, private, behind_tls, file, job, token))
+    run(DashboardSettings(url, **{**given, "users": given["users"] or default_users(url)}))
     return 0
 
 
@@ -814,16 +787,17 @@ def _store_url(store: str | None, job: Path | None) -> str:
 
 def _users(users: Path | None, store: str | None) -> Users:
     try:
-        from compgen.fleet.dashboard.settings import Users, default_users
+        from compgen.fleet.dashboard.users import Users
+
+        file = users if users is not None else default_users(store) if store else None
     except ImportError as error:
         raise _missing(error) from error
-    file = users if users is not None else default_users(store) if store else None
     if file is None:
         raise click.UsageError("give --users FILE, or --store FILE of an SQLite store")
     return Users(file)
 
 
-_users_option = click.option("--users", type=PATH, metavar="FILE", help="File of the users.")
+_users_option = options_of(DashboardSettings, "users", only=("users",), build=lambda users: users)
 _store_option = click.option("--store", metavar="URL", help="SQLite store; the file of its users is next to it.")
 
 
@@ -843,7 +817,7 @@ def add_user(name: str, users: Path | None, store: str | None, password_stdin: b
       volcomp serve add-user meyer --users users.json
     """
     file = _users(users, store)
-    from compgen.fleet.dashboard.settings import check_name
+    from compgen.fleet.dashboard.users import check_name
 
     check_name(name)
     if password_stdin:

@@ -314,7 +314,8 @@ def test_the_dashboard_reads_and_decides_on_it(url, opened, tmp_path):
     pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
     pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
     from compgen.fleet.dashboard.app import make_app
-    from compgen.fleet.dashboard.settings import DashboardSettings, Users
+    from compgen.fleet.dashboard.settings import DashboardSettings
+    from compgen.fleet.dashboard.users import Users
 
     factory, own = _loaded(HERE / "serve_factory.py"), "http://localhost:8765"
     factory.make_factory(url).close()

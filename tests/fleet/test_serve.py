@@ -24,7 +24,8 @@ from compgen.fleet.dashboard import app as reading
 from compgen.fleet.dashboard import background
 from compgen.fleet.dashboard import guard as limits
 from compgen.fleet.dashboard import guard as sessions
-from compgen.fleet.dashboard.settings import DashboardSettings, Users, check_settings, default_users
+from compgen.fleet.dashboard.settings import DashboardSettings, check_settings, default_users
+from compgen.fleet.dashboard.users import Users
 from compgen.fleet.status import fleet
 from compgen.fleet.store import open_store
 

@@ -19,7 +19,7 @@ from compgen.fleet import decisions
 from compgen.fleet.dashboard import guard as limits
 from compgen.fleet.dashboard import server
 from compgen.fleet.dashboard import server as patience
-from compgen.fleet.dashboard.settings import Users
+from compgen.fleet.dashboard.users import Users
 
 factory, OWN, PASSWORD, DECISIONS = helper.factory, helper.OWN, helper.PASSWORD, helper.DECISIONS
 #: How long a test waits for an answer of the server, s.

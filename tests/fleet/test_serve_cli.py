@@ -27,7 +27,8 @@ from compgen.cli.common import run_command
 from compgen.errors import InputError
 from compgen.fleet.dashboard.app import make_app
 from compgen.fleet.dashboard.metrics import WatchMetrics, start_metrics
-from compgen.fleet.dashboard.settings import DashboardSettings, Users
+from compgen.fleet.dashboard.settings import DashboardSettings, read_token
+from compgen.fleet.dashboard.users import Users
 from compgen.fleet.runner import MachineOutcome
 from compgen.fleet.store import open_store
 
@@ -87,7 +88,7 @@ def test_the_password_is_asked_for_twice_and_never_shown(tmp_path):
         (["serve", "--store", "x.sqlite", "--name", "http://a"], "is not a host name"),
         (["serve", "--store", "mysql://h/n"], "is not a store"),
         (["serve", "--job", "no.toml"], "no.toml"),
-        (["serve", "--store", "x.sqlite", "--metrics-token-file", "no"], "cannot be read"),
+        (["serve", "--store", "x.sqlite", "--metrics-token-file", "no"], "no: no such file"),
         (["serve", "add-user", "automatic", "--users", "u.json"], "choose another name"),
         (["serve", "remove-user", "nobody", "--users", "u.json"], "has no user"),
         (["serve", "add-user", "meyer"], "give --users FILE"),
@@ -98,6 +99,24 @@ def test_what_is_not_safe_or_missing_is_exit_code_2_with_the_reason(tmp_path, mo
     assert run_command(cli, words) == 2
     assert message in capfd.readouterr().err
     assert not (tmp_path / "u.json").exists()
+
+
+def test_the_page_lists_every_option_of_the_command():
+    page = (Path(__file__).resolve().parents[2] / "docs" / "serve.md").read_text(encoding="utf-8")
+    table = page.partition("| option | meaning |\n")[2].partition("\n\n")[0]
+    listed = [
+        name for row in table.splitlines() for name in re.findall(r"--[a-z-]+", row.split("|")[1]) if name != "---"
+    ]
+    options = [item.opts[0] for item in serve_commands.serve_command.params if item.opts[0] != "--plugin"]
+    assert sorted(listed) == sorted(options)
+
+
+def test_a_token_that_could_be_guessed_is_refused(tmp_path):
+    (tmp_path / "token").write_text("  15 characters!!\n")
+    with pytest.raises(InputError, match="at least 16 ASCII characters"):
+        read_token(tmp_path / "token")
+    (tmp_path / "token").write_text("sixteen letters!\n")
+    assert read_token(tmp_path / "token") == "sixteen letters!"
 
 
 def test_the_server_starts_answers_and_stops_on_sigterm_with_exit_code_0(tmp_path):

@@ -58,7 +58,8 @@ from compgen.fleet.dashboard.guard import (
     set_cookie,
 )
 from compgen.fleet.dashboard.metrics import CONTENT_TYPE, ServeMetrics
-from compgen.fleet.dashboard.settings import DashboardSettings, Users, check_settings
+from compgen.fleet.dashboard.settings import DashboardSettings, check_settings
+from compgen.fleet.dashboard.users import Users
 from compgen.fleet.database import StoreError
 from compgen.fleet.job import read_job
 from compgen.fleet.recheck import format_recheck_points

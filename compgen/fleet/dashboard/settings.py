@@ -1,28 +1,15 @@
-"""Settings of the dashboard, and the file of its users."""
+"""Settings of the dashboard; ``volcomp serve --help`` loads this module, so what needs a library is imported where it is used."""
 
 from __future__ import annotations
 
 import ipaddress
-import json
-import os
 import re
-import secrets
-import tempfile
-import threading
-import unicodedata
-from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
-from argon2 import PasswordHasher
-from argon2.exceptions import Argon2Error, InvalidHashError
-
-from compgen.data.files import sha256_of
+from compgen.data.files import read_text
+from compgen.data.toml_files import option
 from compgen.errors import InputError
-from compgen.fleet.database import sqlite_path
-from compgen.fleet.records import AUTOMATIC
 
 #: Names under which a browser of this computer reaches the dashboard.
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
@@ -33,29 +20,28 @@ HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|\[[0-9A-F
 class DashboardSettings:
     """How the dashboard runs.
 
-    Parameters
-    ----------
-    store_url : the store, see :func:`compgen.fleet.store.open_store`.
-    host, port : where it listens.
-    names : other host names under which browsers may call it.
-    decide : whether users who are logged in may approve, reject and roll back; otherwise it only reads.
-    private : whether reading needs a login too.
-    tls : whether a proxy in front of it speaks HTTPS to the browsers.
-    users : file of the users; None where nobody can log in.
-    job : job file, whose folders and notifications follow the decisions.
-    metrics_token : what a reader of ``/metrics`` must show; needed where reading needs a login.
+    ``store_url`` is the store, see :func:`compgen.fleet.store.open_store`; ``users`` None: nobody can log in.
     """
 
     store_url: str
-    host: str = "127.0.0.1"
-    port: int = 8765
-    names: tuple[str, ...] = ()
-    decide: bool = False
-    private: bool = False
-    tls: bool = False
-    users: Path | None = None
-    job: Path | None = None
-    metrics_token: str | None = None
+    job: Path | None = option(
+        None,
+        "Job file whose folders and notifications follow decisions, and whose tolerances forecasts use.",
+        metavar="FILE",
+    )
+    host: str = option("127.0.0.1", "Address on which it listens.")
+    port: int = option(8765, "Port; 0: any free one.", within=(0, 65535))
+    names: tuple[str, ...] = option((), "Additional host name that browsers use.", name="--name", metavar="HOST")
+    decide: bool = option(False, "Let users who are logged in approve, reject and roll back.")
+    private: bool = option(False, "Reading needs a login too.")
+    tls: bool = option(False, "A proxy in front speaks HTTPS; cookies go over HTTPS only.", name="--behind-tls")
+    users: Path | None = option(None, "File of the users; default: next to the SQLite store.", metavar="FILE")
+    metrics_token: str | None = option(
+        None,
+        "File with the token that /metrics asks for; with --private there is no /metrics without one.",
+        name="--metrics-token-file",
+        metavar="FILE",
+    )
 
     @property
     def scheme(self) -> str:
@@ -108,146 +94,17 @@ def check_settings(settings: DashboardSettings) -> DashboardSettings:
     return settings
 
 
+def read_token(path: str | Path) -> str:
+    """Return the token of the metrics from its file; InputError for one that could be guessed."""
+    token = read_text(path).strip()
+    if len(token) < 16 or not token.isascii():
+        raise InputError("expected a token of at least 16 ASCII characters", file=path)
+    return token
+
+
 def default_users(store_url: str) -> Path | None:
     """Return the file of users that belongs to a store: next to an SQLite file; None for a store on a server."""
+    from compgen.fleet.database import sqlite_path
+
     path = sqlite_path(store_url)
     return None if path is None else Path(f"{path}.users.json")
-
-
-# --- users ---------------------------------------------------------------------------------------------------------
-#
-# The store never forgets anything and is copied into backups, but a password that was changed must be gone: so users have
-# a file of their own.
-
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
-SHORTEST, LONGEST = 12, 256
-#: Hashes that are worked out at the same time; each takes 64 MiB.
-AT_ONCE = 2
-
-
-class Users:
-    """The file of users; it is read again at every question, so that a change counts at once."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._hasher = PasswordHasher()  # Argon2id with the parameters of RFC 9106, section 4, second choice
-        self._slots = threading.BoundedSemaphore(AT_ONCE)
-
-    def names(self) -> list[str]:
-        """Return the names of all users."""
-        return sorted(self._read()[0])
-
-    def stamp(self, name: str) -> str | None:
-        """Return what changes when the user's password does; None for an unknown user."""
-        found = self._read()[0].get(name)
-        return None if found is None else sha256_of(found.encode())
-
-    def may_decide(self, name: str) -> bool:
-        """Whether the user is there and more than a reader."""
-        users, readers = self._read()
-        return name in users and name not in readers
-
-    def verify(self, name: str, password: str) -> bool:
-        """Whether the password is right; an unknown name takes as long as a wrong password."""
-        found = self._read()[0].get(name)
-        if len(password) > LONGEST:
-            return False
-        with self._slots:
-            try:
-                right = self._hasher.verify(found or _nobody(), _normal(password))
-            except (Argon2Error, InvalidHashError):
-                return False
-        return right and found is not None
-
-    def add(self, name: str, password: str, *, reader: bool = False) -> bool:
-        """Add a user or change password and rights; return whether the user is new. InputError for what cannot be taken.
-
-        A ``reader`` sees what needs a login and decides nothing.
-        """
-        check_name(name)
-        check_password(name, password)
-        users, readers = self._read()
-        new = name not in users
-        others = {known.lower() for known in users if known != name}
-        if name.lower() in others:
-            raise InputError(f"{name!r} differs from another user by capital letters only; choose another name")
-        users[name] = self._hasher.hash(_normal(password))
-        self._write(users, readers | {name} if reader else readers - {name})
-        return new
-
-    def remove(self, name: str) -> None:
-        """Remove a user, whose sessions end at once; InputError if there is none."""
-        users, readers = self._read()
-        if name not in users:
-            raise InputError(f"has no user {name!r}", file=self.path)
-        del users[name]
-        self._write(users, readers - {name})
-
-    def _read(self) -> tuple[dict[str, str], frozenset[str]]:
-        """Return the hashes by name, and who only reads."""
-        try:
-            with self.path.open(encoding="utf-8") as stream:
-                if os.name == "posix" and os.fstat(stream.fileno()).st_mode & 0o022:
-                    raise InputError("others may write this file of users; chmod 600 it", file=self.path)
-                data = json.load(stream)
-        except FileNotFoundError:
-            return {}, frozenset()
-        except (OSError, ValueError) as error:
-            raise InputError(f"cannot be read as a file of users: {error}", file=self.path) from error
-        users = data.get("users") if isinstance(data, dict) else None
-        if not isinstance(users, dict) or not all(isinstance(item, str) for item in users.values()):
-            raise InputError("is not a file of users; make one with `volcomp serve add-user`", file=self.path)
-        readers = data.get("readers", [])
-        if not isinstance(readers, list) or not all(isinstance(item, str) for item in readers):
-            raise InputError(
-                "has a malformed list of who only reads; make it again with `volcomp serve add-user`", file=self.path
-            )
-        return users, frozenset(readers)
-
-    def _write(self, users: Mapping[str, str], readers: frozenset[str]) -> None:
-        """Replace the file in one step; only its owner may read it."""
-        text = json.dumps({"users": dict(sorted(users.items())), "readers": sorted(readers)}, indent=2) + "\n"
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(prefix=".users-", dir=self.path.parent)  # readable by the owner only
-        except OSError as error:
-            raise InputError(f"cannot be written: {error.strerror or error}", file=self.path) from error
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as stream:
-                stream.write(text)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(name, self.path)
-        except OSError as error:
-            with suppress(OSError):
-                os.unlink(name)
-            raise InputError(f"cannot be written: {error.strerror or error}", file=self.path) from error
-
-
-@cache
-def _nobody() -> str:
-    """Return a hash that is compared with where there is no user."""
-    return PasswordHasher().hash(secrets.token_urlsafe())
-
-
-def check_name(name: str) -> None:
-    """Raise InputError unless ``name`` can be that of a user."""
-    if not NAME.fullmatch(name):
-        raise InputError(f"{name!r} is not a name: letters, digits and . _ @ -, at most 64, are allowed")
-    if name.lower() == AUTOMATIC:
-        raise InputError(f"{name!r} signs decisions that no person made; choose another name")
-
-
-def check_password(name: str, password: str) -> None:
-    """Raise InputError for a password that is too short, too long, or the name."""
-    if not SHORTEST <= len(password) <= LONGEST:
-        raise InputError(f"a password has {SHORTEST} to {LONGEST} characters; this one has {len(password)}")
-    if name.lower() in password.lower() or len(set(password)) < 5:
-        raise InputError(
-            "this password is easy to guess: it contains the name, or fewer than five different characters"
-        )
-
-
-def _normal(password: str) -> str:
-    """One form for letters that keyboards write in several ways."""
-    return unicodedata.normalize("NFC", password)

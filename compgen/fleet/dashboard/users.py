@@ -1,0 +1,159 @@
+"""The users of the dashboard: names, passwords, and who only reads, in a file.
+
+The store never forgets anything and is copied into backups, but a password that was changed must be gone: so users have a
+file of their own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import tempfile
+import threading
+import unicodedata
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+from argon2 import PasswordHasher
+from argon2.exceptions import Argon2Error, InvalidHashError
+
+from compgen.data.files import sha256_of
+from compgen.errors import InputError
+from compgen.fleet.records import AUTOMATIC
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+SHORTEST, LONGEST = 12, 256
+#: Hashes that are worked out at the same time; each takes 64 MiB.
+AT_ONCE = 2
+
+
+class Users:
+    """The file of users; it is read again at every question, so that a change counts at once."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._hasher = PasswordHasher()  # Argon2id with the parameters of RFC 9106, section 4, second choice
+        self._slots = threading.BoundedSemaphore(AT_ONCE)
+
+    def names(self) -> list[str]:
+        """Return the names of all users."""
+        return sorted(self._read()[0])
+
+    def stamp(self, name: str) -> str | None:
+        """Return what changes when the user's password does; None for an unknown user."""
+        found = self._read()[0].get(name)
+        return None if found is None else sha256_of(found.encode())
+
+    def may_decide(self, name: str) -> bool:
+        """Whether the user is there and more than a reader."""
+        users, readers = self._read()
+        return name in users and name not in readers
+
+    def verify(self, name: str, password: str) -> bool:
+        """Whether the password is right; an unknown name takes as long as a wrong password."""
+        found = self._read()[0].get(name)
+        if len(password) > LONGEST:
+            return False
+        with self._slots:
+            try:
+                right = self._hasher.verify(found or _nobody(), _normal(password))
+            except (Argon2Error, InvalidHashError):
+                return False
+        return right and found is not None
+
+    def add(self, name: str, password: str, *, reader: bool = False) -> bool:
+        """Add a user or change password and rights; return whether the user is new. InputError for what cannot be taken.
+
+        A ``reader`` sees what needs a login and decides nothing.
+        """
+        check_name(name)
+        check_password(name, password)
+        users, readers = self._read()
+        new = name not in users
+        others = {known.lower() for known in users if known != name}
+        if name.lower() in others:
+            raise InputError(f"{name!r} differs from another user by capital letters only; choose another name")
+        users[name] = self._hasher.hash(_normal(password))
+        self._write(users, readers | {name} if reader else readers - {name})
+        return new
+
+    def remove(self, name: str) -> None:
+        """Remove a user, whose sessions end at once; InputError if there is none."""
+        users, readers = self._read()
+        if name not in users:
+            raise InputError(f"has no user {name!r}", file=self.path)
+        del users[name]
+        self._write(users, readers - {name})
+
+    def _read(self) -> tuple[dict[str, str], frozenset[str]]:
+        """Return the hashes by name, and who only reads."""
+        try:
+            with self.path.open(encoding="utf-8") as stream:
+                if os.name == "posix" and os.fstat(stream.fileno()).st_mode & 0o022:
+                    raise InputError("others may write this file of users; chmod 600 it", file=self.path)
+                data = json.load(stream)
+        except FileNotFoundError:
+            return {}, frozenset()
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot be read as a file of users: {error}", file=self.path) from error
+        users = data.get("users") if isinstance(data, dict) else None
+        if not isinstance(users, dict) or not all(isinstance(item, str) for item in users.values()):
+            raise InputError("is not a file of users; make one with `volcomp serve add-user`", file=self.path)
+        readers = data.get("readers", [])
+        if not isinstance(readers, list) or not all(isinstance(item, str) for item in readers):
+            raise InputError(
+                "has a malformed list of who only reads; make it again with `volcomp serve add-user`", file=self.path
+            )
+        return users, frozenset(readers)
+
+    def _write(self, users: Mapping[str, str], readers: frozenset[str]) -> None:
+        """Replace the file in one step; only its owner may read it."""
+        text = json.dumps({"users": dict(sorted(users.items())), "readers": sorted(readers)}, indent=2) + "\n"
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(prefix=".users-", dir=self.path.parent)  # readable by the owner only
+        except OSError as error:
+            raise InputError(f"cannot be written: {error.strerror or error}", file=self.path) from error
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(name, self.path)
+        except OSError as error:
+            with suppress(OSError):
+                os.unlink(name)
+            raise InputError(f"cannot be written: {error.strerror or error}", file=self.path) from error
+
+
+@cache
+def _nobody() -> str:
+    """Return a hash that is compared with where there is no user."""
+    return PasswordHasher().hash(secrets.token_urlsafe())
+
+
+def check_name(name: str) -> None:
+    """Raise InputError unless ``name`` can be that of a user."""
+    if not NAME.fullmatch(name):
+        raise InputError(f"{name!r} is not a name: letters, digits and . _ @ -, at most 64, are allowed")
+    if name.lower() == AUTOMATIC:
+        raise InputError(f"{name!r} signs decisions that no person made; choose another name")
+
+
+def check_password(name: str, password: str) -> None:
+    """Raise InputError for a password that is too short, too long, or the name."""
+    if not SHORTEST <= len(password) <= LONGEST:
+        raise InputError(f"a password has {SHORTEST} to {LONGEST} characters; this one has {len(password)}")
+    if name.lower() in password.lower() or len(set(password)) < 5:
+        raise InputError(
+            "this password is easy to guess: it contains the name, or fewer than five different characters"
+        )
+
+
+def _normal(password: str) -> str:
+    """One form for letters that keyboards write in several ways."""
+    return unicodedata.normalize("NFC", password)
