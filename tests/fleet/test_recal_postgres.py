@@ -310,13 +310,17 @@ def test_a_backup_moves_a_store_to_the_other_database_and_it_goes_on(url, opened
 # --- the dashboard -------------------------------------------------------------------------------------------------
 
 
-def test_the_dashboard_reads_and_decides_on_it(url, opened, tmp_path):
+def test_the_dashboard_reads_and_decides_on_it(url, opened, tmp_path, monkeypatch):
     pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
     pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed: the dashboard is not tested")
+    from compgen.fleet.dashboard import background
     from compgen.fleet.dashboard.app import make_app
     from compgen.fleet.dashboard.settings import DashboardSettings
     from compgen.fleet.dashboard.users import Users
 
+    # this test asks again all the time, and the server works out the figures of the first page when nobody asks
+    monkeypatch.setattr(background, "REST_S", 0.01)
+    monkeypatch.setattr(background, "WAITING_SHOWN_S", 0.01)
     factory, own = _loaded(HERE / "serve_factory.py"), "http://localhost:8765"
     factory.make_factory(url).close()
     factory.make_factory(tmp_path / "same.sqlite").close()
