@@ -546,7 +546,8 @@ def free_basis(constraints: FloatArray, size: int) -> FloatArray:
         pivots.append(pivot)
     keep = np.ones(size, dtype=bool)
     keep[pivots] = False
-    basis = np.eye(size)[:, keep]
+    basis = np.zeros((size, int(keep.sum())))
+    basis[np.flatnonzero(keep), np.arange(basis.shape[1])] = 1.0
     used = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) > 1e-12).tolist()
     basis[pivots] = -rows[used][:, keep]
     return basis

@@ -187,15 +187,12 @@ def _factorised(problem: _Problem) -> Projector:
         position_mm, weight = np.tile(position_mm, (len(tools_mm), 1)), np.tile(weight, len(tools_mm))
     transform = _transform(machine, basis)
     offsets = 3 if problem.anchored else 0
-    size = transform.shape[1] + offsets
     design = _design(basis, position_mm, tool_mm) @ transform
     if offsets:
         constants = coo_array(np.tile(np.eye(3), (len(position_mm), 1)))
         design = hstack([design, constants], format="csr")
     normal = (design.T @ (design.multiply(np.repeat(weight, 3)[:, None])).tocsr()).toarray()
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
-    regular = RIDGE * np.eye(size)
-    regular[transform.shape[1] :] = 0.0
     # rows whose product with the values gives them at the positions keep_mm of every term
     blocks = []
     for term, place in placed_terms(basis):
@@ -206,8 +203,12 @@ def _factorised(problem: _Problem) -> Projector:
     rows = np.asarray(np.vstack(blocks) @ transform)
     rows *= scale[: transform.shape[1]]
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
-    regular[: transform.shape[1], : transform.shape[1]] += KEEP * rows.T @ rows
-    factor = cho_factor(normal * scale[:, None] * scale + regular, lower=True)
+    regular = KEEP * rows.T @ rows
+    regular[np.diag_indices_from(regular)] += RIDGE
+    normal *= scale[:, None]  # in place: for tables of thousands of nodes these matrices are large
+    normal *= scale
+    normal[: transform.shape[1], : transform.shape[1]] += regular
+    factor = cho_factor(normal, lower=True, overwrite_a=True)
     sampled = (position_mm, weight, own_tool_mm, tool_mm)
     return Projector(basis, *sampled, transform, offsets, design, factor, scale)
 
@@ -230,7 +231,8 @@ def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
                     row = np.zeros(len(nodes_mm))
                     row[node], row[next_node], row[third] = 1.0, -(1.0 + ratio), ratio
                     rows.append(row)
-        blocks.append(free_basis(np.array(rows), len(term.nodes_mm)))
+        # sparse before they are joined: block_diag would keep every zero of a dense block as an entry
+        blocks.append(csr_array(free_basis(np.array(rows), len(term.nodes_mm))))
     return csr_array(block_diag(blocks))
 
 
