@@ -15,7 +15,6 @@ from rich import box
 from rich.table import Table
 
 from compgen.cli.common import (
-    NUMBER,
     PATH,
     STOPPED,
     Command,
@@ -29,6 +28,7 @@ from compgen.cli.terminal import answer, complain, say, stdout
 from compgen.errors import InputError
 from compgen.fleet.dashboard.settings import DashboardSettings, default_users, read_token
 from compgen.fleet.job import Job, MachineJob, add_machine, command_words, read_job, units
+from compgen.fleet.records import ReprocessRequest, RequestedChange
 
 if TYPE_CHECKING:
     from compgen.fleet.dashboard.users import Users
@@ -496,23 +496,12 @@ def _write(path: Path, drift: Drift) -> Path:
 @recal_command.command("recheck")
 @click.argument("machine")
 @click.option("--stations", required=True, metavar="FILE", help="Stations file of volcomp plan or identify.")
-@click.option("--error", required=True, metavar="NAME", help="Error whose change is to be seen, e.g. EC0Y.")
-@click.option("--change", required=True, type=NUMBER, metavar="SIZE", help="Its size, um or urad.")
-@click.option("--power", default=0.9, show_default=True, type=NUMBER, help="Probability of seeing it.")
-@click.option("--confidence", default=0.95, show_default=True, type=NUMBER, help="1 - probability of a false alarm.")
+@options_of(RequestedChange, "request", build=RequestedChange.from_file_units)
 @click.option("--points", default=None, metavar="FILE", type=PATH, help="Write a points file.")
 @job_option
 @json_option
 def recheck_command(
-    machine: str,
-    stations: str,
-    error: str,
-    change: float,
-    power: float,
-    confidence: float,
-    points: Path | None,
-    job: Job,
-    as_json: bool,
+    machine: str, stations: str, request: RequestedChange, points: Path | None, job: Job, as_json: bool
 ) -> int:
     """Find the fewest points at which tracers would see a change of one error of MACHINE since its last calibration.
 
@@ -520,16 +509,11 @@ def recheck_command(
     Example:
       volcomp recal recheck mill-1 --stations stations.csv --error EC0Y --change 10 --points recheck.points.csv
     """
-    from compgen.data.messages import nearest
-    from compgen.data.names import ERROR_NAMES, error_named
+    from compgen.data.names import error_named
     from compgen.fleet.change import calibrations_of
-    from compgen.fleet.recheck import RequestedChange, shortest_recheck, write_recheck_points
+    from compgen.fleet.recheck import shortest_recheck, write_recheck_points
     from compgen.plan import read_stations
 
-    if error not in ERROR_NAMES:
-        raise InputError(f"{error!r} is not an error; {nearest(error, ERROR_NAMES)}", field="--error")
-    name = error_named(error)
-    request = RequestedChange(error, change * name.si_per_unit, power, confidence)
     job.machine(machine)
     history, _, model = opened(job, lambda store: calibrations_of(store, store.machine(machine)))
     found = shortest_recheck(model, read_stations(stations), request, history[-1].covariance)
@@ -537,11 +521,12 @@ def recheck_command(
     if as_json:
         print_json({"accepted": True, "paths": paths, **found.summary()})
         return 0
-    u, smallest = found.u / name.si_per_unit, found.smallest / name.si_per_unit
+    name = error_named(request.error)
+    change, u, smallest = (size / name.si_per_unit for size in (request.size, found.u, found.smallest))
     say(
-        f"{len(found.position_mm)} points, {found.readings} readings: {error} to {u:.2f} {name.unit} (standard "
+        f"{len(found.position_mm)} points, {found.readings} readings: {name.name} to {u:.2f} {name.unit} (standard "
         f"uncertainty); {change:g} {name.unit} is seen with power {found.power:.2f}, {smallest:.2f} {name.unit} with "
-        f"{power:g}"
+        f"{request.power:g}"
     )
     for place in found.position_mm.tolist():
         stdout.print("  " + ", ".join(f"{letter} {value:g} mm" for letter, value in zip("XYZ", place, strict=True)))
@@ -586,30 +571,12 @@ def exclude_command(
 
 @recal_command.command("reprocess")
 @click.argument("machine")
-@click.option(
-    "--measurement",
-    default=None,
-    metavar="ID",
-    help="Its number in `history --json`, or the beginning of its SHA-256; default: the newest.",
-)
-@click.option(
-    "--active-table",
-    default=None,
-    metavar="VERSION|none",
-    help="The tables that were active while the machine was measured, for a measurement that is held back because that is "
-    "not certain; default: what file, job and history say.",
-)
+@options_of(ReprocessRequest, "given", build=dict)
 @job_option
 @who_option(reason=True)
 @json_option
 def reprocess_command(
-    machine: str,
-    measurement: str | None,
-    active_table: str | None,
-    job: Job,
-    actor: str | None,
-    reason: str,
-    as_json: bool,
+    machine: str, given: dict[str, Any], job: Job, actor: str | None, reason: str, as_json: bool
 ) -> int:
     """Identify and export again from a stored measurement of MACHINE, as job, machine and instrument files say now.
 
@@ -620,9 +587,9 @@ def reprocess_command(
       volcomp recal reprocess mill-1 --reason "pitch of X corrected in the machine file"
       volcomp recal reprocess mill-1 --active-table v2 --reason "v2 was on, says the log of the control"
     """
-    from compgen.fleet.actions import ReprocessRequest, reprocess
+    from compgen.fleet.actions import reprocess
 
-    done = reprocess(job, machine, ReprocessRequest(measurement, actor_of(actor), reason, active_table))
+    done = reprocess(job, machine, ReprocessRequest(actor=actor_of(actor), reason=reason, **given))
     table = done.table
     if as_json:
         facts = {"id": done.measurement.id, "name": done.measurement.name, "sha256": done.measurement.sha256}

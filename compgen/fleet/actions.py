@@ -20,7 +20,14 @@ from compgen.fleet.decisions import check_person
 from compgen.fleet.job import Job, MachineJob
 from compgen.fleet.process import ADOPTED, process, without_folder
 from compgen.fleet.publish import check_folder, notify, publish, set_aside
-from compgen.fleet.records import HELD_BACK, DecisionRecord, MachineRecord, MeasurementRecord, TableRecord
+from compgen.fleet.records import (
+    HELD_BACK,
+    DecisionRecord,
+    MachineRecord,
+    MeasurementRecord,
+    ReprocessRequest,
+    TableRecord,
+)
 from compgen.fleet.store import Clock, Store, open_store
 from compgen.kinematics.kernel_switch import one_thread
 
@@ -166,19 +173,6 @@ class Reprocessed:
     def exit_code(self) -> int:
         """0: proposed or active; 1: held back or refused."""
         return 1 if self.table.state in HELD_BACK else 0
-
-
-@dataclass(frozen=True)
-class ReprocessRequest:
-    """Which measurement (None: the newest), who wants it and why.
-
-    ``active_table`` states which tables were on while it was made, a version or "none"; None: what the file says.
-    """
-
-    measurement: str | None
-    actor: str
-    reason: str
-    active_table: str | None = None
 
 
 def reprocess(job: Job, name: str, request: ReprocessRequest, *, clock: Clock | None = None) -> Reprocessed:

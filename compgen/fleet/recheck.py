@@ -27,6 +27,7 @@ from compgen.data.lengths import POSITION_COLUMNS, Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
+from compgen.fleet.records import RequestedChange
 from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.covariance import Covariance, error_values
 from compgen.identify.options import IdentifyOptions
@@ -38,16 +39,6 @@ LEVELS = 4
 MOST_POINTS = 40
 #: Eigenvalues of the scaled nuisances below this share have no data.
 NO_DATA = 1e-10
-
-
-@dataclass(frozen=True)
-class RequestedChange:
-    """A change that is to be seen: ``size`` in mm or rad (of the squareness, or of the line or bow of a curve)."""
-
-    error: str
-    size: float
-    power: float = 0.9
-    confidence: float = 0.95
 
 
 @dataclass(frozen=True)

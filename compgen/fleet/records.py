@@ -1,4 +1,7 @@
-"""Records that the store returns (frozen, times in UTC), and the states of a set of tables."""
+"""Records that the store returns (frozen, times in UTC), the states of a set of tables, and what a person requests.
+
+``volcomp recal --help`` loads this module: it needs no library.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
+
+from compgen.data.messages import nearest
+from compgen.data.names import ERROR_NAMES, error_named
+from compgen.data.toml_files import option
+from compgen.errors import InputError
 
 #: State of a set of tables, from the last decision about it.
 TableState = Literal["pending", "held", "refused", "superseded", "rejected", "active", "retired"]
@@ -253,3 +261,45 @@ def before_active(decisions: Sequence[DecisionRecord]) -> int | None:
             else:
                 stack.append(decision.table_id)
     return stack[-2] if len(stack) > 1 else None
+
+
+# --- what a person requests ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RequestedChange:
+    """A change that is to be seen: ``size`` in mm or rad (of the squareness, or of the line or bow of a curve)."""
+
+    error: str = option(required=True, metavar="NAME", text="Error whose change is to be seen, e.g. EC0Y.")
+    size: float = option(required=True, name="--change", metavar="SIZE", text="Its size, um or urad.")
+    power: float = option(0.9, "Probability of seeing it.")
+    confidence: float = option(0.95, "1 - probability of a false alarm.")
+
+    @classmethod
+    def from_file_units(cls, error: str, size: float, **how: float) -> RequestedChange:
+        """Return the change of ``size`` um or urad; InputError for what is not the name of an error."""
+        if error not in ERROR_NAMES:
+            raise InputError(f"{error!r} is not an error; {nearest(error, ERROR_NAMES)}", field="--error")
+        return cls(error, size * error_named(error).si_per_unit, **how)
+
+
+@dataclass(frozen=True)
+class ReprocessRequest:
+    """Which measurement is to be processed again (None: the newest), who wants it and why: neither may be empty.
+
+    ``active_table`` states which tables were on while it was made, a version or "none"; None: what the file says.
+    """
+
+    measurement: str | None = option(
+        None,
+        "Its number in `history --json`, or the beginning of its SHA-256; default: the newest.",
+        metavar="ID",
+    )
+    actor: str = ""
+    reason: str = ""
+    active_table: str | None = option(
+        None,
+        "The tables that were active while the machine was measured, for a measurement that is held back because that is "
+        "not certain; default: what file, job and history say.",
+        metavar="VERSION|none",
+    )

@@ -5,7 +5,8 @@ import pytest
 
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import InputError
-from compgen.fleet.recheck import RequestedChange, power_of, shortest_recheck
+from compgen.fleet.recheck import power_of, shortest_recheck
+from compgen.fleet.records import RequestedChange
 from compgen.identify import IdentifyOptions
 from compgen.identify.covariance import Covariance
 from compgen.kinematics.first_order import modelled_errors

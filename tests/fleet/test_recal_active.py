@@ -16,9 +16,10 @@ from test_recal import CONTROL, NOW, active_correction, deviations_text, drifted
 
 from compgen.data.error_table import ErrorTable
 from compgen.fleet import actions
-from compgen.fleet.actions import ReprocessRequest, reprocess
+from compgen.fleet.actions import reprocess
 from compgen.fleet.change import volume_points
 from compgen.fleet.job import read_job
+from compgen.fleet.records import ReprocessRequest
 from compgen.fleet.runner import run_jobs
 from compgen.fleet.store import open_store
 from compgen.kinematics.many_points import volumetric_error

@@ -17,8 +17,9 @@ from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import actions, claims, database
-from compgen.fleet.actions import REPROCESS_FAILED, ReprocessRequest, reprocess
+from compgen.fleet.actions import REPROCESS_FAILED, reprocess
 from compgen.fleet.change import calibrations_of
+from compgen.fleet.records import ReprocessRequest
 from compgen.fleet.status import history
 from compgen.fleet.store import counting, open_store
 

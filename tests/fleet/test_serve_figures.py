@@ -22,8 +22,8 @@ from compgen.fleet import claims as results
 from compgen.fleet.dashboard import app as reading
 from compgen.fleet.dashboard import background
 from compgen.fleet.dashboard.background import Background, NotReadyError
-from compgen.fleet.recheck import RequestedChange, shortest_recheck
-from compgen.fleet.records import NewMeasurement, NewResult, StoredTableFile
+from compgen.fleet.recheck import shortest_recheck
+from compgen.fleet.records import NewMeasurement, NewResult, RequestedChange, StoredTableFile
 from compgen.fleet.store import counting
 from compgen.identify.covariance import Covariance, format_covariance
 from compgen.plan import planned_stations

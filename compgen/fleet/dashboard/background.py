@@ -28,8 +28,8 @@ from compgen.fleet.dashboard.charts import UNITS, Chart, ChartSeries, chart, tim
 from compgen.fleet.decisions import EXCLUSION
 from compgen.fleet.drift import DAYS_A_MONTH, Drift, DriftSettings, drift_of_store, following_temperature
 from compgen.fleet.job import Job, read_job
-from compgen.fleet.recheck import Recheck, RequestedChange, shortest_recheck
-from compgen.fleet.records import IdentificationRecord, MachineRecord
+from compgen.fleet.recheck import Recheck, shortest_recheck
+from compgen.fleet.records import IdentificationRecord, MachineRecord, RequestedChange
 from compgen.fleet.store import Store, counting
 from compgen.plan import PlannedStations
 
@@ -375,7 +375,6 @@ def drift_charts(drift: Drift) -> Sequence[Chart]:
 FIRST_CHANGE = 10.0
 #: Largest change that may be asked for, um or urad.
 LARGEST = 10_000.0
-POWER = 0.9
 
 
 @dataclass(frozen=True)
@@ -424,7 +423,7 @@ def requested_change(
         size = 0.0
     if not 0.0 < size <= LARGEST:
         raise InputError(f"the change is a number above 0, at most {LARGEST:g} {UNITS[error_named(name).unit]}")
-    return RequestedChange(name, size * scale, POWER), text
+    return RequestedChange(name, size * scale), text
 
 
 class RecheckCache:
