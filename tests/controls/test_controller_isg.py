@@ -14,7 +14,7 @@ import compgen
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.controls import CONTROLLERS
-from compgen.controls.isg_kernel import errors_from_etalon, read_error_file
+from compgen.controls.isg_kernel import errors_from_etalon, is_list_file, read_error_file
 from compgen.controls.shared.base import SourceFile
 from compgen.data import toml_files
 from compgen.data.error_table import Curve, ErrorTable
@@ -600,6 +600,24 @@ def test_a_list_file_is_known_by_its_contents_and_alone_it_is_not_enough():
         parsed("isg-csv", machine_with(), {"vc.txt": LIST})
     with pytest.raises(InputError, match="second list file"):
         parsed("isg-csv", machine_with(), texts | {"b.lis": LIST})
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("x 1\n", True),
+        ("X EXX\n", False),  # a header with the argument X
+        ("chain XYZ\n", True),
+        ("# comment\n// comment\nfile[0] a.csv\n", True),
+        ("X EXX EYX\n", False),
+        ("chain\n", False),
+        ("C0Y 0\n", False),
+    ],
+)
+def test_a_list_file_begins_with_a_key_and_one_value(text, found):
+    assert is_list_file(SourceFile(Path("volcomp.txt"), text)) is found
+    assert is_list_file(SourceFile(Path("volcomp.LIS"), text)) is True
+    assert is_list_file(SourceFile(Path("volcomp.csv"), text)) is False
 
 
 def test_errors_of_rotary_axes_are_left_out_with_a_warning():
