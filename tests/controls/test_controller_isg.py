@@ -672,6 +672,27 @@ def test_a_folder_of_the_control_has_at_most_200_characters():
 
 
 @pytest.mark.parametrize("name", BOTH)
+@pytest.mark.parametrize(("place", "value_mm"), [(0, 0.02), (1, 0.03), (2, -0.04)])
+def test_the_check_is_where_the_correction_of_an_axis_is_largest(name, place, value_mm):
+    """EXX is 0 but at one end or in the middle of X, EYZ likewise over Z: there minus the error is added."""
+    machine = machine_with()
+    curves = {}
+    for error, (low, high) in (("EXX", TRAVELS[0]), ("EYZ", TRAVELS[2])):
+        value = np.zeros(3)
+        value[place] = value_mm
+        curves[error] = Curve(np.array([low, 0.5 * (low + high), high]), value, np.full(3, np.nan))
+    errors = ErrorTable(curves, {})
+    checks = {item["axis"]: item for item in context_of(name, machine, built(name, machine, errors))["check"]}
+    for axis, base in (("X", 0), ("Y", 2)):
+        low, high = TRAVELS[base]
+        assert checks[axis]["position"][base] == (low, 0.5 * (low + high), high)[place]
+        assert checks[axis]["correction"] == pytest.approx(-value_mm)
+    for item in checks.values():
+        for at, (low, high) in zip(item["position"], TRAVELS, strict=True):
+            assert at in (low, 0.5 * (low + high), high)
+
+
+@pytest.mark.parametrize("name", BOTH)
 def test_the_quantum_is_half_a_digit_of_three_lengths_and_of_eight_angles_at_the_longest_lever(name):
     """Nanometres have 9 digits in mm, angles 12 in rad; the longest lever is 700.5 mm of Y and 40 mm of the tool."""
     due = 0.5 * (3e-9 + 8e-12 * 740.5)
