@@ -442,6 +442,23 @@ def test_a_set_that_is_nearly_as_good_is_judged_by_what_it_holds_and_a_bad_one_b
     assert any("correction Y" in reason for reason in verify(machine, tables, errors(6e-3, 12e-3)).reasons)
 
 
+def test_what_has_no_room_is_named_with_its_rms_the_largest_first():
+    """A zigzag of size a and mean zero has a root mean square of a / sqrt(3): 5.77, 2.89 and 0.009 um."""
+    machine = machine_with("WFYXZT", {"siemens-cec": {"sign": "error", "mult_mode": "S1", "tables_available": 1}})
+    shape, unknown = np.array([0.0, 1.0, -1.0, 0.0, 1.0, -1.0, 0.0]), np.full(7, np.nan)
+    sizes = {"EXY": 12e-3, "EZY": 5e-3, "EYX": 10e-3, "EZX": 15e-6}
+    curves = {
+        name: Curve(machine.axes["XYZ".index(name[2])].nodes_mm, size * shape, unknown) for name, size in sizes.items()
+    }
+    (note,) = [
+        text for text in export(machine, ErrorTable(curves), "siemens-cec").warnings if "not corrected are" in text
+    ]
+    assert note.endswith(
+        ", 1 may be used: not corrected are Y(x) (5.77 um rms), Z(y) (2.89 um rms); together they leave 6.45 um rms over "
+        "the volume (first order)"
+    ), note
+
+
 def test_more_tables_never_leave_more():
     errors, left = None, []
     for tables in (1, 3, 6, 9, 13, 19):
