@@ -170,6 +170,12 @@ def test_the_exchange_format_takes_the_same_rows_as_the_columns():
     assert at_2_5[1] == pytest.approx(+0.0175, abs=ROUNDING_MM)
 
 
+def test_a_value_may_follow_the_name_of_its_parameter_on_the_same_line():
+    text = "[C0Y] VALUE = 1e-5\n[B0Z] VALUE = 2e-5\n[A0Z] VALUE = 3e-5\n"
+    table = errors_from_etalon(text)
+    assert {name: value for name, (value, _) in table.squareness.items()} == {"EC0Y": 1e-5, "EB0Z": 2e-5, "EA0Z": 3e-5}
+
+
 def test_an_exchange_file_is_imported_as_errors_in_mm_and_rad():
     text = "[C0Y]\nVALUE = -0.000012\n" + golden("etalon-exchange", "vendor.etalon.txt")["vendor.etalon.txt"]
     with pytest.warns(CompgenWarning, match="rotary"):
@@ -543,6 +549,7 @@ ETALON = "// head\n[C0Y]\nVALUE = 0.00001\n[EXX]\nGridpoints = {\n-300 0.001\n50
         ("", None, "holds no data"),
         ("VALUE = 1\n", 1, "name in brackets"),
         (ETALON.replace("} // end\n", ""), 4, "no closing brace"),
+        ("[C0Y] VALUE = 1\n[B0Z] VALUE = 2\n[EXX] Gridpoints = {\n0 1\n", 3, r"\[EXX\] has no closing brace"),
         (ETALON.replace("[EXX]", "[C0Y]"), 4, "is a constant"),
         (ETALON.replace("[C0Y]", "[EXX]"), 4, "second time; the first is in a.txt:2"),
         (ETALON.replace("[C0Y]", "[Q0Y]"), 2, "'Q0Y' is not a parameter"),
