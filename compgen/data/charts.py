@@ -53,16 +53,25 @@ class Picture:
     note: str = ""
 
 
-def ticks(low: float, high: float, count: int = 5) -> list[float]:
+def ticks(low: float, high: float, count: int = 5, *, around: bool = False) -> list[float]:
     """Return round numbers within the interval, about ``count``: steps of 1, 2 or 5 times a power of ten.
 
-    >>> ticks(-3.0, 11.0)
-    [-2.0, 0.0, 2.0, 4.0, 6.0, 8.0, 10.0]
+    ``around`` the interval instead: the first at or below it, the last at or above it; also where it has no length.
+
+    >>> ticks(-3.0, 11.0), ticks(-3.0, 11.0, around=True)
+    ([-2.0, 0.0, 2.0, 4.0, 6.0, 8.0, 10.0], [-5.0, 0.0, 5.0, 10.0, 15.0])
     """
+    if around and not high > low:
+        low, high = low - 0.5 * max(abs(low), 1.0), high + 0.5 * max(abs(high), 1.0)
     raw = (high - low) / count or 1.0
     power = 10.0 ** math.floor(math.log10(raw))
-    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= raw * 0.7)
-    return [k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+    least = raw * (0.999 if around else 0.7)
+    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least)
+    if around:
+        first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    else:
+        first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [k * step for k in range(first, last + 1)]
 
 
 def tick_texts(values: Sequence[float]) -> list[str]:

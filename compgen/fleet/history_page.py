@@ -12,7 +12,7 @@ from markupsafe import Markup
 from compgen.data.charts import DASHED, DOTTED, LABEL, Picture, Plot, limits_of, page_assets, svg
 from compgen.data.files import OutputFolder
 from compgen.data.messages import number_text
-from compgen.data.names import COVERAGE, error_named
+from compgen.data.names import COVERAGE
 from compgen.fleet.drift import Drift, FigureDrift, following_temperature, moment_of
 from compgen.report.html.pictures import describe_error
 from compgen.resources import data_folder
@@ -81,8 +81,8 @@ def _over_days(x: tuple[float, float], y: tuple[float, float], unit: str) -> Plo
 
 def _figure(item: FigureDrift, warm: Collection[str]) -> Picture:
     """Values with their uncertainty, those at the mean temperature, trend, steps, tolerance and forecast."""
-    error, series, trend = error_named(item.figure.error), item.series, item.trend
-    scale, days = 1.0 / error.si_per_unit, np.asarray(series.days)
+    series, trend, unit = item.series, item.trend, LABEL[item.figure.unit]
+    scale, days = item.figure.scale, np.asarray(series.days)
     value, spread = series.value * scale, COVERAGE * series.u * scale
     shown, end = [value - spread, value + spread], float(days[-1])
     ahead, following = None, None
@@ -101,7 +101,7 @@ def _figure(item: FigureDrift, warm: Collection[str]) -> Picture:
         [] if item.tolerance is None else [(item.reference + sign * item.tolerance) * scale for sign in (-1.0, 1.0)]
     )
     shown += [level * scale, np.array(limits), value if following is None else following]
-    plot = _over_days(limits_of(days, end, margin=0.03), limits_of(*shown), LABEL[error.unit])
+    plot = _over_days(limits_of(days, end, margin=0.03), limits_of(*shown), unit)
     if ahead is not None and item.forecast is not None:
         low, high = plot.y
         plot.band([days[-1] + item.forecast.low_days, end], [low, low], [high, high])
@@ -118,5 +118,5 @@ def _figure(item: FigureDrift, warm: Collection[str]) -> Picture:
         plot.dots(days, following, "page", size=3.5)
     key = f"figure-{item.figure.name.replace(' ', '-')}"
     note = describe_error(item.figure.error)
-    title = f"{item.figure.name}: {note}, {LABEL[error.unit]} over days"
+    title = f"{item.figure.name}: {note}, {unit} over days"
     return Picture(key, item.figure.name, svg(key, title, [plot]), note=note)

@@ -22,6 +22,7 @@ from compgen.fleet import claims as results
 from compgen.fleet.dashboard import app as reading
 from compgen.fleet.dashboard import background
 from compgen.fleet.dashboard.background import Background, NotReadyError
+from compgen.fleet.dashboard.charts import ChartSeries, chart
 from compgen.fleet.recheck import shortest_recheck
 from compgen.fleet.records import NewMeasurement, NewResult, RequestedChange, StoredTableFile
 from compgen.fleet.store import counting
@@ -412,6 +413,16 @@ def test_what_fails_in_an_idle_moment_stops_nothing(monkeypatch):
     beside.later("fault", lambda: 1 / 0)
     beside.later("next", done.set)
     assert done.wait(20.0)
+
+
+def test_the_axis_of_a_chart_reaches_round_numbers_with_the_same_decimals():
+    drawn = chart("c", [ChartSeries("a", [0.0, 250.0, 1000.0], [-0.3, 0.0, 1.9])])
+    assert [text for _, text in drawn.y_ticks] == ["\N{MINUS SIGN}0.5", "0.0", "0.5", "1.0", "1.5", "2.0"]
+    assert [text for _, text in drawn.x_ticks] == ["0", "200", "400", "600", "800", "1000"]
+    assert (drawn.y_ticks[0][0], drawn.y_ticks[-1][0]) == (drawn.bottom, drawn.top)
+    flat = chart("c", [ChartSeries("a", [5.0], [3.0])])  # one value lies in the middle of both axes
+    assert [text for _, text in flat.y_ticks] == ["1", "2", "3", "4", "5"]
+    assert flat.lines[0][1] == f"{(flat.left + flat.right) / 2},{(flat.top + flat.bottom) / 2}"
 
 
 def test_an_excluded_measurement_is_grey_and_out_of_the_scale(tracked_site):

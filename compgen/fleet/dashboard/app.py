@@ -27,6 +27,7 @@ from werkzeug.exceptions import Forbidden, HTTPException
 from werkzeug.routing import IntegerConverter
 from werkzeug.wrappers import Response as BaseResponse
 
+from compgen.data.charts import LABEL
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import actions, decisions, logs
 from compgen.fleet.actions import NotPublishedError
@@ -43,7 +44,7 @@ from compgen.fleet.dashboard.background import (
     requested_change,
     trend_rows,
 )
-from compgen.fleet.dashboard.charts import UNITS, ErrorCache, find_table, history, number, proposal
+from compgen.fleet.dashboard.charts import ErrorCache, find_table, history, proposal
 from compgen.fleet.dashboard.guard import (
     LONGEST_S,
     LoginLimit,
@@ -495,8 +496,8 @@ def make_app(
     app.jinja_env.undefined = StrictUndefined
     app.jinja_env.trim_blocks = app.jinja_env.lstrip_blocks = True
     app.jinja_env.filters.update(
-        unit=UNITS.__getitem__,
-        micro=lambda text: re.sub(r"\b(um|urad)\b", lambda found: UNITS[found[0]], text),
+        unit=LABEL.__getitem__,
+        micro=lambda text: re.sub(r"\b(um|urad)\b", lambda found: LABEL[found[0]], text),
         when=lambda time: "" if time is None else time.astimezone(UTC).strftime("%Y-%m-%d %H:%M"),
         figure=_figure,
         signed=partial(_figure, sign="+"),
@@ -627,6 +628,5 @@ def _figure(value: float | None, digits: int = 2, sign: str = "") -> str:
     """
     if value is None or value != value:
         return "\N{EN DASH}"
-    if abs(value) >= 1e5 and not sign:
-        return number(value)
-    return f"{value:{sign}z.{digits}f}".replace("-", "\N{MINUS SIGN}")
+    text = f"{value:.4g}" if abs(value) >= 1e5 and not sign else f"{value:{sign}z.{digits}f}"
+    return text.replace("-", "\N{MINUS SIGN}")

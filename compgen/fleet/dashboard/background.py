@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
+from compgen.data.charts import LABEL
 from compgen.data.names import COVERAGE, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
 from compgen.fleet import database, logs
-from compgen.fleet.dashboard.charts import UNITS, Chart, ChartSeries, chart, time_ticks
+from compgen.fleet.dashboard.charts import Chart, ChartSeries, chart, time_ticks
 from compgen.fleet.decisions import EXCLUSION
 from compgen.fleet.drift import DAYS_A_MONTH, Drift, DriftSettings, drift_of_store, following_temperature
 from compgen.fleet.job import Job, read_job
@@ -303,7 +304,7 @@ def change_rows(drift: Drift) -> Sequence[ChangeRow]:
         for changes in (drift.since_last, drift.since_first)
     )
     names = dict.fromkeys([*first, *last])
-    return [ChangeRow(name, UNITS[error_named(name).unit], last.get(name), first.get(name)) for name in names]
+    return [ChangeRow(name, LABEL[error_named(name).unit], last.get(name), first.get(name)) for name in names]
 
 
 def trend_rows(drift: Drift) -> Sequence[TrendRow]:
@@ -316,7 +317,7 @@ def trend_rows(drift: Drift) -> Sequence[TrendRow]:
         month, (rate, u), kelvin = DAYS_A_MONTH * scale, item.trend.slope, item.trend.per_kelvin
         row = TrendRow(
             name=item.figure.name,
-            unit=UNITS[item.figure.unit],
+            unit=LABEL[item.figure.unit],
             rate=rate * month,
             expanded=COVERAGE * u * month,
             adjusted=item.adjusted,
@@ -365,7 +366,7 @@ def drift_charts(drift: Drift) -> Sequence[Chart]:
             ends = np.array([item.reference - item.tolerance, item.reference + item.tolerance]) * scale
             span = (seconds[0], seconds[-1])
             series += [ChartSeries("limit of the tolerance", span, (end, end), marked=False) for end in ends.tolist()]
-        found.append(chart(f"{item.figure.name}, {UNITS[item.figure.unit]}", series, marks))
+        found.append(chart(f"{item.figure.name}, {LABEL[item.figure.unit]}", series, marks))
     return [item for item in found if item is not None]
 
 
@@ -422,7 +423,7 @@ def requested_change(
     except ValueError:
         size = 0.0
     if not 0.0 < size <= LARGEST:
-        raise InputError(f"the change is a number above 0, at most {LARGEST:g} {UNITS[error_named(name).unit]}")
+        raise InputError(f"the change is a number above 0, at most {LARGEST:g} {LABEL[error_named(name).unit]}")
     return RequestedChange(name, size * scale), text
 
 

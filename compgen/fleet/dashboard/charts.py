@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from compgen.data.charts import LABEL, tick_texts, ticks
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import sha256_of
 from compgen.data.names import COVERAGE, error_named
@@ -36,8 +37,6 @@ from compgen.fleet.store import Store, at_one_moment, counting
 #: Size of a chart and its margins (left, right, top, bottom), px.
 WIDTH, HEIGHT = 620.0, 200.0
 MARGINS = (64.0, 16.0, 12.0, 30.0)
-#: How pages write the units of files.
-UNITS = {"um": "\N{MICRO SIGN}m", "urad": "\N{MICRO SIGN}rad"}
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def chart(
     grey = None if left_out is None else _finite(left_out)
     xs += [] if grey is None else grey.x
     ys = [y + side * u for item in kept for y, u in zip(item.y, item.u, strict=True) for side in (-1.0, 1.0)]
-    y_marks = ticks(min(ys), max(ys))
+    y_marks = ticks(min(ys), max(ys), around=True)
     low, high = min(*ys, y_marks[0]), max(*ys, y_marks[-1])
     across = _Scale(min(xs), max(xs), MARGINS[0] + 8, WIDTH - MARGINS[1] - 8)
     up = _Scale(low, high, HEIGHT - MARGINS[3], MARGINS[2])
@@ -110,11 +109,13 @@ def chart(
     for mark in [] if grey is None else _line(grey, across, up)[2]:  # those beyond the scale go to its edge
         y = min(max(mark.y, MARGINS[2]), HEIGHT - MARGINS[3])
         outside.append(mark if y == mark.y else Mark(mark.x, y, None, None))
-    x_marks = [(x, number(x)) for x in ticks(min(xs), max(xs))] if x_ticks is None else x_ticks
+    if x_ticks is None:
+        x_marks = ticks(min(xs), max(xs), around=True)
+        x_ticks = list(zip(x_marks, tick_texts(x_marks), strict=True))
     return Chart(
         title,
-        [(across(x), text) for x, text in x_marks if min(xs) <= x <= max(xs)],
-        [(up(y), number(y)) for y in y_marks],
+        [(across(x), text) for x, text in x_ticks if min(xs) <= x <= max(xs)],
+        [(up(y), text) for y, text in zip(y_marks, tick_texts(y_marks), strict=True)],
         [_line(item, across, up) for item in kept],
         left_out=outside,
     )
@@ -144,23 +145,6 @@ def _line(item: ChartSeries, across: _Scale, up: _Scale) -> tuple[str, str, list
         low, high = (up(y - u), up(y + u)) if u > 0.0 else (None, None)
         marks.append(Mark(across(x), up(y), low, high))
     return item.label, " ".join(f"{mark.x},{mark.y}" for mark in marks), marks if item.marked else []
-
-
-def ticks(low: float, high: float, count: int = 5) -> list[float]:
-    """Return round numbers that cover the interval: steps of 1, 2 or 5 times a power of ten."""
-    if not high > low:
-        low, high = low - 0.5 * max(abs(low), 1.0), high + 0.5 * max(abs(high), 1.0)
-    raw = (high - low) / count
-    power = 10.0 ** math.floor(math.log10(raw))
-    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= raw * 0.999)
-    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
-    return [k * step for k in range(first, last + 1)]
-
-
-def number(value: float) -> str:
-    """Return a short text of a number; no minus before a zero."""
-    text = f"{value:.4g}"
-    return "0" if float(text) == 0.0 else text.replace("-", "\N{MINUS SIGN}")
 
 
 # --- one machine over time -----------------------------------------------------------------------------------------
@@ -273,7 +257,7 @@ def _trend(
         spread[-1],
         values[-1] - values[-2] if len(values) > 1 else None,
         values[-1] - values[0] if len(values) > 1 else None,
-        chart(f"{name}, {what}, {UNITS[error.unit]}", [series], time_ticks([*times, *(at for at, _ in grey)]), outside),
+        chart(f"{name}, {what}, {LABEL[error.unit]}", [series], time_ticks([*times, *(at for at, _ in grey)]), outside),
     )
 
 
@@ -524,7 +508,7 @@ def _curves(now: ErrorTable, before: ErrorTable | None) -> list[Chart]:
         if name in old:
             place, value = old[name].position_mm.tolist(), (old[name].value * scale).tolist()
             series.append(ChartSeries("behind the active tables", place, value))
-        charts.append(chart(f"{name}, {UNITS[error.unit]} over {'XYZ'[error.axis]}, mm", series))
+        charts.append(chart(f"{name}, {LABEL[error.unit]} over {'XYZ'[error.axis]}, mm", series))
     return [item for item in charts if item is not None]
 
 
