@@ -34,18 +34,18 @@ from compgen.accuracy.field import (
     volume_figures,
 )
 from compgen.accuracy.positioning import EDITIONS, LATEST, SAME_TARGET_MM, RunStatistics, SetupBudget, accuracy_of_runs
+from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.display import Bars, Drawable, Overview, Panel
 from compgen.data.error_table import Curve, ErrorTable, hat_matrix
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.data.names import COVERAGE, ERROR_INDEX, MM_PER_UM, error_named
+from compgen.data.names import COVERAGE, MM_PER_UM, error_named
 from compgen.data.toml_files import option
 from compgen.errors import InputError
-from compgen.identify.covariance import normalized_error
 from compgen.kinematics.first_order import observable_errors, tool_of
-from compgen.kinematics.gauge import LEVER_MM, gauge_directions
+from compgen.kinematics.gauge import LEVER_MM, gauge_changes, gauge_directions, gauge_part
 
 # The same points before and after: matched, or refused with what differs, or brought together as the user says.
 
@@ -309,14 +309,8 @@ def in_common_gauge(source: ErrorSource) -> ErrorSource:
     machine, errors = source.machine, source.errors
     shown = observable_errors(machine)
     names = [n for n in errors.names if n in shown and (n in errors.squareness or len(errors.curves[n].value) > 1)]
-    directions = gauge_directions(machine, names)
-    if not len(directions):
-        return source
-    values, changes = errors.values(), []
-    for name in errors.names:  # constants and slopes as changes of the values of the table
-        constant, slope = directions[:, ERROR_INDEX[name]].T
-        nodes = np.zeros(1) if name in errors.squareness else errors.curves[name].position_mm
-        changes.append(constant + nodes[:, None] * slope)
+    values, factor = errors.values(), source.factor
+    changes = gauge_changes(gauge_directions(machine, names), *errors.labels())
     # what takes from the values that which the common gauge makes zero; angles times a lever, mm
     blocks = [np.zeros((0, len(values)))]
     for name in (name for name in names if name in errors.curves):
@@ -326,14 +320,9 @@ def in_common_gauge(source: ErrorSource) -> ErrorSource:
         lever = 1.0 if error.kind == "linear" else LEVER_MM
         block[:, errors.rows()[name]] = lever * hat_matrix(errors.curves[name].position_mm, np.array(where))
         blocks.append(block)
-    change, conditions = np.vstack(changes), np.vstack(blocks)
-    effect = conditions @ change
-    scale = np.linalg.norm(effect, axis=0)
-    used = scale > 1e-12 * scale.max(initial=0.0)
-    amounts = np.linalg.pinv(effect[:, used] / scale[used], rcond=1e-10) / scale[used][:, None]
-    taken_out = -change[:, used] @ amounts @ conditions
-    factor = None if source.factor is None else source.factor + taken_out @ source.factor
-    return replace(source, errors=errors.with_values(values + taken_out @ values), factor=factor)
+    part = gauge_part(changes, np.vstack(blocks))
+    factor = None if factor is None else factor - part @ factor
+    return replace(source, errors=errors.with_values(values - part @ values), factor=factor)
 
 
 # Before against after, and predicted against measured: improvement with its significance.

@@ -10,16 +10,23 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.comparison import (
+    SmallMotion,
+    normalized_error,
+    rigid_fields,
+    sizes_of,
+    small_motion,
+    without_rigid_motion,
+)
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
-from compgen.identify.covariance import Covariance, covariance_or_independent, normalized_error
+from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import c_matrix, tool_of
-from compgen.kinematics.gauge import rigid_fields, without_rigid_motion
 from compgen.kinematics.many_points import volumetric_error
 
 # One figure of accuracy with its uncertainty, and how two of them compare.
@@ -193,13 +200,11 @@ def independent_spread(u_mm: FloatArray) -> Spread:
     return spread
 
 
-def _without(field: ErrorField, parameters: FloatArray, error_mm: FloatArray, text: str) -> ErrorField:
-    """Field with ``error_mm``, of which a rigid motion was taken out that ``parameters`` (6, n, 3) read off the field."""
-    motion = rigid_fields(field.tip_mm).reshape(-1, 3, 6)
+def _without(field: ErrorField, motion: SmallMotion, error_mm: FloatArray, text: str) -> ErrorField:
+    """Field with ``error_mm``, of which a rigid motion was taken out: to first order ``motion``."""
 
     def spread(weight: FloatArray) -> float:
-        through = np.einsum("nij,ni->j", motion, weight)
-        return field.spread(weight - np.einsum("j,jni->ni", through, parameters))
+        return field.spread(motion.taken_out_of_weights(weight))
 
     return replace(field, error_mm=error_mm, spread=spread, alignment=text)
 
@@ -219,11 +224,8 @@ def aligned(machine: Machine, field: ErrorField, alignment: Alignment) -> ErrorF
         return field
     if alignment == "axes":
         return _to_axes(machine, field)
-    motion = rigid_fields(field.tip_mm)
-    scale = np.linalg.norm(motion, axis=0)
-    inverse = np.linalg.pinv(motion / scale) / scale[:, None]
     error = without_rigid_motion(field.tip_mm, field.error_mm)
-    return _without(field, inverse.reshape(6, -1, 3), error, "best-fit rigid motion taken out (least squares)")
+    return _without(field, small_motion(field.tip_mm), error, "best-fit rigid motion taken out (least squares)")
 
 
 def axis_lines(machine: Machine) -> FloatArray:
@@ -255,18 +257,17 @@ def _to_axes(machine: Machine, field: ErrorField) -> ErrorField:
             if other:  # the primary axis fixes the rotation about z
                 parameters[5, row, across] += side * sign / length
             parameters[3 + across, row, 2] -= side * sign / length  # dz along x: -B; dz along y: +A
-    motion = rigid_fields(field.tip_mm).reshape(-1, 3, 6)
+    fields = rigid_fields(field.tip_mm)
     rotation = parameters[3:].copy()
     parameters[:3, rows[0]] = np.eye(3)
-    parameters[:3] -= np.einsum("ij,jnk->ink", motion[rows[0]][:, 3:], rotation)
-    amounts = np.einsum("jni,ni->j", parameters, field.error_mm)
-    error = field.error_mm - np.einsum("nij,j->ni", motion, amounts)
+    parameters[:3] -= np.einsum("ij,jnk->ink", fields.reshape(-1, 3, 6)[rows[0]][:, 3:], rotation)
+    motion = SmallMotion(fields, parameters.reshape(6, -1))
     names = ("X", "Y")
     text = (
         f"primary axis {names[first]}, secondary axis {names[second]}, end-point lines through the reference point "
         "(zero there)"
     )
-    return _without(field, parameters, error, text)
+    return _without(field, motion, motion.taken_out(field.error_mm), text)
 
 
 def volume_figures(field: ErrorField, pairs: ErrorField | None = None) -> dict[str, Figure]:
@@ -285,14 +286,13 @@ def volume_figures(field: ErrorField, pairs: ErrorField | None = None) -> dict[s
         weight[:, k] = range_weight(along)
         found[f"V_{axis}"] = Figure.of_mm(np.ptp(along), field.spread(weight), meaning)
     size = np.linalg.norm(field.error_mm, axis=1)
-    rms = float(np.sqrt(np.mean(size**2)))
+    largest, rms, p95 = sizes_of(size)
     worst = int(np.argmax(size))
     found["max"] = _figure(
-        field, size[worst], _at(field, worst), f"largest length of the error vector {where}; not a standard figure"
+        field, largest, _at(field, worst), f"largest length of the error vector {where}; not a standard figure"
     )
     weight = field.error_mm / (len(field) * rms) if rms else np.zeros_like(field.error_mm)
     found["rms"] = _figure(field, rms, weight, f"root mean square of the error vector {where}; not a standard figure")
-    p95 = float(np.percentile(size, 95))
     near = int(np.argmin(np.abs(size - p95)))
     found["p95"] = _figure(
         field, p95, _at(field, near), f"95th percentile of its length {where}; not a standard figure"

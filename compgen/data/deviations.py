@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.comparison import best_rotation
 from compgen.data.csv_files import CsvTable, FloatArray
 from compgen.data.display import Displayed, Overview, ranges_of
 from compgen.data.names import MM_PER_UM
@@ -264,7 +265,7 @@ def aligned(deviations: Deviations) -> Deviations:
         own = setups == setup
         nominal = deviations.position_mm[own]
         actual = nominal + deviations.deviation_mm[own]
-        rotation = _best_rotation(nominal, actual)
+        rotation = _turn(nominal, actual)
         # means over what was measured; 0 for a component that was not
         seen = np.isfinite(actual)
         count = np.maximum(seen.sum(axis=0), 1)
@@ -282,20 +283,20 @@ def aligned(deviations: Deviations) -> Deviations:
     return replace(deviations, deviation_mm=turned, poses=poses)
 
 
-def _best_rotation(nominal_mm: FloatArray, actual_mm: FloatArray) -> FloatArray:
-    """The proper rotation from nominal to measured coordinates (Kabsch), in the plane or the space that was measured."""
+def _turn(nominal_mm: FloatArray, actual_mm: FloatArray) -> FloatArray:
+    """The rotation (3, 3) from nominal to measured coordinates, in the plane or the space that was measured."""
     rows = np.isfinite(actual_mm)
     components = np.flatnonzero(rows.any(axis=0))
     complete = rows[:, components].all(axis=1)
     if len(components) < 2 or np.count_nonzero(complete) < len(components):
         return np.eye(3)
-    first, second = nominal_mm[complete][:, components], actual_mm[complete][:, components]
-    moment = (second - second.mean(axis=0)).T @ (first - first.mean(axis=0))
-    left, size, right = np.linalg.svd(moment)
-    if size[-2] < 1e-9 * max(size[0], 1e-9):  # all on one line: its rotation about itself is not seen
+    first, second = (values[complete][:, components] for values in (nominal_mm, actual_mm))
+    moment = np.zeros((3, 3))
+    moment[np.ix_(components, components)] = (second - second.mean(axis=0)).T @ (first - first.mean(axis=0))
+    size = np.linalg.svd(moment, compute_uv=False)
+    if size[len(components) - 2] < 1e-9 * max(size[0], 1e-9):  # all on one line: its rotation about itself is not seen
         return np.eye(3)
-    guard = np.ones(len(components))
-    guard[-1] = np.sign(np.linalg.det(left @ right))  # a reflection would fit data with a sign error, silently
-    matrix = np.eye(3)
-    matrix[np.ix_(components, components)] = (left * guard) @ right
-    return matrix
+    if len(components) == 2:  # the component that was not measured stays: no turn out of the plane, no mirror image
+        left = 3 - components.sum()
+        moment[left, left] = size[0]
+    return best_rotation(moment)

@@ -170,6 +170,12 @@ class ErrorTable(Drawable):
             first += count
         return found
 
+    def labels(self) -> tuple[tuple[str, ...], FloatArray]:
+        """Name and position in mm of each of :meth:`values`, (k,); nan for squareness."""
+        names = [name for name, rows in self.rows().items() for _ in range(rows.start, rows.stop)]
+        at = [(np.nan,) if name in self.squareness else self.curves[name].position_mm for name in self.names]
+        return tuple(names), self._stacked(at)
+
     def with_values(self, values: FloatArray | None = None, u: FloatArray | None = None) -> ErrorTable:
         """Return the table with other values or uncertainties (k,), in the order of :meth:`values`."""
         values = self.values() if values is None else values

@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns, read_axis_runs
+from compgen.data.comparison import rigid_fields
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations, read_deviations
 from compgen.data.lengths import Lengths, read_lengths
@@ -247,10 +248,10 @@ class ObservedDeviations(Observed):
     def placed(self, tip_mm: FloatArray, placement: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Component of tip - nominal, shifted and turned (to first order) with the frame."""
         nominal = self.poses.position_mm + self.poses.tool_mm
-        moved = tip_mm - nominal + placement[:3] + np.cross(placement[3:], nominal)
-        unit = np.eye(3)[self.component]
-        columns = np.hstack([unit, np.cross(nominal[self.poses.of], unit)])
-        return moved[self.poses.of, self.component], unit, columns
+        fields = rigid_fields(nominal).reshape(-1, 3, 6)
+        moved = tip_mm - nominal + fields @ placement
+        read = self.poses.of, self.component
+        return moved[read], np.eye(3)[self.component], fields[read]
 
     def readings(self, tip_mm: FloatArray, placement: FloatArray) -> Readings:
         """The components as readings along the axes."""

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from compgen.data.comparison import Difference, SmallMotion, Uncertain, compare, sizes_of, small_motion
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.machine import Machine
-from compgen.data.names import ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.data.names import MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
 from compgen.fleet.decisions import excluded
 from compgen.fleet.records import MachineRecord
@@ -26,18 +26,18 @@ from compgen.identify.covariance import (
     error_design,
     values_at_nodes,
 )
-from compgen.kinematics.gauge import LEVER_MM, gauge_directions, rigid_fields
+from compgen.kinematics.gauge import curve_weights, gauge_changes, gauge_directions, gauge_part
 from compgen.kinematics.many_points import volumetric_error
 
 # Whether a machine has changed between two measurements, against the uncertainty of both.
 #
 # The change is E = C P of the new errors minus that of the old ones at points of the volume, with the best-fit rigid
 # motion taken out: so the gauge directions, which no measurement shows, do not count. If nothing changed, its covariance
-# is the sum of both, and the sum of squares T over the points is a weighted sum of chi-squares with the eigenvalues of
-# that covariance as weights; its distribution is taken as that of a scaled chi-square with the same mean and variance
-# (Satterthwaite 1946, Biometrics Bulletin 2).
+# is the sum of both, which says how probable its sum of squares over the points is (:mod:`compgen.data.comparison`).
 
 
+#: Identified errors and, where it is known, their covariance.
+Known = tuple[ErrorTable, Covariance | None]
 #: Points along each axis of the grid on which the change is looked at.
 POINTS = 6
 #: A change is like a field if it differs from it by at most the first share of the field (rms) beyond the noise, or by at
@@ -101,8 +101,8 @@ class Likeness:
 
 def likeness(
     machine: Machine,
-    new: tuple[ErrorTable, Covariance | None],
-    old: tuple[ErrorTable, Covariance | None],
+    new: Known,
+    old: Known,
     added: Mapping[str, FloatArray],
     missing: Mapping[str, FloatArray],
 ) -> Likeness | None:
@@ -119,12 +119,10 @@ def likeness(
     missing : fields that may have been counted without acting.
     """
     position_mm = volume_points(machine)
-    keep = rigid_free_projector(machine, position_mm)
-    difference = volumetric_error(machine, new[0], position_mm) - volumetric_error(machine, old[0], position_mm)
-    moved = keep @ difference.ravel()
-    factors = [_spread(machine, spread, position_mm) for _, spread in (new, old) if spread is not None]
-    noise = sum(float(np.sum((keep @ factor) ** 2)) for factor in factors)
-    free = _directions(machine, new[0], position_mm, keep)
+    motion = small_motion(position_mm)
+    change = _compared(machine, new, old, position_mm)
+    moved, noise = change.value, change.noise
+    free = _directions(machine, new[0], position_mm, motion)
     best: Likeness | None = None
     nearest = DRIFTED
     signed = [
@@ -132,7 +130,7 @@ def likeness(
         *((name, -1, field) for name, field in missing.items()),
     ]
     for name, sign, error_field in signed:
-        known = keep @ error_field.ravel()
+        known = motion.taken_out(error_field).ravel()
         square, product = float(known @ known), float(known @ moved)
         if square <= 4.0 * noise or sign * product <= 0.0:
             continue  # too small to be told from nothing, or the other way round
@@ -147,7 +145,7 @@ def likeness(
     return best
 
 
-def _directions(machine: Machine, errors: ErrorTable, position_mm: FloatArray, keep: FloatArray) -> float:
+def _directions(machine: Machine, errors: ErrorTable, position_mm: FloatArray, motion: SmallMotion) -> float:
     """Number of independent directions that low-order changes of the errors span over the volume.
 
     Each error may change by its value (squareness), or by a line and a bow; fields that nearly coincide count once: n^2
@@ -165,7 +163,7 @@ def _directions(machine: Machine, errors: ErrorTable, position_mm: FloatArray, k
         else:
             share = np.interp(at, (at.min(), at.max()), (-1.0, 1.0))
             shapes = np.array([share, share**2 - 1.0 / 3.0])
-        columns += [keep @ (design[:, own] @ shape) for shape in shapes]
+        columns += [motion.taken_out(design[:, own] @ shape) for shape in shapes]
     fields = np.column_stack(columns)
     length = np.linalg.norm(fields, axis=0)
     fields = fields[:, length > 1e-6 * length.max()] / length[length > 1e-6 * length.max()]
@@ -182,49 +180,34 @@ def change_between(
     confidence: float,
 ) -> Change:
     """Compare two identifications (errors with covariance) of one machine over its volume."""
-    position_mm = volume_points(machine)
-    difference = volumetric_error(machine, new[0], position_mm) - volumetric_error(machine, old[0], position_mm)
-    keep = rigid_free_projector(machine, position_mm)
-    moved = keep @ difference.ravel()
-    factors = [_spread(machine, covariance, position_mm) for _, covariance in (new, old)]
-    factor = keep @ np.hstack(factors)
-    count = len(position_mm)
-    p_value = _p_value(float(moved @ moved), factor)
+    found = _compared(machine, new, old, volume_points(machine))
+    sizes = sizes_of(found.size / MM_PER_UM)
+    count = len(found.size)
     return Change(
-        rms_um=float(np.sqrt(moved @ moved / count)) / MM_PER_UM,
-        max_um=float(np.max(np.linalg.norm(moved.reshape(-1, 3), axis=1))) / MM_PER_UM,
-        expected_rms_um=float(np.sqrt(np.sum(factor**2) / count)) / MM_PER_UM,
-        p_value=p_value,
+        rms_um=sizes.rms,
+        max_um=sizes.largest,
+        expected_rms_um=float(np.sqrt(found.noise / count)) / MM_PER_UM,
+        p_value=found.p_of_sum(),
         confidence=confidence,
     )
+
+
+def _compared(machine: Machine, new: Known, old: Known, position_mm: FloatArray) -> Difference:
+    """Difference of the fields at points (n, 3) without rigid motion; what has no covariance counts as exact."""
+    fields: list[Uncertain] = []
+    for errors, covariance in (new, old):
+        factor = np.zeros((position_mm.size, 0))
+        if covariance is not None:
+            design = error_design(machine, covariance, position_mm)
+            factor = design.reshape(position_mm.size, -1) @ covariance.errors_factor
+        fields.append((volumetric_error(machine, errors, position_mm).ravel(), factor))
+    return compare(fields[0], fields[1], small_motion(position_mm))
 
 
 def volume_points(machine: Machine) -> FloatArray:
     """Return the points at which changes are looked at, (n, 3), mm."""
     levels = [np.linspace(*axis.range_mm, POINTS) for axis in machine.axes]
     return np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _spread(machine: Machine, covariance: Covariance, position_mm: FloatArray) -> FloatArray:
-    """Factor of the covariance of E at all points one after another, (3 n, r), mm."""
-    design = error_design(machine, covariance, position_mm)
-    return np.asarray(design.reshape(3 * len(position_mm), -1) @ covariance.errors_factor)
-
-
-def rigid_free_projector(machine: Machine, position_mm: FloatArray) -> FloatArray:
-    """Projector (3 n, 3 n) that takes translations and rotations out of a field at points (n, 3)."""
-    tip = (position_mm - position_mm.mean(axis=0)) / 1000.0
-    rigid, _ = np.linalg.qr(rigid_fields(tip))
-    return np.asarray(np.eye(tip.size) - rigid @ rigid.T)
-
-
-def _p_value(total: float, factor: FloatArray) -> float:
-    """Probability that the squares of a normal vector with covariance F F^T add up to ``total`` or more."""
-    gram = factor.T @ factor if factor.shape[1] < factor.shape[0] else factor @ factor.T
-    mean, squares = float(np.trace(gram)), float(np.sum(gram**2))
-    if mean <= 0.0:
-        return 0.0 if total > 0.0 else 1.0
-    return float(chi2.sf(total * mean / squares, mean * mean / squares))
 
 
 # The calibrations of one machine on common figures: gauge-aligned, each with its joint covariance.
@@ -390,19 +373,10 @@ def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
 
 def _gauge_projector(machine: Machine, error: Sequence[str], position_mm: FloatArray) -> FloatArray:
     """Matrix (k, k) that takes the gauge directions out so that the curves, not squareness, become small."""
-    counts = {name: error.count(name) for name in error}
-    names = [name for name, count in counts.items() if count > 1 or name in SQUARENESS_NAMES]
-    directions = gauge_directions(machine, names)
-    index = [ERROR_INDEX[name] for name in error]
-    shapes = directions[:, index, 0] + directions[:, index, 1] * np.nan_to_num(position_mm)
-    gauge = shapes.T  # (k, directions)
-    # every curve counts alike however many nodes it has, an angle by its lever, a squareness not at all
-    reach = {name: 1.0 if error_named(name).kind == "linear" else LEVER_MM for name in counts}
-    part = {name: reach[name] / float(np.sqrt(count)) for name, count in counts.items()}
-    weight = np.array([0.0 if name in SQUARENESS_NAMES else part[name] for name in error])
-    gauge = gauge / np.maximum(np.linalg.norm(weight[:, None] * gauge, axis=0), 1e-300)
-    amounts = np.linalg.pinv(weight[:, None] * gauge, rcond=1e-10) * weight
-    return np.asarray(np.eye(len(error)) - gauge @ amounts)
+    names = [name for name in dict.fromkeys(error) if name in SQUARENESS_NAMES or error.count(name) > 1]
+    weight = np.where(np.isin(error, SQUARENESS_NAMES), 0.0, curve_weights(error))
+    changes = gauge_changes(gauge_directions(machine, names), error, position_mm)
+    return np.asarray(np.eye(len(error)) - gauge_part(changes, np.diag(weight)))
 
 
 def _figures(
@@ -436,10 +410,6 @@ def _parts(name: str, position_mm: FloatArray) -> dict[str, FloatArray]:
 # Change between two calibrations: of each error with the joint covariance of its values, and of the volume.
 
 
-#: Directions of the covariance with less than this share of the largest standard uncertainty are rounding.
-ROUNDING = 1e-7
-
-
 @dataclass(frozen=True)
 class ErrorChange:
     """Change of one error in the common gauge.
@@ -464,27 +434,15 @@ class ErrorChange:
 
 def changes(data: Aligned, new: int, old: int) -> tuple[ErrorChange, ...]:
     """Return the change of every error from calibration ``old`` to ``new``; both are taken as independent."""
-    difference = data.value[new] - data.value[old]
-    factor = np.hstack([data.factor[new], data.factor[old]])
+    whole = compare((data.value[new], data.factor[new]), (data.value[old], data.factor[old]))
     names = list(dict.fromkeys(data.error))
     found = []
     for name in names:
-        columns = data.columns(name)
-        part, spread = difference[columns], factor[columns]
-        k = int(np.argmax(np.abs(part)))
-        found.append((float(part[k]), float(np.linalg.norm(spread[k])), chi_square_p(part, spread)))
+        part = whole.part(data.columns(name))
+        k = int(np.argmax(np.abs(part.value)))
+        found.append((float(part.value[k]), float(part.u[k]), part.p_of_pattern()))
     adjusted = holm([item[2] for item in found])
     return tuple(ErrorChange(name, *item, each) for name, item, each in zip(names, found, adjusted, strict=True))
-
-
-def chi_square_p(difference: FloatArray, factor: FloatArray) -> float:
-    """Probability of at least this difference (m,) under a normal distribution with covariance F F^T (m, m)."""
-    vectors, sizes, _ = np.linalg.svd(factor, full_matrices=False)
-    kept = sizes > ROUNDING * sizes[0]
-    if not kept.any():
-        return 1.0
-    score = vectors[:, kept].T @ difference / sizes[kept]
-    return float(chi2.sf(score @ score, int(np.count_nonzero(kept))))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm, t
 
+from compgen.data.comparison import small_motion
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.errors import InputError
@@ -27,7 +28,6 @@ from compgen.fleet.change import (
     change_between,
     changes,
     holm,
-    rigid_free_projector,
     volume_points,
     with_all_errors,
 )
@@ -478,7 +478,7 @@ def _field(data: Aligned) -> FloatArray:
     """E at the points of the volume without rigid motion, by the error values, (3 n, k)."""
     position_mm = volume_points(data.machine)
     design = error_design(data.machine, data.field_covariance(0), position_mm)
-    return np.asarray(rigid_free_projector(data.machine, position_mm) @ design.reshape(3 * len(position_mm), -1))
+    return small_motion(position_mm).taken_out(design.reshape(3 * len(position_mm), -1))
 
 
 #: Mean length of a month.

@@ -138,15 +138,7 @@ def joint_covariance(result: Identification) -> Covariance:
 
 def covariance_of_values(errors: ErrorTable, factor: FloatArray, machine: str = "") -> Covariance:
     """Covariance of error values that a factor (k, r) in the order of the errors file describes; no stations."""
-    names: list[str] = []
-    positions = []
-    for name in errors.names:
-        at = np.array([np.nan]) if name in errors.squareness else errors.curves[name].position_mm
-        names += [name] * len(at)
-        positions.append(at)
-    return Covariance(
-        tuple(names), np.concatenate([np.zeros(0), *positions]), (), np.zeros(0, dtype=np.int64), factor, machine
-    )
+    return Covariance(*errors.labels(), (), np.zeros(0, dtype=np.int64), factor, machine)
 
 
 def values_at_nodes(errors: ErrorTable, names: Sequence[str], position_mm: FloatArray) -> FloatArray:
@@ -168,13 +160,6 @@ def covariance_or_independent(
         return covariance
     u = errors.uncertainties()
     return covariance_of_values(errors, np.diag(u), machine) if len(u) and np.isfinite(u).all() else None
-
-
-def normalized_error(difference: FloatArray, expanded: FloatArray) -> FloatArray:
-    """E_n number of each difference (ISO/IEC 17043): its size over its expanded uncertainty; 0 for nothing over nothing."""
-    size, expanded = np.abs(difference), np.asarray(expanded, dtype=np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where((size == 0.0) & (expanded == 0.0), 0.0, size / expanded))
 
 
 # --- systematic inputs on top of the random part -------------------------------------------------------------------

@@ -15,16 +15,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from compgen.data.comparison import Uncertain, compare, normalized_error, small_motion
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify.adjust.unknowns import ErrorParameters
-from compgen.identify.covariance import error_design, error_values, joint_covariance, normalized_error, values_at_nodes
+from compgen.identify.covariance import error_design, error_values, joint_covariance, values_at_nodes
 from compgen.identify.identification import Identification, table_of_values, worst_uncertainty
 from compgen.kinematics.first_order import c_matrix, tool_of
-from compgen.kinematics.gauge import rigid_fields
 
 #: Probability with which two true measurements are said to disagree somewhere.
 FALSE_ALARM = 0.05
@@ -71,8 +71,9 @@ def merge(machine: Machine, first: Identification, second: Identification) -> Id
     names, positions, turned, factor, left = projected(machine, first.layout, second)
     values = values_at_nodes(first.errors, names, positions)
     freedom = float(second.details.get("repeatability_freedom") or MANY)
-    agreement, u1, u2 = _compare(names, (values, own.errors_factor), (turned, factor), left, freedom)
-    merged, roots = _average(names, agreement, (values, own.errors_factor, u1), (turned, factor, u2))
+    pair = (values, own.errors_factor), (turned, factor)
+    agreement = _compare(names, *pair, left, freedom)
+    merged, roots = _average(names, agreement, *pair)
     errors = _table(first.errors, names, positions, merged, roots)
     texts = _texts(agreement)
     for text in texts:
@@ -128,12 +129,12 @@ def projected(machine: Machine, layout: ErrorParameters, second: Identification)
     tool that the layout cannot express, mm.
     """
     position = _points(machine)
-    tip = position + tool_of(machine, None)
     bases = [layout.basis(axis, position[:, axis]) for axis in range(3)]
     design = layout.design(c_matrix(machine, position, None), bases).reshape(-1, layout.size)
-    design = np.hstack([design, rigid_fields(tip)])
     covariance = joint_covariance(second)
     target = error_design(machine, covariance, position).reshape(len(design), -1)
+    motion = small_motion(position + tool_of(machine, None))  # each instrument has a frame of its own
+    design, target = motion.taken_out(design), motion.taken_out(target)
     scale = np.linalg.norm(design, axis=0)
     found = np.linalg.lstsq(design / scale, target, rcond=1e-11)[0] / scale[:, None]
     values = values_at_nodes(second.errors, list(covariance.error), covariance.position_mm)
@@ -148,35 +149,27 @@ def projected(machine: Machine, layout: ErrorParameters, second: Identification)
 
 
 def _compare(
-    names: Sequence[str],
-    first: tuple[FloatArray, FloatArray],
-    second: tuple[FloatArray, FloatArray],
-    left_mm: float,
-    freedom: float,
-) -> tuple[InstrumentAgreement, FloatArray, FloatArray]:
+    names: Sequence[str], first: Uncertain, second: Uncertain, left_mm: float, freedom: float
+) -> InstrumentAgreement:
     from scipy.special import stdtrit  # imported here: slow to load, and few measurements have two instruments
 
-    (one, root1), (other, root2) = first, second
-    u1, u2 = (np.sqrt(np.einsum("ij,ij->i", root, root)) for root in (root1, root2))
-    u = np.hypot(u1, u2)
-    known = u > 1e-15
+    found = compare(first, second)
+    known = found.u > 1e-15
     k = -float(stdtrit(freedom, FALSE_ALARM / 2.0 / max(int(known.sum()), 1)))
-    ratio = np.where(known, normalized_error(one - other, k * u), 0.0)
+    ratio = np.where(known, normalized_error(found.value, k * found.u), 0.0)
     label = np.array(names)
     en = {name: float(ratio[label == name].max()) for name in dict.fromkeys(names)}
-    return InstrumentAgreement(en, k, left_mm), u1, u2
-
-
-Part = tuple[FloatArray, FloatArray, FloatArray]
+    return InstrumentAgreement(en, k, left_mm)
 
 
 def _average(
-    names: Sequence[str], agreement: InstrumentAgreement, first: Part, second: Part
+    names: Sequence[str], agreement: InstrumentAgreement, first: Uncertain, second: Uncertain
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted means (k,) and a factor of their covariance; disagreeing errors keep the first value."""
-    (one, root1, u1), (other, root2, u2) = first, second
-    square = u1**2 + u2**2
-    share = np.where(square > 0, u1**2 / np.where(square > 0, square, 1.0), 0.0)
+    (one, root1), (other, root2) = first, second
+    square1, square2 = (np.einsum("ij,ij->i", root, root) for root in (root1, root2))
+    square = square1 + square2
+    share = np.where(square > 0, square1 / np.where(square > 0, square, 1.0), 0.0)
     label = np.array(names)
     odd = np.zeros((len(names), len(agreement.disagree)))
     for column, name in enumerate(agreement.disagree):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.comparison import rigid_fields
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import PART, Deviations, aligned, setups_of
 from compgen.data.error_table import ErrorTable
@@ -213,15 +214,15 @@ def _readings(machine: Machine, deviations: Deviations, sigma_mm: FloatArray) ->
 
 def observed_positions(layout: ErrorParameters, readings: _Readings, *, free_scale: bool = False) -> Observations:
     """The components of positions as readings of the errors, and of shift, turn and scale of each set-up about its centre."""
-    unit = np.eye(3)[readings.component]
-    # e . (w x p) = w . (p x e)
-    own = [unit, np.cross(readings.arm_mm, unit), np.einsum("ij,ij->i", unit, readings.arm_mm)[:, None]]
-    block = np.hstack(own[: 3 if free_scale else 2])
+    read = np.arange(len(readings.component)), readings.component
+    block = rigid_fields(readings.arm_mm).reshape(-1, 3, 6)[read]
+    if free_scale:
+        block = np.column_stack([block, readings.arm_mm[read]])
     setups = np.unique(readings.setup)
     columns = c_matrix(layout.machine, readings.position_mm, readings.tool_mm)
     design = layout.design(columns, layout.bases(readings.position_mm))
     return Observations(
-        design=np.asarray(design[np.arange(len(design)), readings.component]),
+        design=np.asarray(design[read]),
         others=np.hstack([block * (readings.setup == setup)[:, None] for setup in setups]),
         value=readings.deviation_mm,
         sigma=readings.sigma_mm,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.comparison import best_rotation, small_motion
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths
@@ -346,7 +347,7 @@ class Placement:
 def place(
     points_mm: FloatArray, target_mm: FloatArray, weight: FloatArray | None = None, anchor: int | None = None
 ) -> Placement:
-    """Return the rigid motion that brings points (n, 3) closest to targets (n, 3): eq. 20 by singular values.
+    """Return the rigid motion that brings points (n, 3) closest to targets (n, 3): eq. 20 in closed form.
 
     Parameters
     ----------
@@ -363,22 +364,18 @@ def place(
     w = np.ones(len(points_mm)) if weight is None else weight / weight.mean()
     share = w / w.sum() if anchor is None else (np.arange(len(w)) == anchor).astype(np.float64)
     here, there = share @ points_mm, share @ target_mm
-    left, size, right = np.linalg.svd((target_mm - there).T @ (w[:, None] * (points_mm - here)))
+    moment = (target_mm - there).T @ (w[:, None] * (points_mm - here))
+    size = np.linalg.svd(moment, compute_uv=False)
     if size[1] <= 1e-12 * size[0]:
         raise UndeterminedError("the points lie on one line; nothing tells how the frame is turned about it", [])
-    hand = 1.0 if np.linalg.det(left @ right) > 0 else -1.0
-    proper = _rotated(left, right, hand, points_mm - here, target_mm - there, w)
-    image = _rotated(left, right, -hand, points_mm - here, target_mm - there, w)
-    rotation, rms = proper
-    return Placement(rotation, there - rotation @ here, rms, image[1] < MIRROR_RATIO * rms)
-
-
-def _rotated(
-    left: FloatArray, right: FloatArray, hand: float, points: FloatArray, targets: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, float]:
-    rotation = left @ np.diag([1.0, 1.0, hand]) @ right
-    rest = points @ rotation.T - targets
-    return rotation, float(np.sqrt(np.average(np.sum(rest**2, axis=1), weights=weight)))
+    # the best rotation, and the best mirror image: a rotation of the points mirrored in their centre
+    rotation, image = best_rotation(moment), -best_rotation(-moment)
+    rms_mm, rms_of_image = (
+        float(np.sqrt(np.average(np.sum(((points_mm - here) @ turn.T - target_mm + there) ** 2, axis=1), weights=w)))
+        for turn in (rotation, image)
+    )
+    handed = size[2] > 1e-12 * size[0]  # points in a plane are their own mirror image
+    return Placement(rotation, there - rotation @ here, rms_mm, handed and rms_of_image < MIRROR_RATIO * rms_mm)
 
 
 def placed_covariance(
@@ -392,15 +389,9 @@ def placed_covariance(
     lever, shared : (n, 3, q) and (q, q); the points share the part lever shared lever^T.
     points_mm, weight : as for :func:`place`, the points in the final frame.
     """
-    w = weight / weight.mean()
-    share = w / w.sum()
-    arms = cross_matrices(points_mm - share @ points_mm)
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), own.shape), -arms], axis=2)  # movement by (shift, turn)
-    moment = np.einsum("n,nji,njk->ik", w, arms, arms)
-    turning = np.linalg.solve(moment, w[:, None, None] * arms)
-    taken = np.concatenate(
-        [share[:, None, None] * np.eye(3), turning], axis=1
-    )  # (shift, turn) by each point, (n, 6, 3)
+    motion = small_motion(points_mm, weight)
+    rigid = motion.fields.reshape(-1, 3, 6)  # movement of each point by the six amounts
+    taken = motion.reading.reshape(6, -1, 3).transpose(1, 0, 2)  # the six amounts by each point, (n, 6, 3)
     own_part = taken @ own  # (n, 6, 3)
     total = np.einsum("nij,nkj->ik", own_part, taken)
     cross = rigid @ own_part

@@ -9,24 +9,22 @@ and positioning of its axis.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
+from compgen.data.comparison import rigid_fields
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Machine
-from compgen.data.names import CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, SQUARENESS_NAMES, error_named
+from compgen.data.names import CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, error_named
 from compgen.kinematics.first_order import c_matrix, tool_of
 
 #: 1 um counts as much as 1 urad: an angle counts at this lever.
 LEVER_MM = 1000.0
 #: Singular value below which a combination has no effect; coordinates and levers are scaled to about 1.
 NO_EFFECT = 1e-9
-
-
-#: Change of the values of some errors, by name: at the positions of a curve, or of a squareness error (1,).
-Change = Mapping[str, FloatArray]
 
 
 def gauge_directions(
@@ -85,32 +83,33 @@ def _effects(
     return np.column_stack(columns), slots
 
 
-def rigid_fields(tip_mm: FloatArray) -> FloatArray:
-    """Fields of three translations and three small rotations about the origin at tips (n, 3): columns, (3 n, 6)."""
-    unit = np.eye(3)
-    fields = [np.broadcast_to(unit[k], tip_mm.shape) for k in range(3)]
-    fields += [np.cross(unit[k], tip_mm) for k in range(3)]
-    return np.column_stack([field.ravel() for field in fields])
+def gauge_changes(directions: FloatArray, error: Sequence[str], position_mm: FloatArray) -> FloatArray:
+    """Return gauge directions (d, 21, 2) as changes of error values, (k, d).
 
-
-def without_rigid_motion(position_mm: FloatArray, error_mm: FloatArray) -> FloatArray:
-    """Take the best-fit rigid motion (least squares, finite rotation by SVD) out of errors (n, 3) at points (n, 3).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import compgen
-    >>> position_mm = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]])
-    >>> shifted = np.tile([0.01, 0.0, 0.0], (4, 1))
-    >>> float(np.abs(compgen.without_rigid_motion(position_mm, shifted)).max()) < 1e-12
-    True
+    ``error`` and ``position_mm`` (k,) are the name and position of each value; nan for squareness.
     """
-    actual = position_mm + error_mm
-    centre, moved_centre = position_mm.mean(axis=0), actual.mean(axis=0)
-    left, _, right = np.linalg.svd((actual - moved_centre).T @ (position_mm - centre))
-    sign = np.sign(np.linalg.det(left @ right))
-    rotation = left @ np.diag([1.0, 1.0, sign]) @ right  # nominal -> actual
-    return np.asarray((actual - moved_centre) @ rotation - (position_mm - centre))
+    index = [ERROR_INDEX[name] for name in error]
+    return np.asarray((directions[:, index, 0] + directions[:, index, 1] * np.nan_to_num(position_mm)).T)
+
+
+def gauge_part(changes: FloatArray, conditions: FloatArray) -> FloatArray:
+    """Matrix (k, k) that finds what ``changes`` (k, d) have to take out of values (k,): G (W G)^+ W.
+
+    With it taken out, the ``conditions`` W (m, k) leave as little of the values as they can (least squares). This is the
+    choice of a gauge: which values shall be zero or small. It is linear, so it takes its part out of a covariance too.
+    """
+    effect = conditions @ changes
+    scale = np.linalg.norm(effect, axis=0)
+    used = scale > 1e-12 * scale.max(initial=0.0)
+    amounts = np.linalg.pinv(effect[:, used] / scale[used], rcond=1e-10) / scale[used][:, None]
+    return np.asarray(changes[:, used] @ (amounts @ conditions))
+
+
+def curve_weights(error: Sequence[str]) -> FloatArray:
+    """Weights (k,) of error values with which every curve counts alike however many nodes it has, an angle by its lever."""
+    counts = Counter(error)
+    reach = {name: 1.0 if error_named(name).kind == "linear" else LEVER_MM for name in counts}
+    return np.array([reach[name] / np.sqrt(counts[name]) for name in error])
 
 
 def align(
@@ -129,21 +128,19 @@ def align(
     tools_mm : tool offsets (n, 3) that the tables are used with; default the machine's own.
     """
     full = _completed(errors, reference)
+    error, position_mm = full.labels()
     names = [name for name in full.names if name in full.squareness or len(full.curves[name].value) > 1]
-    directions = gauge_directions(machine, names, tools_mm)
-    changes: list[Change] = []
-    for direction in directions:  # constants and slopes (21, 2) as changes of node values
-        parts = {name: direction[ERROR_INDEX[name]] for name in full.names}
-        along = {name: full.curves[name].position_mm if name in full.curves else np.zeros(1) for name in full.names}
-        changes.append({name: part[0] + part[1] * along[name] for name, part in parts.items() if part.any()})
-    changes += _free_changes(machine, full, tools_mm)
-    if not changes:
-        return errors
-    design = np.column_stack([_stacked(full, change) for change in changes])
-    target = _stacked(full, _differences(full, reference))
-    scale = np.linalg.norm(design, axis=0)
-    amounts = np.linalg.lstsq(design / scale, target, rcond=1e-13)[0] / scale
-    return _changed(errors, full, changes, amounts)
+    changes = gauge_changes(gauge_directions(machine, names, tools_mm), error, position_mm)
+    changes = np.hstack([changes, *_free_changes(machine, full, tools_mm)])
+    there = np.zeros(len(error))  # an error that the reference lacks comes close to zero
+    for name, rows in full.rows().items():
+        if name in reference.curves:
+            there[rows] = reference.curves[name].at(position_mm[rows])
+        elif name in reference.squareness:
+            there[rows] = reference.squareness[name][0]
+    change = gauge_part(changes, np.diag(curve_weights(error))) @ (there - full.values())
+    kept = [name for name, rows in full.rows().items() if name in errors.names or change[rows].any()]
+    return full.with_values(full.values() + change).only(*kept)
 
 
 def _completed(errors: ErrorTable, reference: ErrorTable) -> ErrorTable:
@@ -156,12 +153,12 @@ def _completed(errors: ErrorTable, reference: ErrorTable) -> ErrorTable:
     return ErrorTable(curves, squareness, errors.metadata)
 
 
-def _free_changes(machine: Machine, full: ErrorTable, tools_mm: FloatArray | None) -> list[Change]:
-    """Changes of single nodes of angular errors that no travel shows, with what makes up for them in other curves."""
+def _free_changes(machine: Machine, full: ErrorTable, tools_mm: FloatArray | None) -> list[FloatArray]:
+    """Changes (k, nodes) of angular errors that no travel shows, node by node, with what makes up for them elsewhere."""
     tools = np.atleast_2d(tool_of(machine, None) if tools_mm is None else tools_mm)
     if len(tools) > 1 and np.ptp(tools, axis=0).max() > 0:
         return []
-    found: list[Change] = []
+    found, rows = [], full.rows()
     for name in (name for name in full.curves if error_named(name).kind == "angular"):
         error = error_named(name)
         if machine.chain.lever_axes(error.axis):
@@ -173,49 +170,10 @@ def _free_changes(machine: Machine, full: ErrorTable, tools_mm: FloatArray | Non
             p in full.curves and np.array_equal(full.curves[p].position_mm, curve.position_mm) for p in partners
         ):
             continue
-        for node in np.eye(len(curve.value)):
-            found.append({name: node, **{p: -arm * node for p, arm in partners.items()}})
+        nodes = np.eye(len(curve.value))
+        changes = np.zeros((len(full.values()), len(nodes)))
+        changes[rows[name]] = nodes
+        for partner, arm in partners.items():
+            changes[rows[partner]] = -arm * nodes
+        found.append(changes)
     return found
-
-
-def _stacked(full: ErrorTable, values: Change) -> FloatArray:
-    """Node values of all errors one after another, zero where ``values`` has none; every curve counts alike."""
-    parts = []
-    for name in full.names:
-        count = len(full.curves[name].value) if name in full.curves else 1
-        lever = 1.0 if error_named(name).kind == "linear" else LEVER_MM
-        parts.append(lever / np.sqrt(count) * values.get(name, np.zeros(count)))
-    return np.concatenate(parts)
-
-
-def _differences(full: ErrorTable, reference: ErrorTable) -> dict[str, FloatArray]:
-    """Reference minus table at the nodes of the table; nothing for errors that the reference lacks."""
-    found = {}
-    for name in full.names:
-        if name in full.curves:
-            curve = full.curves[name]
-            other = reference.curves[name].at(curve.position_mm) if name in reference.curves else 0.0
-            found[name] = other - curve.value
-        else:
-            found[name] = np.array([reference.squareness.get(name, (0.0, 0.0))[0] - full.squareness[name][0]])
-    return found
-
-
-def _changed(errors: ErrorTable, full: ErrorTable, changes: Sequence[Change], amounts: FloatArray) -> ErrorTable:
-    """Add the changes times their amounts (k,); what was completed and did not change is left out again."""
-    change: dict[str, FloatArray] = {}
-    for part, amount in zip(changes, amounts.tolist(), strict=True):
-        for name, values in part.items():
-            change[name] = change.get(name, np.zeros(len(values))) + amount * values
-    curves = {
-        name: Curve(curve.position_mm, curve.value + change.get(name, 0.0), curve.u)
-        for name, curve in full.curves.items()
-        if name in errors.curves or np.any(change.get(name, np.zeros(1)) != 0.0)
-    }
-    squareness = {
-        name: (value + float(change[name][0]) if name in change else value, u)
-        for name, (value, u) in full.squareness.items()
-        if name in errors.squareness or name in change
-    }
-    assert set(squareness) <= set(SQUARENESS_NAMES)
-    return ErrorTable(curves, squareness, errors.metadata)

@@ -9,8 +9,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from compgen.data.comparison import Residuals
 from compgen.data.messages import um_text
-from compgen.tables.judge import Residuals
 from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation
 
 # What the options of a control would buy: tables for the terminal, and ``options.md``.

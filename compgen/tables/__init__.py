@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 from compgen.resources import load_on_first_use
 
 if TYPE_CHECKING:
+    from compgen.data.comparison import Residuals, residuals, without_rigid_motion
     from compgen.data.files import Provenance
-    from compgen.kinematics.gauge import without_rigid_motion
     from compgen.resources import program_version
     from compgen.tables.export import REJECTED_PREFIX, REPORT_FILES, Export, export, set_aside_superseded, usable_format
-    from compgen.tables.judge import Residuals, SafetyLimits, residuals
+    from compgen.tables.judge import SafetyLimits
     from compgen.tables.render import Format, load_format
     from compgen.tables.signs import check_files
     from compgen.tables.synthesis import Projector, projector, synthesize, wanted_correction

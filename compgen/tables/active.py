@@ -11,6 +11,7 @@ import numpy as np
 
 from compgen.controls.shared.base import Monomial, Term
 from compgen.controls.shared.grids import curve_nodes_mm
+from compgen.data.comparison import figures_of
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import Curve, ErrorTable
@@ -23,7 +24,7 @@ from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, modelled_errors
 from compgen.kinematics.many_points import volume_grid
 from compgen.tables import wanted_correction
-from compgen.tables.judge import figures_of, node_positions
+from compgen.tables.judge import node_positions
 from compgen.tables.synthesis import Projector, projector
 from compgen.tables.verification import ReadTables, read_tables, table_files
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from compgen.data.comparison import figures_of, rms
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.kinematics.many_points import volume_grid
-from compgen.tables.judge import components, figures_of, node_positions, rms
+from compgen.tables.judge import components, node_positions
 from compgen.tables.verification import ReadTables
 
 #: Components below this, um rms, are left out of the list.

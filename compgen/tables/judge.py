@@ -11,6 +11,7 @@ import numpy as np
 
 from compgen.controls import AnyController
 from compgen.controls.shared.grids import curve_nodes_mm
+from compgen.data.comparison import residuals_twice, rms
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves, reversal_name
 from compgen.data.lengths import Points
@@ -20,47 +21,8 @@ from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import c_matrix, tool_of
-from compgen.kinematics.gauge import without_rigid_motion
 from compgen.kinematics.many_points import VolumeGrid, volume_grid
 from compgen.tables.synthesis import Projector, best_values, projector
-
-# Figures of a residual field over the volume, as it stands and after the best-fit rigid motion is taken out.
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """Figures of a field of position errors: largest, root mean square, 95th percentile of the length of the vector.
-
-    ``v_x_um`` ... are the ranges (max - min) of the components over the volume (ISO 230-1 volumetric accuracy).
-    """
-
-    max_um: float
-    rms_um: float
-    p95_um: float
-    v_x_um: float
-    v_y_um: float
-    v_z_um: float
-
-    def as_dict(self) -> dict[str, float]:
-        """Return the figures by name."""
-        return asdict(self)
-
-
-def figures_of(size_mm: FloatArray) -> dict[str, float]:
-    """Return the largest, the root mean square and the 95th percentile of magnitudes (n,), by name, um."""
-    size = np.abs(size_mm) / MM_PER_UM
-    return {
-        "max_um": float(size.max()),
-        "rms_um": float(np.sqrt(np.mean(size**2))),
-        "p95_um": float(np.percentile(size, 95)),
-    }
-
-
-def residuals(error_mm: FloatArray) -> Residuals:
-    """Return the figures of errors (n, 3)."""
-    x, y, z = (float(value) for value in np.ptp(error_mm, axis=0) / MM_PER_UM)
-    return Residuals(**figures_of(np.linalg.norm(error_mm, axis=1)), v_x_um=x, v_y_um=y, v_z_um=z)
-
 
 # A field on a full grid split into what belongs to one axis, to a pair of axes, and to all three.
 #
@@ -98,11 +60,6 @@ def components(grid: VolumeGrid, field_mm: FloatArray) -> dict[str, FloatArray]:
             parts[f"{letter}({name})"] = pair
         parts[f"{letter}(x,y,z)"] = rest
     return parts
-
-
-def rms(part_mm: FloatArray) -> float:
-    """Root mean square of a component over the grid (broadcasting does not change it)."""
-    return float(np.sqrt(np.mean(part_mm**2)))
 
 
 # Lines along the axes, sampled densely: a single wrong node of a fine table shows here and not in any mean.
@@ -254,9 +211,7 @@ class Judge:
         nominal = position_mm + tool_of(self.machine, None)
         before = exact_error(self.machine, self.errors, position_mm)
         after = exact_error(self.machine, self.errors, position_mm + correction_mm) + correction_mm
-        rms_before, rms_after = (
-            residuals(without_rigid_motion(nominal, error)).rms_um * MM_PER_UM for error in (before, after)
-        )
+        rms_before, rms_after = (residuals_twice(nominal, error)[1].rms_um * MM_PER_UM for error in (before, after))
         if rms_after <= rms_before + 1e-9 or rms_after <= self.resolution_mm:
             return []
         return [

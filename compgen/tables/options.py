@@ -15,6 +15,7 @@ from compgen.controls.shared.base import Usage
 from compgen.controls.shared.grids import curve_nodes_mm
 from compgen.controls.shared.terms import error_terms, one_dimensional_terms, product_terms
 from compgen.data import toml_files
+from compgen.data.comparison import Residuals, residuals_twice
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
@@ -23,10 +24,9 @@ from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.gauge import without_rigid_motion
 from compgen.kinematics.many_points import volume_grid, volumetric_error
 from compgen.tables import Export, export
-from compgen.tables.judge import LargestStep, Residuals, in_both_directions, left_by_reversal, residuals, safety_of
+from compgen.tables.judge import LargestStep, in_both_directions, left_by_reversal, safety_of
 from compgen.tables.synthesis import Projector, basis_field, placed_terms, projector, wanted_correction
 
 # Levels of compensation that controls sell, as bases of terms, and the best that each could do for given errors.
@@ -409,7 +409,7 @@ def _left(
     if reversal is not None and points.approach is not None:
         error = error + reversal.displacement(points.position_mm, points.approach)
     nominal = points.position_mm + tool_mm
-    return Left(residuals(error), residuals(without_rigid_motion(nominal, error)))
+    return Left(*residuals_twice(nominal, error))
 
 
 def _settings(machine: Machine, name: str) -> Any:

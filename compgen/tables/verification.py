@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from compgen.controls import AnyController, SourceFile, controller_named
+from compgen.data.comparison import Difference, Residuals, residuals_twice, rms, small_motion
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
 from compgen.data.error_table import ErrorTable, ReversalCurves
@@ -26,19 +27,16 @@ from compgen.identify.covariance import Covariance, covariance_or_independent, e
 from compgen.identify.identification import Identification
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import observable_errors, tool_of
-from compgen.kinematics.gauge import rigid_fields, without_rigid_motion
 from compgen.kinematics.many_points import volumetric_error
 from compgen.tables.entries import entry_check
 from compgen.tables.judge import (
     Judge,
-    Residuals,
     Safety,
     SafetyLimits,
     in_both_directions,
     judge_of,
     left_by_reversal,
     mean_correction,
-    residuals,
     reversal_reasons,
     safety_of,
 )
@@ -181,17 +179,11 @@ def figure_uncertainty(
     chosen = position_mm[places]
     spread = error_design(machine, known, chosen) @ known.errors_factor
     flat = spread.reshape(3 * len(chosen), -1)
-    rigid, _ = np.linalg.qr(rigid_fields((chosen + tool_of(machine, None) - chosen.mean(axis=0)) / 1000.0))
-    rest = flat - rigid @ (rigid.T @ flat)
-    rms, largest = _size_um(flat)
-    rms_rest, largest_rest = _size_um(rest)
-    return FigureUncertainty(rms, largest, rms_rest, largest_rest)
-
-
-def _size_um(flat: FloatArray) -> tuple[float, float]:
-    variance = np.einsum("ij,ij->i", flat, flat).reshape(-1, 3).sum(axis=1)
-    scale = COVERAGE / MM_PER_UM
-    return scale * float(np.sqrt(variance.mean())), scale * float(np.sqrt(variance.max()))
+    found: list[float] = []
+    for factor in (flat, small_motion(chosen + tool_of(machine, None)).taken_out(flat)):
+        u_um = Difference(np.zeros(len(flat)), factor).u_size / MM_PER_UM
+        found += [COVERAGE * rms(u_um), COVERAGE * float(u_um.max())]
+    return FigureUncertainty(*found)
 
 
 # --- the measurement -----------------------------------------------------------------------------------------------
@@ -713,8 +705,7 @@ def verify(
     rest = wanted_correction(machine, errors, grid_mm) - judge.best_mm
     if control.anchored:
         rest = rest - rest.mean(axis=0)
-    figures = [residuals(error) for error in (before, after)]
-    rigid_removed = [residuals(without_rigid_motion(nominal, error)) for error in (before, after)]
+    figures, rigid_removed = zip(*(residuals_twice(nominal, error) for error in (before, after)), strict=True)
     safety, reasons = reasons_against(machine, tables, judge, limits, reversal)
     useless = _useless_reasons(
         machine, tables, points_mm=(grid_mm, judge.line_mm), figures=figures, removed=rigid_removed

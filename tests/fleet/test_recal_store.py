@@ -338,15 +338,6 @@ def test_what_is_no_backup_is_refused(tmp_path):
 # --- the change against its uncertainty ----------------------------------------------------------------------------
 
 
-def test_the_probability_is_that_of_brute_force():
-    generator = np.random.default_rng(3)
-    factor = generator.normal(size=(12, 5)) * np.array([3.0, 1.0, 0.5, 0.2, 0.1])
-    totals = np.sum((generator.normal(size=(200_000, 5)) @ factor.T) ** 2, axis=1)
-    for share in (0.5, 0.9, 0.95, 0.99):
-        p_value = change._p_value(float(np.quantile(totals, share)), factor)
-        assert p_value == pytest.approx(1.0 - share, rel=0.25, abs=0.01)
-
-
 def test_a_change_of_the_gauge_is_no_change_and_a_shear_is(small_machine, small_errors):
     known = covariance_or_independent(small_errors, None)
     direction = gauge_directions(small_machine, small_errors.names)[3] * 1e-2

@@ -8,6 +8,7 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import CHAINS
 from compgen.data.names import ERROR_INDEX, ERROR_NAMES, SQUARENESS_NAMES, error_named
 from compgen.kinematics import align, gauge_directions, observable_errors, volumetric_error
+from compgen.kinematics.gauge import gauge_part
 
 ROUNDING = 1e-12  # mm, and rad at a lever of one metre
 RANGES = ((-420.0, 130.0), (50.0, 650.0), (-300.0, 0.0))
@@ -244,3 +245,19 @@ def test_alignment_comes_as_close_as_the_gauge_allows():
         step = direction * 1e-6 / max(np.abs(direction[:, 0]).max(), 300.0 * np.abs(direction[:, 1]).max())
         assert distance_to(transformed(aligned, step), reference) > least
         assert distance_to(transformed(aligned, -step), reference) > least
+
+
+def test_what_is_taken_out_along_the_gauge_leaves_the_least_of_the_conditions():
+    """The part lies along the changes, is taken out once and for all, and no step along them leaves less."""
+    generator = np.random.default_rng(3)
+    changes, conditions = generator.normal(size=(30, 4)) * [1.0, 1e-3, 1e3, 1.0], generator.normal(size=(12, 30))
+    changes[:, 3] = 2.0 * changes[:, 0]  # the same change twice
+    part, values = gauge_part(changes, conditions), generator.normal(size=30)
+    taken = part @ values
+    amounts = np.linalg.lstsq(changes[:, :3], taken, rcond=None)[0]
+    assert np.allclose(changes[:, :3] @ amounts, taken, rtol=0, atol=1e-10)
+    assert np.allclose(part @ taken, taken, rtol=0, atol=1e-10)
+    effect = conditions @ changes
+    left = conditions @ (values - taken)
+    assert np.abs(left @ effect / np.linalg.norm(effect, axis=0)).max() < 1e-10  # normal equations
+    assert not gauge_part(changes, np.zeros((5, 30))).any()  # nothing that is to be small

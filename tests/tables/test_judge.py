@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from compgen.controls import controller_named
+from compgen.data.comparison import residuals, rms
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.errors import InputError
@@ -19,9 +20,7 @@ from compgen.tables.judge import (
     left_by_reversal,
     mean_correction,
     point_reasons,
-    residuals,
     reversal_reasons,
-    rms,
     safety_of,
     scan_lines,
 )
