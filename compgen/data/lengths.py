@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,22 @@ class Lengths(Displayed):
     def __len__(self) -> int:
         """Return the number of readings."""
         return len(self.length_mm)
+
+    def part(self, rows: NDArray[Any]) -> Lengths:
+        """Return some of the readings, ``rows`` as an index or a mask (n,); all stations keep their number."""
+        chosen = np.arange(len(self))[rows].tolist()
+        return replace(
+            self,
+            station=self.station[rows],
+            point=[self.point[k] for k in chosen],
+            position_mm=self.position_mm[rows],
+            length_mm=self.length_mm[rows],
+            tool_mm=None if self.tool_mm is None else self.tool_mm[rows],
+            approach=None if self.approach is None else self.approach[rows],
+            labels={name: values[rows] for name, values in self.labels.items()},
+            covariates={name: values[rows] for name, values in self.covariates.items()},
+            origin=[self.origin[k] for k in chosen] if len(self.origin) else (),
+        )
 
     def overview(self) -> Overview:
         """Number of readings of each station."""

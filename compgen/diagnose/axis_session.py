@@ -147,7 +147,7 @@ class AxisSession:
         names = ("row", "position_mm", "direction", "run", "deviation_mm", "target", "leg", "cycle", "time")
         taken = {name: getattr(self, name)[kept] for name in names}
         _, cell = np.unique(self.cell[kept], return_inverse=True)
-        return replace(self, **taken, cell=cell.ravel(), readings=_part(self.readings, kept))
+        return replace(self, **taken, cell=cell.ravel(), readings=self.readings.part(kept))
 
 
 def sessions_of(machine: Machine, runs: AxisRuns, order: Order = "auto") -> list[AxisSession]:
@@ -232,19 +232,4 @@ def _readings(
         approach=approach,
         covariates={**covariates, "order": number},
         labels={"run": runs.run[rows]},
-    )
-
-
-def _part(readings: Readings, kept: IntArray) -> Readings:
-    assert readings.approach is not None
-    return replace(
-        readings,
-        position_mm=readings.position_mm[kept],
-        direction=readings.direction[kept],
-        tool_mm=readings.tool_mm[kept],
-        station=readings.station[kept],
-        range_mm=readings.range_mm[kept],
-        approach=readings.approach[kept],
-        covariates={name: values[kept] for name, values in readings.covariates.items()},
-        labels={name: values[kept] for name, values in readings.labels.items()},
     )

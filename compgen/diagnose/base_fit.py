@@ -13,9 +13,10 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import hat_matrix, spline_matrix
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
-from compgen.diagnose.observed import DistinctPoses, Observed
+from compgen.diagnose.observed import Observed
 from compgen.effects import Effect, Readings
 from compgen.errors import InputError
+from compgen.identify.adjust.unknowns import DistinctPoses
 from compgen.kinematics.exact_chain import exact_columns
 from compgen.kinematics.first_order import modelled_errors
 

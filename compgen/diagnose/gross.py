@@ -18,11 +18,10 @@ from compgen.diagnose.base_fit import CurveBasis, base_errors, fit_base, least_n
 from compgen.diagnose.diagnosis import Classed
 from compgen.diagnose.layout import IntArray, MeasurementLayout
 from compgen.diagnose.noise_model import difference_matrix
-from compgen.diagnose.observed import ObservedLengths, located, some_lengths
+from compgen.diagnose.observed import ObservedLengths, located
 from compgen.errors import CompgenError
 from compgen.identify.adjust.starts import robust_state
-from compgen.identify.adjust.unknowns import State
-from compgen.identify.tracer_lengths import dead_lengths_of
+from compgen.identify.adjust.unknowns import State, dead_lengths_of
 from compgen.kinematics.first_order import tool_of
 
 # Gross errors of convention, looked for first: swapped axes, wrong signs, the tool the wrong way, mixed-up stations.
@@ -112,7 +111,7 @@ def _joined(first: str, second: str) -> str:
 
 def _some(lengths: Lengths) -> Lengths:
     rng = np.random.default_rng(0)
-    return some_lengths(lengths, np.sort(rng.choice(len(lengths), min(READINGS, len(lengths)), replace=False)))
+    return lengths.part(np.sort(rng.choice(len(lengths), min(READINGS, len(lengths)), replace=False)))
 
 
 def _small_fit(machine: Machine, lengths: Lengths) -> float:

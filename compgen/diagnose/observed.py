@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -22,7 +21,7 @@ from compgen.diagnose.layout import IntArray, MeasurementLayout, layout_of
 from compgen.effects import Readings, readings_of_deviations, readings_of_lengths
 from compgen.errors import InputError
 from compgen.identify.adjust.starts import StationStart, station_start
-from compgen.identify.tracer_lengths import dead_lengths_of
+from compgen.identify.adjust.unknowns import DistinctPoses, dead_lengths_of, distinct_poses
 from compgen.kinematics.first_order import tool_of
 
 # Start values of a station in closed form, refined on the distances; no search, so that gross errors show at once.
@@ -81,21 +80,8 @@ def _residual(target_mm: FloatArray, length_mm: FloatArray, group: IntArray, sta
 # rigid motion of their frame.
 
 
-@dataclass(frozen=True)
-class DistinctPoses:
-    """Distinct positions with their tools (m, 3), and the pose of each reading (n,)."""
-
-    position_mm: FloatArray
-    tool_mm: FloatArray
-    of: IntArray
-
-
-def poses_of(position_mm: FloatArray, tool_mm: FloatArray) -> DistinctPoses:
-    """Number the distinct poses of readings; positions and tools (n, 3)."""
-    keys: FloatArray = np.column_stack([position_mm, np.broadcast_to(tool_mm, position_mm.shape)])
-    unique, inverse = np.unique(np.round(keys, 7), axis=0, return_inverse=True)
-    unique = np.asarray(unique, dtype=np.float64)
-    return DistinctPoses(unique[:, :3], unique[:, 3:], inverse.ravel().astype(np.int64))
+#: Positions that agree to so many decimals of a mm are one.
+SAME_DIGITS = 7
 
 
 class Observed(ABC):
@@ -140,7 +126,8 @@ class ObservedLengths(Observed):
     def __init__(self, machine: Machine, lengths: Lengths) -> None:
         self.machine, self.lengths = machine, lengths
         self.value_mm = lengths.length_mm
-        self.poses = poses_of(lengths.position_mm, tool_of(machine, lengths.tool_mm))
+        tool_mm = tool_of(machine, lengths.tool_mm)
+        self.poses = distinct_poses(lengths.position_mm.round(SAME_DIGITS), tool_mm.round(SAME_DIGITS))
         self.group = dead_lengths_of(lengths)
         names = [f"station {name} {axis}" for name in lengths.stations for axis in "xyz"]
         setup = lengths.labels.get("setup")
@@ -189,23 +176,7 @@ class ObservedLengths(Observed):
 
     def part(self, rows: IntArray) -> ObservedLengths:
         """Return some of the lengths."""
-        return ObservedLengths(self.machine, some_lengths(self.lengths, rows))
-
-
-def some_lengths(lengths: Lengths, rows: IntArray) -> Lengths:
-    """Return the readings ``rows`` of lengths; all stations keep their number."""
-    return replace(
-        lengths,
-        station=lengths.station[rows],
-        point=[lengths.point[k] for k in rows],
-        position_mm=lengths.position_mm[rows],
-        length_mm=lengths.length_mm[rows],
-        tool_mm=None if lengths.tool_mm is None else lengths.tool_mm[rows],
-        approach=None if lengths.approach is None else lengths.approach[rows],
-        labels={name: values[rows] for name, values in lengths.labels.items()},
-        covariates={name: values[rows] for name, values in lengths.covariates.items()},
-        origin=[lengths.origin[k] for k in rows] if len(lengths.origin) else (),
-    )
+        return ObservedLengths(self.machine, self.lengths.part(rows))
 
 
 class ObservedDeviations(Observed):
@@ -218,28 +189,13 @@ class ObservedDeviations(Observed):
         position = np.concatenate([np.flatnonzero(measured[:, k]) for k in range(3)])
         component = np.repeat(np.arange(3), measured.sum(axis=0))
         self.rows = np.arange(len(whole)) if rows is None else rows
-        self._whole = whole
         self.value_mm = deviations.deviation_mm[position, component][self.rows]
         self.component, self.place = component[self.rows], position[self.rows]
-        reads = self._readings()
-        self.poses = poses_of(reads.position_mm, reads.tool_mm)
+        self._reads = reads = whole.part(self.rows)
+        self.poses = distinct_poses(reads.position_mm.round(SAME_DIGITS), reads.tool_mm.round(SAME_DIGITS))
         _, stop = np.unique(self.place, return_inverse=True)
         self.layout = layout_of(reads, self.component, stop.ravel().astype(np.int64))
         self.placement_names = tuple(f"placement {what}" for what in ("x", "y", "z", "a", "b", "c"))
-
-    def _readings(self) -> Readings:
-        whole, rows = self._whole, self.rows
-        return replace(
-            whole,
-            position_mm=whole.position_mm[rows],
-            direction=whole.direction[rows],
-            tool_mm=whole.tool_mm[rows],
-            station=whole.station[rows],
-            range_mm=whole.range_mm[rows],
-            approach=None if whole.approach is None else whole.approach[rows],
-            covariates={name: values[rows] for name, values in whole.covariates.items()},
-            labels={name: values[rows] for name, values in whole.labels.items()},
-        )
 
     def start(self) -> FloatArray:
         """No shift and no turn."""
@@ -255,7 +211,7 @@ class ObservedDeviations(Observed):
 
     def readings(self, tip_mm: FloatArray, placement: FloatArray) -> Readings:
         """The components as readings along the axes."""
-        return self._readings()
+        return self._reads
 
     def part(self, rows: IntArray) -> ObservedDeviations:
         """Return some of the components."""

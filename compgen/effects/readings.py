@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -60,6 +60,20 @@ class Readings:
     def __len__(self) -> int:
         """Return the number of readings."""
         return len(self.direction)
+
+    def part(self, rows: NDArray[np.int64]) -> Readings:
+        """Return some of the readings; all stations keep their number."""
+        return replace(
+            self,
+            position_mm=self.position_mm[rows],
+            direction=self.direction[rows],
+            tool_mm=self.tool_mm[rows],
+            station=self.station[rows],
+            range_mm=self.range_mm[rows],
+            approach=None if self.approach is None else self.approach[rows],
+            covariates={name: values[rows] for name, values in self.covariates.items()},
+            labels={name: values[rows] for name, values in self.labels.items()},
+        )
 
     def covariate(self, name: str) -> FloatArray | None:
         """Return a covariate (n,); None if it was not logged for every reading."""

@@ -297,11 +297,20 @@ def keep_result(
         if active_id(decisions) != judged_against:
             raise ChangedMeanwhileError(f"{machine.name}: other tables became active; the measurement is judged again")
         table_id = _insert(store, connection, machine, claim, new)
-        if new.accepted and not new.hold:
-            for old in dict.fromkeys(item.table_id for item in decisions):
-                if old is not None and state_of(old, decisions) in OPEN:
-                    add_decision(store, connection, machine, "supersede", old, AUTOMATIC, "a newer proposal came")
-        _decide(store, connection, machine, table_id, new)
+        reason, actor = "; ".join(filter(None, [new.reason, *new.hold])), new.actor or AUTOMATIC
+        if not new.accepted:
+            add_decision(store, connection, machine, "refuse", table_id, actor, reason or "not accepted")
+            return table_id
+        if new.hold:
+            add_decision(store, connection, machine, "hold", table_id, actor, reason)
+            return table_id
+        for old in dict.fromkeys(item.table_id for item in decisions):
+            if old is not None and state_of(old, decisions) in OPEN:
+                add_decision(store, connection, machine, "supersede", old, AUTOMATIC, "a newer proposal came")
+        shown = "; ".join(filter(None, [reason, *new.reservations]))
+        add_decision(store, connection, machine, "propose", table_id, actor, shown)
+        if new.approve:
+            add_decision(store, connection, machine, "approve", table_id, AUTOMATIC, "approval = auto")
         return table_id
 
     try:
@@ -322,19 +331,6 @@ def keep_result(
         table_id = stored
     forget(store, claim)
     return next(table for table in store.tables(machine) if table.id == table_id)
-
-
-def _decide(store: Store, connection: sa.Connection, machine: MachineRecord, table_id: int, new: NewResult) -> None:
-    reason, actor = "; ".join(filter(None, [new.reason, *new.hold])), new.actor or AUTOMATIC
-    if not new.accepted:
-        add_decision(store, connection, machine, "refuse", table_id, actor, reason or "not accepted")
-    elif new.hold:
-        add_decision(store, connection, machine, "hold", table_id, actor, reason)
-    else:
-        shown = "; ".join(filter(None, [reason, *new.reservations]))
-        add_decision(store, connection, machine, "propose", table_id, actor, shown)
-        if new.approve:
-            add_decision(store, connection, machine, "approve", table_id, AUTOMATIC, "approval = auto")
 
 
 def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, claim: Claim, new: NewResult) -> int:

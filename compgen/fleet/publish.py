@@ -448,21 +448,12 @@ def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list
 
 
 def untold(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any]]]:
-    """Return what should be told and was not yet, oldest first."""
+    """Return what should be told and was not yet, oldest first, by a name that stays."""
     known, since = _told(store, machine), (store.now() - OLDEST).isoformat()
-    return [item for item in _news(store, machine) if item[0] not in known and item[1]["at"] >= since]
-
-
-def _told(store: Store, machine: MachineRecord) -> set[str]:
-    return {event.subject for event in store.events(machine) if event.kind == NOTIFIED}
-
-
-def _news(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any]]]:
-    """Return everything that may be told, in the order of time, by a name that stays."""
-    known, decisions, attempts = store.together(
+    every, decisions, attempts = store.together(
         lambda: (store.tables(machine, figures=False), store.decisions(machine), store.attempts(machine))
     )
-    tables = {table.id: table for table in known}
+    tables = {table.id: table for table in every}
     found: list[tuple[str, dict[str, Any]]] = []
     for decision in decisions:
         table = None if decision.table_id is None else tables[decision.table_id]
@@ -480,7 +471,12 @@ def _news(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any
         if attempt.outcome == "failed":
             message = {"machine": machine.name, "event": "failed", "reason": attempt.message}
             found.append((f"attempt {attempt.id}", {**message, "at": attempt.at.isoformat()}))
-    return sorted(found, key=lambda item: str(item[1]["at"]))
+    fresh = [item for item in found if item[0] not in known and item[1]["at"] >= since]
+    return sorted(fresh, key=lambda item: str(item[1]["at"]))
+
+
+def _told(store: Store, machine: MachineRecord) -> set[str]:
+    return {event.subject for event in store.events(machine) if event.kind == NOTIFIED}
 
 
 def _send(command: Sequence[str], message: dict[str, Any]) -> str:

@@ -86,17 +86,7 @@ def self_check(
     used = np.flatnonzero(result.accepted)
     sigma_mm = adjustment.sigma_mm / np.sqrt(adjustment.weight[used])
     model_mm = (lengths.length_mm + result.residual_mm)[used]
-    plain = replace(
-        lengths,
-        station=lengths.station[used],
-        point=[lengths.point[k] for k in used.tolist()],
-        position_mm=lengths.position_mm[used],
-        tool_mm=None if lengths.tool_mm is None else lengths.tool_mm[used],
-        labels={name: values[used] for name, values in lengths.labels.items()},
-        covariates={},
-        origin=[lengths.origin[k] for k in used.tolist()] if len(lengths.origin) else (),
-        approach=None,
-    )
+    plain = replace(lengths.part(used), covariates={}, approach=None)
     options = IdentifyOptions(
         u_length_um=result.u_length_um, u_length_um_per_m=result.u_length_um_per_m, reject=False, temperature=False
     )

@@ -29,7 +29,7 @@ from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.adjust.residual_tests import residual_series
 from compgen.identify.adjust.robust import LIMIT, MOST_REJECTED, Rejected, standardised_spread
 from compgen.identify.adjust.solver import Factor, Rank, determined_factor, step_levers, unknown_names
-from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State, check_travel, common_tool
+from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State, check_travel, common_tool, distinct_poses
 from compgen.identify.identification import (
     Identification,
     error_table,
@@ -113,12 +113,10 @@ class _Stream:
     ) -> None:
         """Add a chunk without compiled code: its normal equations are those of a problem of its own."""
         count, stations = len(chunk.group), len(self.archive.stations)
-        position = np.column_stack(chunk.position_mm)
-        poses, pose = np.unique(position, axis=0, return_inverse=True)
-        tools = np.broadcast_to(self.tool_mm, poses.shape)
-        bases = self.layout.bases(poses)
-        at = pose.ravel(), chunk.station, chunk.group, chunk.length_mm, np.ones(count)
-        problem = LengthProblem(self.layout, bases, poses, tools, *at, numbers=(stations, len(self.setups)))
+        poses = distinct_poses(np.column_stack(chunk.position_mm), self.tool_mm)
+        where = self.layout.bases(poses.position_mm), poses.position_mm, poses.tool_mm, poses.of
+        what = chunk.station, chunk.group, chunk.length_mm, np.ones(count)
+        problem = LengthProblem(self.layout, *where, *what, numbers=(stations, len(self.setups)))
         residual = problem.residuals(state)
         sigma = noise.constant_mm + noise.proportional * (
             residual + chunk.length_mm + state.dead_length_mm[chunk.group]

@@ -36,6 +36,7 @@ from compgen.identify.adjust.unknowns import (
     State,
     check_travel,
     common_tool,
+    dead_lengths_of,
     parameters_for_tools,
 )
 from compgen.identify.covariance import with_systematic
@@ -126,15 +127,6 @@ def problem_of(machine: Machine, lengths: Lengths, layout: ErrorParameters, grou
 
         found = length_problem(machine, lengths, layout, group)
     return found
-
-
-def dead_lengths_of(lengths: Lengths) -> IntArray:
-    """Index of the dead length of every reading: one for every station and set-up."""
-    setup = lengths.labels.get("setup")
-    if setup is None or not np.any(setup != setup[0]):
-        return lengths.station
-    _, group = np.unique(np.column_stack([lengths.station, setup]), axis=0, return_inverse=True)
-    return group.ravel().astype(np.int64)
 
 
 def start_values(task: Task) -> tuple[State, list[int]]:

@@ -17,7 +17,7 @@ from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjust.problem import LEVER_MM, LinesOfSight, PointEquations, SeparationProblem, frame_rotation
 from compgen.identify.adjust.robust import MOST_ROUNDS, Rejected, accepted_readings, check_rejected
 from compgen.identify.adjust.solver import LeastSquaresSolution, determined_factor, factorise, solve
-from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State
+from compgen.identify.adjust.unknowns import DistinctPoses, ErrorParameters, IntArray, State, distinct_poses
 from compgen.kinematics.exact_chain import cross_matrices
 from compgen.kinematics.first_order import tool_of
 
@@ -456,14 +456,6 @@ class Located:
         return self.placement.apply(self.calibration.frame.points_mm)
 
 
-def distinct_poses(readings: TracerReadings) -> tuple[FloatArray, IntArray]:
-    """Distinct positions with their tools (m, 6), and the pose of each reading (n,)."""
-    lengths = readings.lengths
-    tool = np.broadcast_to(tool_of(readings.layout.machine, lengths.tool_mm), lengths.position_mm.shape)
-    poses, pose = np.unique(np.column_stack([lengths.position_mm, tool]), axis=0, return_inverse=True)
-    return poses, pose.ravel().astype(np.int64)
-
-
 def locatable_readings(readings: TracerReadings, pose: IntArray, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """TracerReadings whose pose is seen by three stations or more; InputError if they cannot locate the tracers."""
     lengths = readings.lengths
@@ -491,12 +483,12 @@ def locatable_readings(readings: TracerReadings, pose: IntArray, keep: NDArray[n
     return np.asarray(rows)
 
 
-def locate_points(readings: TracerReadings, poses: FloatArray, pose: IntArray, rows: IntArray) -> Located:
-    """Self-calibrate and place (eq. 12-20) with the readings ``rows`` (k,); ``poses`` (m, 6), ``pose`` of each reading (n,)."""
+def locate_points(readings: TracerReadings, poses: DistinctPoses, rows: IntArray) -> Located:
+    """Self-calibrate and place (eq. 12-20) with the readings ``rows`` (k,); ``poses`` are those of all readings."""
     lengths = readings.lengths
-    present, point = np.unique(pose[rows], return_inverse=True)
+    present, point = np.unique(poses.of[rows], return_inverse=True)
     point = point.ravel().astype(np.int64)
-    position_mm, tool_mm = poses[present, :3], poses[present, 3:]
+    position_mm, tool_mm = poses.position_mm[present], poses.tool_mm[present]
     nominal = position_mm + tool_mm
     sightings = Sightings(
         point, lengths.station[rows], readings.group[rows], lengths.length_mm[rows], readings.sigma_mm[rows]
@@ -565,11 +557,11 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
         if no optimum is reached, or too many readings do not fit.
     """
     count = len(readings.lengths)
-    poses, pose = distinct_poses(readings)
+    poses = distinct_poses(readings.lengths.position_mm, tool_of(readings.layout.machine, readings.lengths.tool_mm))
     keep = np.ones(count, dtype=bool)
     for _ in range(MOST_ROUNDS):
-        used = keep & locatable_readings(readings, pose, keep)
-        located = locate_points(readings, poses, pose, np.flatnonzero(used))
+        used = keep & locatable_readings(readings, poses.of, keep)
+        located = locate_points(readings, poses, np.flatnonzero(used))
         turn, calibration = located.placement.rotation, located.calibration
         problem = SeparationProblem(
             parameters=readings.layout,
@@ -585,7 +577,7 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
         joint = _joint(problem, solution, located, float(readings.sigma_mm.min()))
         state = joint.state
         # also of the readings that were not used
-        sight = readings.layout.tips(state.errors, poses[:, :3], poses[:, 3:])[pose]
+        sight = readings.layout.tips(state.errors, poses.position_mm, poses.tool_mm)[poses.of]
         sight = sight - state.stations_mm[readings.lengths.station]
         distance = np.linalg.norm(sight, axis=1)
         residual = distance - state.dead_length_mm[readings.group] - readings.lengths.length_mm

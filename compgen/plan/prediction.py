@@ -24,7 +24,7 @@ from compgen.errors import InputError
 from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identify.adjust.problem import LengthProblem, length_problem
 from compgen.identify.adjust.solver import ZERO_EIGENVALUE, Rank, describe_rank, unknown_names
-from compgen.identify.adjust.unknowns import ErrorParameters, State, check_travel, error_parameters
+from compgen.identify.adjust.unknowns import ErrorParameters, State, check_travel, dead_lengths_of, error_parameters
 from compgen.identify.covariance import error_values
 from compgen.identify.identification import table_of_values
 from compgen.identify.options import IdentifyOptions, ReadingNoise, reading_noise
@@ -120,8 +120,7 @@ def planned(machine: Machine, stations: PlannedStations, points: Points, noise: 
         labels={"setup": setup},
     )
     layout = error_parameters(machine, names, several_tools=several)
-    _, group = np.unique(np.column_stack([station, setup]), axis=0, return_inverse=True)
-    problem = grid_problem(layout, position_mm, tools, station, group.ravel(), distance)
+    problem = grid_problem(layout, position_mm, tools, station, dead_lengths_of(lengths), distance)
     found = Planned(machine, stations, noise, lengths, problem or length_problem(machine, lengths, layout), tools)
     nearest = int(np.argmin(found.distances_mm()))
     if found.distances_mm()[nearest] < NEAREST_MM:
@@ -182,10 +181,8 @@ def predict_unknowns(matrix: FloatArray) -> Prediction:
 def planned_rank(found: Planned, matrix: FloatArray) -> Rank:
     """Return the rank with the combinations in words."""
     lengths = found.lengths
-    _, group = np.unique(np.column_stack([lengths.station, lengths.labels["setup"]]), axis=0, return_inverse=True)
-    return describe_rank(
-        matrix, unknown_names(found.problem.parameters, lengths.stations, lengths.station, group.ravel())
-    )
+    names = unknown_names(found.problem.parameters, lengths.stations, lengths.station, dead_lengths_of(lengths))
+    return describe_rank(matrix, names)
 
 
 # What a measurement will determine, and how well, before it is made.

@@ -461,17 +461,7 @@ def test_identified_lengths_compare_and_other_targets_are_refused(
     assert data["figures"]["errors"]["EXX"]["factor"] == pytest.approx(10.0, rel=0.3)
     lengths = read_lengths(after)
     kept = np.flatnonzero(lengths.position_mm[:, 0] < 199.0)
-    part = replace(
-        lengths,
-        station=lengths.station[kept],
-        point=[lengths.point[k] for k in kept],
-        position_mm=lengths.position_mm[kept],
-        length_mm=lengths.length_mm[kept],
-        labels={key: values[kept] for key, values in lengths.labels.items()},
-        approach=None if lengths.approach is None else lengths.approach[kept],
-        covariates={key: values[kept] for key, values in lengths.covariates.items()},
-    )
-    cut = save(tmp_path / "cut.lengths.csv", format_lengths(part))
+    cut = save(tmp_path / "cut.lengths.csv", format_lengths(lengths.part(kept)))
     capsys.readouterr()
     assert call("compare", name, before, cut, "--out", tmp_path / "no") == 2
     assert "--align model" in capsys.readouterr().err

@@ -167,3 +167,20 @@ def test_a_temperature_that_is_not_in_degrees_celsius_is_left_out(saved):
     with pytest.warns(CompgenWarning, match="column 'temp_x_k' is unknown and ignored"):
         lengths = read_lengths(saved(f"{HEADER},temp_x_k\nA,P1,0,0,0,1,293\n"))
     assert lengths.covariates == {}
+
+
+def test_a_part_keeps_each_reading_with_everything_that_belongs_to_it(saved):
+    whole = read_lengths(saved(format_lengths(example())))
+    for rows, expected in ((np.array([5, 0]), [5, 0]), (np.arange(12) % 7 == 3, [3, 10])):
+        part = whole.part(rows)
+        assert part.stations == whole.stations and len(part) == 2
+        for k, row in enumerate(expected):
+            assert part.station[k] == whole.station[row] and part.length_mm[k] == whole.length_mm[row]
+            assert part.point[k] == whole.point[row] and part.origin[k] == whole.origin[row]
+            for name in ("position_mm", "tool_mm", "approach"):
+                assert getattr(part, name)[k].tolist() == getattr(whole, name)[row].tolist()
+            for name in ("labels", "covariates"):
+                values = getattr(part, name)
+                assert {key: value[k] for key, value in values.items()} == {
+                    key: value[row] for key, value in getattr(whole, name).items()
+                }

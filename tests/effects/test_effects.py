@@ -163,15 +163,7 @@ def test_velocity_follows_the_motion_within_a_run_and_rests_where_the_axis_does(
     np.testing.assert_allclose(np.linalg.norm(velocity, axis=1), feed / 60.0)
     np.testing.assert_allclose(velocity[along_x], (feed * readings.approach[:, 0])[along_x, None] / 60.0 * [1.0, 0, 0])
     shuffled = np.random.default_rng(0).permutation(len(lengths))
-    mixed = replace(
-        lengths,
-        station=lengths.station[shuffled],
-        position_mm=lengths.position_mm[shuffled],
-        tool_mm=lengths.tool_mm[shuffled],
-        approach=lengths.approach[shuffled],
-        labels={name: values[shuffled] for name, values in lengths.labels.items()},
-        covariates={name: values[shuffled] for name, values in lengths.covariates.items()},
-    )
+    mixed = lengths.part(shuffled)
     other = velocity_mm_s(readings_of_lengths(machine, mixed, PLACES_MM[mixed.station], mixed.position_mm))
     np.testing.assert_array_equal(other, velocity[shuffled])
 

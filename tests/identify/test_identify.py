@@ -82,20 +82,8 @@ def measured(machine, truth, *, sigma_mm=0.0, seed=2, stations=STATIONS, positio
     )
     if keep < 1.0:
         rows = np.flatnonzero(rng.random(len(station)) < keep)
-        lengths = picked(lengths, rows)
+        lengths = lengths.part(rows)
     return lengths
-
-
-def picked(lengths, rows):
-    return replace(
-        lengths,
-        station=lengths.station[rows],
-        point=[lengths.point[k] for k in rows],
-        position_mm=lengths.position_mm[rows],
-        length_mm=lengths.length_mm[rows],
-        tool_mm=None if lengths.tool_mm is None else lengths.tool_mm[rows],
-        labels={key: value[rows] for key, value in lengths.labels.items()},
-    )
 
 
 def deviations(found, truth):
@@ -296,7 +284,7 @@ def test_stations_may_be_metres_away_and_points_of_one_station_in_a_plane():
     truth = truth_of(machine)
     lengths = measured(machine, truth, stations=far)
     in_plane = np.abs(lengths.position_mm[:, 2] + 300.0) < 1e-9
-    lengths = picked(lengths, np.flatnonzero((lengths.station != 3) | in_plane))
+    lengths = lengths.part(np.flatnonzero((lengths.station != 3) | in_plane))
     result = identify(machine, lengths)
     assert np.allclose(result.stations[0].position_mm, far[0], rtol=0, atol=1e-4)
     assert deviations(result.errors, truth)[0] < 0.05 * MICROMETRE

@@ -106,20 +106,6 @@ def disturbed(lengths, change):
     return replace(lengths, length_mm=reading)
 
 
-def picked(lengths, rows):
-    return replace(
-        lengths,
-        station=lengths.station[rows],
-        point=[lengths.point[k] for k in rows],
-        position_mm=lengths.position_mm[rows],
-        length_mm=lengths.length_mm[rows],
-        approach=None if lengths.approach is None else lengths.approach[rows],
-        labels={key: value[rows] for key, value in lengths.labels.items()},
-        covariates={key: value[rows] for key, value in lengths.covariates.items()},
-        origin=[lengths.origin[k] for k in rows],
-    )
-
-
 def worst(found, truth=TRUTH):
     """Largest deviation of linear curves in mm and of rotations in rad."""
     linear, angular = 0.0, 0.0
@@ -390,7 +376,7 @@ def test_coplanar_stations_and_trajectory_are_refused():
     lengths = measured(CUBE, CUBE_TRUTH, stations=stations)
     in_plane = np.flatnonzero(np.isclose(lengths.position_mm[:, 2], 0.0) & (lengths.labels["run"] == 1))
     with pytest.raises(UndeterminedError, match="no data at all for: E"):
-        identify(CUBE, picked(lengths, in_plane))
+        identify(CUBE, lengths.part(in_plane))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -461,7 +447,7 @@ def test_the_mean_difference_of_a_station_is_that_of_its_readings(backlash):
 
 def test_the_two_way_mean_does_not_need_both_directions_everywhere(backlash):
     rows = np.sort(np.random.default_rng(0).choice(len(backlash), int(0.6 * len(backlash)), replace=False))
-    found = identify(MACHINE, picked(backlash, rows))
+    found = identify(MACHINE, backlash.part(rows))
     assert_reversal(found)
     assert worst(found)[0] < 1.5 * NOISE_LINEAR_MM
 
@@ -489,7 +475,7 @@ def test_no_reversal_is_found_where_there_is_none(clean):
 
 def test_one_direction_only_says_nothing_of_reversal(clean):
     rows = np.flatnonzero(clean.labels["run"] == 1)
-    assert identify(MACHINE, picked(clean, rows)).reversal is None
+    assert identify(MACHINE, clean.part(rows)).reversal is None
 
 
 # --- temperature, air, uncertainty by reading -------------------------------------------------------------------------
@@ -647,7 +633,7 @@ def test_alarm_for_an_error_that_the_nodes_cannot_follow():
     """A sine of 120 mm along X on nodes 110 mm apart, seen at four positions between them."""
     fine = machine_of(nodes=21)
     lengths = measured(fine, truth_of(MACHINE), stations=STATIONS)
-    lengths = picked(lengths, np.flatnonzero((np.arange(len(lengths)) // 4) % 5 == 0))
+    lengths = lengths.part(np.flatnonzero((np.arange(len(lengths)) // 4) % 5 == 0))
     sight = lengths.position_mm - STATIONS[lengths.station]
     unit_x = sight[:, 0] / np.linalg.norm(sight, axis=1)
     wave = 1.0 * MICROMETRE * np.sin(2 * np.pi * lengths.position_mm[:, 0] / 120.0)

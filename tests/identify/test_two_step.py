@@ -69,17 +69,6 @@ def measured(machine, truth, *, sigma_mm=0.0, seed=2, stations=STATIONS, runs=1,
     )
 
 
-def picked(lengths, rows):
-    return replace(
-        lengths,
-        station=lengths.station[rows],
-        point=[lengths.point[k] for k in np.arange(len(lengths))[rows]],
-        position_mm=lengths.position_mm[rows],
-        length_mm=lengths.length_mm[rows],
-        labels={key: value[rows] for key, value in lengths.labels.items()},
-    )
-
-
 def all_values(errors):
     """Values and uncertainties of all curves and squareness errors one after another, and which are translations."""
     values, u, linear = [], [], []
@@ -424,7 +413,7 @@ def test_one_tracer_at_three_places_with_points_of_their_own_is_for_the_joint_me
 @pytest.mark.parametrize("method", ["joint", "two-step"])
 def test_there_and_back_gives_the_same_as_its_mean(method, make_errors):
     lengths = measured(GANTRY, leaning(GANTRY, make_errors), sigma_mm=SIGMA_MM, runs=2)
-    there, back = (picked(lengths, lengths.labels["run"] == run) for run in (0, 1))
+    there, back = (lengths.part(lengths.labels["run"] == run) for run in (0, 1))
     mean = replace(there, length_mm=0.5 * (there.length_mm + back.length_mm), metadata={})
     options = IdentifyOptions(method=method, reject=False)
     both = identify(GANTRY, lengths, options)

@@ -233,7 +233,7 @@ def _far_nodes(
         along = observations.at_mm[accepted & observations.shows[:, number], curve.error.axis]
         along = along[np.isfinite(along)]
         hats = hat_matrix(curve.nodes_mm, along)
-        near: NDArray[np.bool_] = (hats > 1e-6).any(axis=0)
+        near = np.asarray((hats > 1e-6).any(axis=0))
         if not near.all():
             unreached[curve.error.name] = curve.nodes_mm[~near]
         weight = (layout.basis(curve.error.axis, along) ** 2).sum(axis=0)

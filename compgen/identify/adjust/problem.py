@@ -10,7 +10,14 @@ import numpy as np
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State
+from compgen.identify.adjust.unknowns import (
+    ErrorParameters,
+    IntArray,
+    KnownPositions,
+    State,
+    dead_lengths_of,
+    distinct_poses,
+)
 from compgen.kinematics.exact_chain import cross_matrices, exact_columns, level_rotations, tip_position
 from compgen.kinematics.first_order import tool_of
 
@@ -241,20 +248,15 @@ def length_problem(
 
     ``group`` is the index of the dead length of each reading (n,), by default one for every station and set-up.
     """
-    tool = np.broadcast_to(tool_of(machine, lengths.tool_mm), lengths.position_mm.shape)
-    keys = np.column_stack([lengths.position_mm, tool])
-    unique, pose = np.unique(keys, axis=0, return_inverse=True)
-    if group is None:
-        setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
-        _, group = np.unique(np.column_stack([lengths.station, setup]), axis=0, return_inverse=True)
+    poses = distinct_poses(lengths.position_mm, tool_of(machine, lengths.tool_mm))
     return LengthProblem(
         parameters=parameters,
-        position_mm=unique[:, :3],
-        tool_mm=unique[:, 3:],
-        bases=parameters.bases(unique[:, :3]),
-        pose=pose.ravel().astype(np.int64),
+        position_mm=poses.position_mm,
+        tool_mm=poses.tool_mm,
+        bases=parameters.bases(poses.position_mm),
+        pose=poses.of,
         station=lengths.station,
-        group=group.ravel().astype(np.int64),
+        group=dead_lengths_of(lengths) if group is None else group,
         length_mm=lengths.length_mm,
         weight=np.ones(len(lengths)),
     )

@@ -19,8 +19,7 @@ from compgen.data.records import DEVIATION_COLUMNS
 from compgen.errors import CompgenWarning, ConvergenceError
 from compgen.identify.adjust.solver import Factor, LeastSquaresSolution, solve
 from compgen.identify.adjust.starts import robust_spread
-from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, LeastSquaresProblem, State
-from compgen.kinematics.exact_chain import tip_position
+from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, LeastSquaresProblem, State, distinct_poses
 from compgen.kinematics.first_order import tool_of
 
 if TYPE_CHECKING:
@@ -480,17 +479,15 @@ def _expected(
     residual_mm: FloatArray,
     sigma_mm: FloatArray,
 ) -> _Expected:
-    tool = np.broadcast_to(tool_of(layout.machine, lengths.tool_mm), lengths.position_mm.shape)
-    poses, pose = np.unique(np.column_stack([lengths.position_mm, tool]), axis=0, return_inverse=True)
-    bases = [layout.basis(axis, poses[:, axis]) for axis in range(3)]
-    tip = tip_position(layout.machine, layout.values(state.errors, bases), poses[:, :3], poses[:, 3:])
+    poses = distinct_poses(lengths.position_mm, tool_of(layout.machine, lengths.tool_mm))
+    tip = layout.tips(state.errors, poses.position_mm, poses.tool_mm)
     station_of = np.zeros(len(state.dead_length_mm), dtype=np.int64)
     station_of[group] = lengths.station
     return _Expected(
         distance_mm=np.linalg.norm(tip[:, None, :] - state.stations_mm[None], axis=2),
         dead_mm=state.dead_length_mm,
         station_of=station_of,
-        pose=pose.ravel().astype(np.int64),
+        pose=poses.of,
         group=group,
         close_mm=CLOSE * sigma_mm * max(standardised_spread(residual_mm / sigma_mm), 0.1),
     )

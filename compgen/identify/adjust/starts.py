@@ -53,10 +53,10 @@ def station_start(points_mm: FloatArray, length_mm: FloatArray, group: NDArray[n
     kept = eigenvalues > 1e-11 * eigenvalues[-1]
     right = vectors[:, kept].T @ (normal[:size, size] * unit)
     solution = unit * (vectors[:, kept] @ (right / eigenvalues[kept]))
-    position, dead = solution[:3], solution[3 : 3 + groups]
-    if not kept.all() or _misfit(p, reading, member, position, dead) > 1e-2:
-        position, dead = _search(p, reading, member)
-    return StationStart(position * scale + centre, dead * scale)
+    found = solution[: 3 + groups]
+    if not kept.all() or np.median(np.abs(_residual(p, reading, member, found))) > 1e-2:
+        found = _search(p, reading, member)
+    return StationStart(found[:3] * scale + centre, found[3:] * scale)
 
 
 def station_start_from_moments(
@@ -107,13 +107,7 @@ def _residual(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_], x: 
     return np.asarray(np.linalg.norm(p - x[:3], axis=1) - member @ x[3:] - reading)
 
 
-def _misfit(
-    p: FloatArray, reading: FloatArray, member: NDArray[np.bool_], position: FloatArray, dead: FloatArray
-) -> float:
-    return float(np.median(np.abs(_residual(p, reading, member, np.concatenate([position, dead])))))
-
-
-def _search(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def _search(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_]) -> FloatArray:
     from scipy.optimize import least_squares  # imported here: slow to load, and rarely needed
 
     best: tuple[float, FloatArray] | None = None
@@ -130,7 +124,7 @@ def _search(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_]) -> tu
             if best is None or found.cost < best[0]:
                 best = (float(found.cost), found.x)
     assert best is not None
-    return best[1][:3], best[1][3:]
+    return best[1]
 
 
 # What the closed-form start of the stations needs of the readings on a grid.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import free_basis, hat_matrix, spline_matrix
+from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, SQUARENESS_NAMES, ErrorName, error_named
 from compgen.errors import InputError
@@ -251,6 +252,34 @@ class LeastSquaresProblem(Protocol):
 
     def weighted(self, weight: FloatArray) -> LeastSquaresProblem:
         """Return the same problem with other weights of the readings, 1/mm^2."""
+
+
+# Which pose and which dead length a reading belongs to.
+
+
+@dataclass(frozen=True)
+class DistinctPoses:
+    """Distinct positions with their tools, (m, 3), ascending, and the pose ``of`` each reading, (n,)."""
+
+    position_mm: FloatArray
+    tool_mm: FloatArray
+    of: IntArray
+
+
+def distinct_poses(position_mm: FloatArray, tool_mm: FloatArray) -> DistinctPoses:
+    """Number the distinct poses of readings at positions (n, 3) with tools (3,) or (n, 3)."""
+    keys: FloatArray = np.column_stack([position_mm, np.broadcast_to(tool_mm, position_mm.shape)])
+    unique, of = np.unique(keys, axis=0, return_inverse=True)
+    return DistinctPoses(unique[:, :3], unique[:, 3:], of.ravel().astype(np.int64))
+
+
+def dead_lengths_of(lengths: Lengths) -> IntArray:
+    """Index of the dead length of every reading: one for every station and set-up."""
+    setup = lengths.labels.get("setup")
+    if setup is None or not np.any(setup != setup[0]):
+        return lengths.station
+    _, group = np.unique(np.column_stack([lengths.station, setup]), axis=0, return_inverse=True)
+    return group.ravel().astype(np.int64)
 
 
 # Measured positions must lie within the travel of the machine.
