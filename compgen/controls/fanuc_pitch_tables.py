@@ -33,7 +33,16 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.toml_files import axis_setting, choice, setting, whole, word_for
+from compgen.data.toml_files import (
+    accepted,
+    accepts,
+    array_schema,
+    axis_setting,
+    choice,
+    setting,
+    whole,
+    word_for,
+)
 from compgen.errors import InputError
 
 # Settings of ``[controllers.fanuc-pitch]``: what the control counts in, how its files look, which numbers are free.
@@ -43,6 +52,7 @@ from compgen.errors import InputError
 INTERVAL_QUANTUM_MM = Decimal("0.001")
 
 
+@accepts(array_schema({"type": "array", "items": accepted(whole(0, MOST_NUMBER)), "minItems": 2, "maxItems": 2}))
 def _spans(value: Any) -> tuple[tuple[int, int], ...]:
     """A list of blocks of numbers."""
     if not isinstance(value, list):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import ROUND_CEILING, Decimal
 from itertools import product
@@ -52,6 +52,7 @@ from compgen.errors import InputError
 SECTIONS = 100
 
 
+@toml_files.accepts(toml_files.array_schema({"enum": list(ACROSS)}, 1))
 def _pairs(value: Any) -> tuple[tuple[int, int], ...]:
     """A list of at most three tables such as ``"Y(x)"``, each moving axis once."""
     if not isinstance(value, list) or not value or any(item not in ACROSS for item in value):
@@ -60,6 +61,22 @@ def _pairs(value: Any) -> tuple[tuple[int, int], ...]:
     if len({moving for _, moving in found}) < len(found):
         raise ValueError("each moving axis can be given once only: the control keeps four points for each moving axis")
     return found
+
+
+_NUMBER = toml_files.whole(0, 9999)
+#: Keys of the compensation points of an axis, each with its check.
+_GRID_KEYS: Mapping[str, Callable[[Any], Any]] = {
+    "reference": _NUMBER,
+    "first": _NUMBER,
+    "last": _NUMBER,
+    "interval_mm": toml_files.positive,
+}
+_OF_AXIS = toml_files.table_schema(
+    {key: toml_files.accepted(check) for key, check in _GRID_KEYS.items()}, [*_GRID_KEYS]
+)
+_points = toml_files.accepts(toml_files.table_schema(dict.fromkeys(AXES, _OF_AXIS)))(
+    lambda value: toml_files.table(value)
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +90,7 @@ class StraightnessSettings(PunchedSettings):
 
     path: int = setting(whole(1, 99), 1, meaning="path of the control whose parameters count, where they have a word L")
     grids: tuple[PointGrid | None, ...] = setting(
-        toml_files.table,
+        _points,
         (None, None, None),
         key="points",
         meaning="compensation points of an axis as pitch error compensation has them, { X = { reference = 40, first = 33, "
@@ -163,13 +180,8 @@ def _with_points(machine: Machine, settings: StraightnessSettings, points: toml_
 
 
 def _grid(section: toml_files.Section) -> PointGrid:
-    number = toml_files.whole(0, 9999)
-    grid = PointGrid(
-        reference=section.take("reference", number),
-        first=section.take("first", number),
-        last=section.take("last", number),
-        interval_mm=Decimal(repr(section.take("interval_mm", toml_files.positive))),
-    )
+    reference, first, last, interval_mm = (section.take(key, check) for key, check in _GRID_KEYS.items())
+    grid = PointGrid(reference=reference, first=first, last=last, interval_mm=Decimal(repr(interval_mm)))
     section.finish()
     if grid.last < grid.first + 3:
         raise section.fail("last", f"points {grid.first} to {grid.last}: at least four are needed")

@@ -45,7 +45,15 @@ from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
-from compgen.data.toml_files import axis_setting, choice, file_setting, setting, whole, word_for
+from compgen.data.toml_files import (
+    accepts,
+    axis_setting,
+    choice,
+    file_setting,
+    setting,
+    whole,
+    word_for,
+)
 from compgen.errors import CompgenWarning, InputError
 
 # Settings of ``[controllers.heidenhain-com]``: generation, sign, node positions, limits, tables saved on the control.
@@ -59,6 +67,7 @@ SMALLEST_EXPONENT, LARGEST_EXPONENT = 6, 23
 MOST_ENTRIES = 256
 
 
+@accepts({"type": "string", "pattern": "^[A-Za-z0-9_]{1,12}$"})
 def name_on_control(value: Any) -> str:
     """The name of an axis, which is that of a column too."""
     if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9_]{1,12}", value, re.ASCII):
@@ -74,6 +83,7 @@ def check_names(section: toml_files.Section, names: tuple[str, str, str]) -> Non
         )
 
 
+@accepts({"type": "number", "exclusiveMinimum": -(10**7), "exclusiveMaximum": 10**7})
 def _position(value: Any) -> Decimal:
     exact = Decimal(repr(toml_files.number(value)))
     if exact % SPACING_UNIT_MM or abs(exact) >= 10**7:

@@ -24,7 +24,16 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Chain, Machine
 from compgen.data.messages import doubled, nearest
 from compgen.data.names import AXES, ERROR_NAMES, SQUARENESS_NAMES, error_named
-from compgen.data.toml_files import Section, axis_setting, choice, flag, setting, unless_stated, whole
+from compgen.data.toml_files import (
+    Section,
+    accepts,
+    axis_setting,
+    choice,
+    flag,
+    setting,
+    unless_stated,
+    whole,
+)
 from compgen.errors import CompgenWarning, InputError
 from compgen.kinematics.first_order import coefficients, factor
 
@@ -259,6 +268,7 @@ def _whole(lowest: int, highest: int) -> Callable[[str], int]:
     return check
 
 
+@accepts({"type": "string", "pattern": r"^(?!.*(.).*\1)[XYZ]*$"})
 def axis_letters(value: object) -> str:
     """Return some of the letters X, Y, Z, each once, in that order; ValueError for anything else."""
     if not isinstance(value, str) or len(set(value)) != len(value) or not set(value) <= set("XYZ"):
@@ -269,6 +279,7 @@ def axis_letters(value: object) -> str:
 # What the machine file says to the ISG kernel's volumetric compensation, and what the control has loaded.
 
 
+@accepts({"type": "string", "maxLength": 200, "pattern": r"^[!-\"$-~]*$"})
 def folder_of_control(value: object) -> str:
     """A folder on the control, with a slash at its end; empty for none."""
     if not isinstance(value, str) or len(value) > 200 or any(not "!" <= char <= "~" or char == "#" for char in value):

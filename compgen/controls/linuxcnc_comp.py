@@ -27,7 +27,15 @@ from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.toml_files import axis_setting, choice, setting, whole
+from compgen.data.toml_files import (
+    accepted,
+    accepts,
+    array_schema,
+    axis_setting,
+    choice,
+    setting,
+    whole,
+)
 from compgen.errors import InputError
 
 # Text that LinuxCNC reads: lines one by one, so that garbage of any size fails at its first wrong line; numbers; units.
@@ -329,6 +337,7 @@ _AXIS_OF_NAME = re.compile(r"joint_?([012])(?!\d)|(?<![a-z])([xyz])(?![a-z])", r
 _LAST_LETTER = re.compile(r"((?<=[a-z0-9])[XYZ]|(?<=[_.-])[xyzXYZ])$")
 
 
+@accepts({**array_schema(accepted(toml_files.positive), 3), "maxItems": 3})
 def _positive3(value: Any) -> tuple[float, float, float]:
     x, y, z = toml_files.vector3(value)
     if min(x, y, z) <= 0:

@@ -547,6 +547,7 @@ _AXIS_LETTERS, _MOST_JOINTS = "XYZABCUVW", 16
 STEEPEST = 0.5
 
 
+@toml_files.accepts({"type": "string", "pattern": f"^[{_AXIS_LETTERS}{_AXIS_LETTERS.lower()}]{{3,{_MOST_JOINTS}}}$"})
 def _coordinates(value: Any) -> str:
     """One letter of an axis for each joint, X, Y and Z among them."""
     letters = str(value).upper() if isinstance(value, str) else ""

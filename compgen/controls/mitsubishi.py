@@ -27,7 +27,16 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.messages import one_line
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.toml_files import axis_setting, file_setting, multiple_of, setting, whole, word_for
+from compgen.data.toml_files import (
+    accepts,
+    array_schema,
+    axis_setting,
+    file_setting,
+    multiple_of,
+    setting,
+    whole,
+    word_for,
+)
 from compgen.errors import CompgenWarning, InputError
 
 # Rows of a set sheet and records of the control's own parameter file, and what that file shows of all axes.
@@ -252,6 +261,7 @@ INTERVAL_QUANTUM_MM = Decimal("0.001")
 LOWEST_VALUE, HIGHEST_VALUE = -128, 127
 
 
+@accepts({"anyOf": [{"type": "boolean"}, {**array_schema({"enum": list(ACROSS)}), "uniqueItems": True}]})
 def _across(value: Any) -> tuple[tuple[int, int], ...]:
     """True for all tables of one axis as a function of another, false for none, or a list of names."""
     if isinstance(value, bool):
@@ -261,6 +271,7 @@ def _across(value: Any) -> tuple[tuple[int, int], ...]:
     return tuple(ACROSS[item] for item in value)
 
 
+@accepts({"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9]{0,3}$"})
 def _name(value: Any) -> str:
     if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,3}", value, re.ASCII):
         raise ValueError("a name of at most four letters and digits is expected")

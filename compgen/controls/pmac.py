@@ -23,7 +23,15 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.messages import one_line
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.toml_files import axis_setting, setting, whole, word_for
+from compgen.data.toml_files import (
+    accepted,
+    accepts,
+    axis_setting,
+    setting,
+    table_schema,
+    whole,
+    word_for,
+)
 from compgen.errors import CompgenWarning, InputError
 
 # Compensation tables of PMAC and Turbo PMAC as the control keeps them: whole 1/16 counts that roll over.
@@ -372,6 +380,10 @@ _COUNTS_MISSING = (
 )
 
 
+_EACH = table_schema(dict.fromkeys(AXES, accepted(toml_files.number)), AXES)
+
+
+@accepts({"anyOf": [accepted(toml_files.number), _EACH], "examples": [1000.0]})
 def _scales(value: Any) -> tuple[float, float, float]:
     """Counts per mm: one number for all axes, or a table with X, Y and Z; none is zero."""
     if isinstance(value, dict):

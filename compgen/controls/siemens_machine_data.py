@@ -19,12 +19,16 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.data.toml_files import (
     Section,
+    accepted,
+    accepts,
+    array_schema,
     axis_setting,
     choice,
     flag,
     multiple_of,
     positive,
     setting,
+    table_schema,
     unless_stated,
     whole,
 )
@@ -90,9 +94,11 @@ _MODE_MISSING = (
     'mult_mode = "S1", or write products = false'
 )
 _STEP, _STEP_MEANING = multiple_of(POSITION_QUANTUM_MM), "distance of the nodes, e.g. { X = 50.0 }; at most 6 decimals"
+_OF_AXIS = [{"enum": [0, 1]}, {**array_schema({"enum": [0, 1]}, 1), "uniqueItems": True}]
 Encoders = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
 
+@accepts({"anyOf": [*_OF_AXIS, table_schema(dict.fromkeys(AXES, {"anyOf": _OF_AXIS}))]})
 def _encoders(value: Any) -> Encoders:
     """Measuring systems of the axes: 0 or 1, a list of both, or a table of these by axis (0 for one that is absent)."""
     if isinstance(value, dict):
@@ -112,12 +118,14 @@ def _encoders_of_axis(value: Any) -> tuple[int, ...]:
     return tuple(sorted(items))
 
 
+@accepts({"type": "string", "pattern": "^[A-Za-z_][A-Za-z0-9_]{0,31}$"})
 def _axis_name(value: Any) -> str:
     if not isinstance(value, str) or not _NAME.fullmatch(value.upper()) or not value.isascii():
         raise ValueError("an axis name of letters, digits and '_', e.g. 'AX1' or 'X1', is expected")
     return value.upper()
 
 
+@accepts({**array_schema(accepted(whole(0, 999))), "uniqueItems": True})
 def _table_indices(value: Any) -> tuple[int, ...]:
     index = whole(0, 999)
     if not isinstance(value, list) or len({index(item) for item in value}) != len(value):
@@ -125,6 +133,7 @@ def _table_indices(value: Any) -> tuple[int, ...]:
     return tuple(sorted(value))
 
 
+@accepts({"anyOf": [accepted(positive), table_schema(dict.fromkeys(AXES, accepted(positive)), AXES)]})
 def _per_axis(value: Any) -> tuple[float, float, float]:
     """One number above zero for all axes, or a table with X, Y and Z."""
     if isinstance(value, dict):

@@ -21,7 +21,17 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.toml_files import axis_setting, choice, flag, positive, setting, table_setting, whole, word_for
+from compgen.data.toml_files import (
+    accepts,
+    axis_setting,
+    choice,
+    flag,
+    positive,
+    setting,
+    table_setting,
+    whole,
+    word_for,
+)
 from compgen.errors import CompgenWarning, InputError
 
 # Axis lists of the TwinCAT CNC (TF5200): leadscrew, cross and plane tables as the control keeps them, and their lookup.
@@ -482,12 +492,14 @@ _PLANES = {"XY": (0, 1), "YX": (1, 0), "XZ": (0, 2), "ZX": (2, 0), "YZ": (1, 2),
 _DIFFER = "gives {} for X, Y, Z; three different ones are needed"
 
 
+@accepts({"type": "string", "pattern": f"^{_NAME.pattern}$"})
 def _axis_name(value: Any) -> str:
     if not isinstance(value, str) or not _NAME.fullmatch(value):
         raise ValueError("an axis name of letters, digits, '_' and '-' is expected")
     return value
 
 
+@accepts({"enum": list(_PLANES)})
 def plane_masters(value: Any) -> tuple[int, int] | None:
     """The first and second master of a plane by their letters, e.g. "XZ"; None for "none"."""
     if not isinstance(value, str) or value not in _PLANES:

@@ -35,6 +35,15 @@ ZONE_WEIGHT = 10.0
 MOST_ZONE_WEIGHT = 1e3
 
 
+@toml_files.accepts({"type": "number", "minimum": 1.0, "maximum": MOST_ZONE_WEIGHT})
+def _weight(value: Any) -> float:
+    """A weight from 1 to 1000."""
+    result = toml_files.number(value)
+    if not 1.0 <= result <= MOST_ZONE_WEIGHT:
+        raise ValueError(f"a number from 1 (no zone) to {MOST_ZONE_WEIGHT:g} (the zone all but alone) is expected")
+    return result
+
+
 @dataclass(frozen=True)
 class Emphasis:
     """What the least squares of the tables weighs.
@@ -46,9 +55,11 @@ class Emphasis:
     tools_mm : tool offsets over which the residual is averaged; none: the machine's own.
     """
 
-    zone_mm: tuple[Interval | None, Interval | None, Interval | None] = (None, None, None)
-    zone_weight: float = ZONE_WEIGHT
-    tools_mm: tuple[Vector3, ...] = ()
+    zone_mm: tuple[Interval | None, Interval | None, Interval | None] = toml_files.axis_setting(
+        toml_files.interval, key="work_zone_mm", meaning="the part of the travel where tables have to be best, mm"
+    )
+    zone_weight: float = toml_files.setting(_weight, ZONE_WEIGHT)
+    tools_mm: tuple[Vector3, ...] = toml_files.setting(toml_files.vectors3, ())
 
     @property
     def has_zone(self) -> bool:
@@ -102,25 +113,11 @@ class Emphasis:
 
 def take_emphasis(root: toml_files.Section, travel_mm: Sequence[Interval]) -> Emphasis:
     """Take ``work_zone_mm``, ``zone_weight`` and ``tools_mm`` from a machine file."""
-    zone = root.section("work_zone_mm", required=False)
-    parts = [zone.take(letter, toml_files.interval, None) for letter in AXES]
-    zone.finish()
-    for letter, part, (low, high) in zip(AXES, parts, travel_mm, strict=True):
+    emphasis = toml_files.take_settings(Emphasis, root)
+    for letter, part, (low, high) in zip(AXES, emphasis.zone_mm, travel_mm, strict=True):
         if part is not None and (part[0] < low or part[1] > high):
-            raise zone.fail(letter, _outside(letter, part, (low, high)))
-    return Emphasis(
-        zone_mm=(parts[0], parts[1], parts[2]),
-        zone_weight=root.take("zone_weight", zone_weight, ZONE_WEIGHT),
-        tools_mm=root.take("tools_mm", toml_files.vectors3, ()),
-    )
-
-
-def zone_weight(value: Any) -> float:
-    """A weight from 1 to 1000."""
-    result = toml_files.number(value)
-    if not 1.0 <= result <= MOST_ZONE_WEIGHT:
-        raise ValueError(f"a number from 1 (no zone) to {MOST_ZONE_WEIGHT:g} (the zone all but alone) is expected")
-    return result
+            raise root.section("work_zone_mm").fail(letter, _outside(letter, part, (low, high)))
+    return emphasis
 
 
 def zone_of(text: str, travel_mm: Sequence[Interval]) -> tuple[Interval | None, Interval | None, Interval | None]:
@@ -169,8 +166,61 @@ CHAINS: tuple[str, ...] = tuple(f"W{''.join(order)}T" for order in permutations(
 
 #: Longest travel and offset of a machine, mm.
 MOST_MM = 1e6
+_NODES = toml_files.whole(2, 10001)
+_ONE_NODES = {"oneOf": [{"required": ["nodes"]}, {"required": ["nodes_mm"]}]}
+#: A length of a machine, mm.
+_WITHIN = {"type": "number", "minimum": -MOST_MM, "maximum": MOST_MM}
 
 
+@toml_files.accepts({**toml_files.accepted(toml_files.interval), "items": _WITHIN})
+def _travel(value: object) -> tuple[float, float]:
+    """Lower and upper end of the travel, mm."""
+    lower, upper = toml_files.interval(value)
+    if max(abs(lower), abs(upper)) > MOST_MM:
+        raise ValueError("a range within a kilometre of zero is expected; is the unit mm?")
+    return lower, upper
+
+
+@toml_files.accepts({**toml_files.accepted(toml_files.vector3), "items": _WITHIN})
+def _offset(value: object) -> Vector3:
+    """A vector from one point of a machine to another, mm."""
+    x, y, z = toml_files.vector3(value)
+    if max(abs(x), abs(y), abs(z)) > MOST_MM:
+        raise ValueError("components of less than a kilometre are expected; is the unit mm?")
+    return x, y, z
+
+
+@toml_files.accepts(
+    {
+        "anyOf": [
+            {"enum": ["observable", 17, 21]},
+            {**toml_files.array_schema({"enum": list(ERROR_NAMES)}, 1), "uniqueItems": True},
+        ]
+    }
+)
+def _error_selection(value: Any) -> ErrorSelection:
+    if value == "observable" or (value in (17, 21) and not isinstance(value, bool)):
+        return cast(Literal["observable", 17, 21], value)
+    if not isinstance(value, list) or not value:
+        raise ValueError("'observable', 17, 21 or a list of error names is expected")
+    for name in value:
+        if name not in ERROR_NAMES:
+            raise ValueError(f"{name!r} is not one of the 21 errors; {nearest(str(name), ERROR_NAMES)}")
+    if len(set(value)) != len(value):
+        raise ValueError("each error may be named once")
+    return tuple(name for name in ERROR_NAMES if name in value)
+
+
+@toml_files.accepts({"type": "string", "maxLength": 200, "pattern": r"^\s*[^\s=+@-][^=]*$"})
+def _name(value: Any) -> str:
+    """Return the name of a machine, which may be an argument of a command and a cell of a table."""
+    name = toml_files.text(value)
+    if "=" in name or name.lstrip()[0] in "+-@":
+        raise ValueError("a name without '=' that does not begin with '+', '-' or '@' is expected")
+    return name
+
+
+@toml_files.accepts({"enum": list(CHAINS), "examples": ["WFYXZT"]})
 @dataclass(frozen=True)
 class Chain:
     """Kinematic chain from workpiece to tool, e.g. ``WFYXZT``; axes count 0, 1, 2 for X, Y, Z.
@@ -221,10 +271,20 @@ class Axis(Displayed):
     600.0
     """
 
-    range_mm: tuple[float, float]
-    nodes_mm: FloatArray
-    expansion_um_per_m_k: float | None = toml_files.setting(toml_files.number, None)
-    screw_pitch_mm: float | None = toml_files.setting(toml_files.positive, None)
+    range_mm: tuple[float, float] = toml_files.setting(_travel, meaning="lower and upper end of the travel, mm")
+    nodes_mm: FloatArray = toml_files.part_setting(
+        {
+            "nodes": {"anyOf": [toml_files.accepted(check) for check in (_NODES, toml_files.ascending)]},
+            "nodes_mm": toml_files.accepted(toml_files.ascending),
+        },
+        meaning="nodes of the error curves: how many there are, equally spaced over the travel, or where, mm",
+    )
+    expansion_um_per_m_k: float | None = toml_files.setting(
+        toml_files.number, None, meaning="thermal expansion of screw or scale, um/m/K"
+    )
+    screw_pitch_mm: float | None = toml_files.setting(
+        toml_files.positive, None, meaning="pitch of the screw, mm: where periodic errors are looked for"
+    )
 
     @property
     def length_mm(self) -> float:
@@ -258,19 +318,45 @@ class Machine(Displayed):
     [-500.0, -500.0, -500.0]
     """
 
-    name: str
-    chain: Chain
-    axes: tuple[Axis, Axis, Axis]
-    squareness_reference: Reference = "X"
-    tool_offset_mm: Vector3 = (0.0, 0.0, 0.0)
-    reference_point_mm: Vector3 = (0.0, 0.0, 0.0)
-    errors: ErrorSelection = "observable"
-    curves: CurveBasis = "linear"
-    controllers: Mapping[str, toml_files.Section] = field(default_factory=dict)
+    name: str = toml_files.setting(_name, meaning="name of the machine, in reports and as MACHINE of commands")
+    chain: Chain = toml_files.setting(
+        Chain,
+        meaning="order of the bodies from workpiece W over foundation F to tool T: axes left of F carry the workpiece",
+    )
+    axes: tuple[Axis, Axis, Axis] = toml_files.part_setting(
+        lambda: toml_files.table_schema(dict.fromkeys(AXES, {**toml_files.section_schema(Axis), **_ONE_NODES}), AXES),
+        required=True,
+    )
+    squareness_reference: Reference = toml_files.setting(
+        toml_files.choice("X", "Y"), "X", meaning="the axis that squareness is measured from; X as in ISO 230-1"
+    )
+    tool_offset_mm: Vector3 = toml_files.setting(
+        _offset, (0.0, 0.0, 0.0), meaning="from the reference of the spindle to the tip of the tool, mm"
+    )
+    reference_point_mm: Vector3 = toml_files.setting(
+        toml_files.vector3, (0.0, 0.0, 0.0), meaning="where the errors are zero, within the travel, mm"
+    )
+    errors: ErrorSelection = toml_files.setting(
+        _error_selection,
+        "observable",
+        meaning="the errors that the model contains: what lengths show, 17, 21, or names",
+    )
+    curves: CurveBasis = toml_files.setting(
+        toml_files.choice("linear", "cubic"), "linear", meaning="shape of the error curves between nodes"
+    )
+    controllers: Mapping[str, toml_files.Section] = toml_files.part_setting(
+        factory=dict, meaning="what the export to each control needs"
+    )
     source: Path | None = None
     emphasis: Emphasis = Emphasis()
-    effects: Mapping[str, toml_files.Section] = field(default_factory=dict)
-    tool_range_mm: ToolRange | None = None
+    effects: Mapping[str, toml_files.Section] = toml_files.part_setting(
+        factory=dict, meaning="known effects beside the geometric errors"
+    )
+    tool_range_mm: ToolRange | None = toml_files.part_setting(
+        lambda: toml_files.table_schema(dict.fromkeys(AXES, toml_files.accepted(toml_files.interval))),
+        None,
+        meaning="tool offsets that the machine may carry, lower and upper end by axis, mm",
+    )
     copy: Path | None = field(default=None, compare=False, repr=False)
 
     @property
@@ -312,8 +398,8 @@ class Machine(Displayed):
         """Return a fresh section with the settings of one control (empty if the file has none)."""
         section = self.controllers.get(name)
         if section is None:
-            return toml_files.Section({}, path=self.source, name=f"controllers.{name}")
-        return toml_files.Section(section.data, path=section.path, text=section.text, name=section.name)
+            return toml_files.Section({}, path=self.source, name=f"controllers.{name}", place=("controllers", name))
+        return section.again()
 
     def with_setting(self, controller: str, key: str, value: Any) -> Machine:
         """Return the machine with one setting of one control put in place of what the file says."""
@@ -329,78 +415,55 @@ class Machine(Displayed):
 
 def read_machine(path: str | Path) -> Machine:
     """Read a machine TOML strictly: an unknown key, a wrong unit, a reversed range are errors that say what to do."""
-    return _machine_of(toml_files.read_toml(path), Path(path))
+    return machine_of(toml_files.read_toml(path), Path(path))
 
 
 def parse_machine(text: str, source: Path) -> Machine:
     """Read the text of a machine TOML as :func:`read_machine` does; ``source`` is what messages name."""
-    return replace(_machine_of(toml_files.parse_toml(text, source), source), source=None)
+    return replace(machine_of(toml_files.parse_toml(text, source), source), source=None)
 
 
-def _machine_of(root: toml_files.Section, source: Path) -> Machine:
-    name = root.take("name", _name)
-    chain = root.take("chain", Chain)
-    reference = root.take("squareness_reference", toml_files.choice("X", "Y"), "X")
-    tool_offset_mm = root.take("tool_offset_mm", _offset, (0.0, 0.0, 0.0))
-    reference_point_mm = root.take("reference_point_mm", toml_files.vector3, (0.0, 0.0, 0.0))
-    errors: ErrorSelection = root.take("errors", _error_selection, "observable")
-    curves = root.take("curves", toml_files.choice("linear", "cubic"), "linear")
+def machine_of(root: toml_files.Section, source: Path) -> Machine:
+    """Read the root of a machine TOML as :func:`read_machine` does."""
+    stated = toml_files.stated_settings(Machine, root)
     axes_section = root.section("axes")
-    axes = [_read_axis(axes_section.section(axis), curves) for axis in AXES]
+    axes = [_read_axis(axes_section.section(axis), stated.get("curves", Machine.curves)) for axis in AXES]
     axes_section.finish()
     controllers_section = root.section("controllers", required=False)
     controllers = {key: controllers_section.section(key) for key in controllers_section.data}
     effects_section = root.section("effects", required=False)
     effects = {key: effects_section.section(key) for key in effects_section.data}
-    for axis_name, axis, reference_mm in zip(AXES, axes, reference_point_mm, strict=True):
+    for axis_name, axis, reference_mm in zip(
+        AXES, axes, stated.get("reference_point_mm", Machine.reference_point_mm), strict=True
+    ):
         low, high = axis.range_mm
         if not low <= reference_mm <= high:
             raise root.fail(
                 "reference_point_mm",
                 f"{axis_name} = {reference_mm:g} mm lies outside the travel {low:g} ... {high:g} mm; the "
                 f"position-dependent errors are zero there, so it must lie within the travel; set reference_point_mm",
+                instead=[axis.range_mm[0] for axis in axes],
             )
     tool_range_mm: ToolRange | None = None
     if "tool_range_mm" in root:  # an axis that is not named has the machine's own offset
         section = root.section("tool_range_mm")
         x, y, z = (
-            section.take(axis, toml_files.interval, (at, at)) for axis, at in zip(AXES, tool_offset_mm, strict=True)
+            section.take(axis, toml_files.interval, (at, at))
+            for axis, at in zip(AXES, stated.get("tool_offset_mm", Machine.tool_offset_mm), strict=True)
         )
         section.finish()
         tool_range_mm = x, y, z
     emphasis = take_emphasis(root, [axis.range_mm for axis in axes])
     root.finish()
     return Machine(
-        name=name,
-        chain=chain,
+        **stated,
         axes=(axes[0], axes[1], axes[2]),
-        squareness_reference=cast(Reference, reference),
-        tool_offset_mm=tool_offset_mm,
-        reference_point_mm=reference_point_mm,
-        errors=errors,
-        curves=cast(CurveBasis, curves),
         controllers=controllers,
         source=source,
         emphasis=emphasis,
         effects=effects,
         tool_range_mm=tool_range_mm,
     )
-
-
-def _travel(value: object) -> tuple[float, float]:
-    """Lower and upper end of the travel, mm."""
-    lower, upper = toml_files.interval(value)
-    if max(abs(lower), abs(upper)) > MOST_MM:
-        raise ValueError("a range within a kilometre of zero is expected; is the unit mm?")
-    return lower, upper
-
-
-def _offset(value: object) -> Vector3:
-    """A vector from one point of a machine to another, mm."""
-    x, y, z = toml_files.vector3(value)
-    if max(abs(x), abs(y), abs(z)) > MOST_MM:
-        raise ValueError("components of less than a kilometre are expected; is the unit mm?")
-    return x, y, z
 
 
 def _read_axis(section: toml_files.Section, curves: str) -> Axis:
@@ -414,23 +477,10 @@ def _read_axis(section: toml_files.Section, curves: str) -> Axis:
             message = f"goes from {nodes_mm[0]:g} to {nodes_mm[-1]:g} mm; first and last node are the ends of range_mm"
             raise section.fail(key, message)
     else:
-        nodes_mm = np.linspace(*range_mm, section.take("nodes", toml_files.whole(2, 10001)))
+        nodes_mm = np.linspace(*range_mm, section.take("nodes", _NODES))
     if curves == "cubic" and len(nodes_mm) < 4:
         raise section.fail("nodes", f"{len(nodes_mm)} is too few for curves = 'cubic'; at least 4 are needed")
     return toml_files.read_settings(Axis, section, range_mm=range_mm, nodes_mm=nodes_mm)
-
-
-def _error_selection(value: Any) -> ErrorSelection:
-    if value == "observable" or (value in (17, 21) and not isinstance(value, bool)):
-        return cast(Literal["observable", 17, 21], value)
-    if not isinstance(value, list) or not value:
-        raise ValueError("'observable', 17, 21 or a list of error names is expected")
-    for name in value:
-        if name not in ERROR_NAMES:
-            raise ValueError(f"{name!r} is not one of the 21 errors; {nearest(str(name), ERROR_NAMES)}")
-    if len(set(value)) != len(value):
-        raise ValueError("each error may be named once")
-    return tuple(name for name in ERROR_NAMES if name in value)
 
 
 def machine_files(folders: tuple[Path, ...] = ()) -> dict[str, Path]:
@@ -449,14 +499,6 @@ def machine_files(folders: tuple[Path, ...] = ()) -> dict[str, Path]:
 
 def _several(name: str, paths: Sequence[Path]) -> str:
     return f"two machines are named {name!r}: {' and '.join(map(str, paths))}; rename one"
-
-
-def _name(value: Any) -> str:
-    """Return the name of a machine, which may be an argument of a command and a cell of a table."""
-    name = toml_files.text(value)
-    if "=" in name or name.lstrip()[0] in "+-@":
-        raise ValueError("a name without '=' that does not begin with '+', '-' or '@' is expected")
-    return name
 
 
 def _declared(folders: tuple[Path, ...]) -> dict[str, list[Path]]:

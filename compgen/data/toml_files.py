@@ -1,25 +1,30 @@
 """Strict reading of TOML: every key is taken by a reader, the rest is an error that names the nearest known key.
 
 A :class:`Section` is one table of a file. A dataclass whose fields are declared with :func:`setting` is read by
-:func:`read_settings`; a reader with rules of its own takes key by key. The checks at the end say what a value may be.
+:func:`read_settings`; a reader with rules of its own takes key by key. :func:`section_schema` makes a JSON schema of what is
+declared, :func:`problems_of` lists everything that a reader would refuse. The checks at the end say what a value may be, to
+the reader and, by :func:`accepts`, to the schema.
 """
 
 from __future__ import annotations
 
 import difflib
+import inspect
 import math
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Container, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, TypeVar, cast, overload
+from typing import Any, Literal, TypeVar, cast, overload
 
 from compgen.data.files import read_text
 from compgen.data.messages import nearest, visible_line
 from compgen.data.names import AXES, LARGEST, SMALLEST
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError
 
 
 def option(
@@ -52,7 +57,44 @@ def option(
 
 T = TypeVar("T")
 D = TypeVar("D")
+C = TypeVar("C", bound=Callable[..., Any])
 _REQUIRED = object()
+#: A JSON schema (draft 2020-12), or a part of one.
+Schema = Mapping[str, Any]
+#: Where a key is in a file: keys of tables, and numbers in arrays of tables.
+Place = tuple[str | int, ...]
+
+
+def accepts(schema: Schema) -> Callable[[C], C]:
+    """Say as a JSON schema what a check takes, as far as a schema can; a check without one takes anything there."""
+
+    def declare(check: C) -> C:
+        check.json_schema = schema  # type: ignore[attr-defined]
+        return check
+
+    return declare
+
+
+def accepted(check: Callable[[Any], Any]) -> Schema:
+    """Return the JSON schema of what a check takes."""
+    return cast(Schema, getattr(check, "json_schema", {}))
+
+
+class SettingError(InputError):
+    """An InputError about one key of a TOML file.
+
+    Parameters
+    ----------
+    place : where the key is in the file, or would be.
+    kind : "unknown" to the reader, "missing", of a wrong "value", or wrong together with "others".
+    instead : a value with which reading can go on where the key may not be left out; None: there is none.
+    meant : the key of the file that was probably meant, if it is missing under its right name.
+    """
+
+    place: Place = ()
+    kind: Literal["unknown", "missing", "value", "others"] = "others"
+    instead: Any = None
+    meant: str = ""
 
 
 @dataclass(frozen=True)
@@ -97,14 +139,27 @@ class Section:
         path: Path | None,
         text: str = "",
         name: str = "",
+        place: Place | None = None,
         defaults: Section | None = None,
     ) -> None:
         self.data, self.path, self.text, self.name, self.defaults = dict(data), path, text, name, defaults
+        self.place: Place = (tuple(name.split(".")) if name else ()) if place is None else place
         self._nth = 0  # which of the tables of that name, for an array of tables
         self._known: set[str] = set()
 
-    def fail(self, key: str, message: str) -> InputError:
-        """Return the error that points at ``key`` of this section."""
+    def again(self, data: Mapping[str, Any] | None = None, defaults: Section | None = None) -> Section:
+        """Return the section as if nothing had been taken from it, or with other ``data`` or ``defaults``."""
+        return Section(
+            self.data if data is None else data,
+            path=self.path,
+            text=self.text,
+            name=self.name,
+            place=self.place,
+            defaults=defaults or self.defaults,
+        )
+
+    def fail(self, key: str, message: str, *, instead: Any = None) -> SettingError:
+        """Return the error that points at ``key`` of this section; ``instead``: a value that would do."""
         full = f"{self.name}.{key}" if self.name else key
         # the line of the key, or of its table's header if the file does not have the key
         inside, count, own = not self.name, -1, None
@@ -122,7 +177,9 @@ class Section:
                 own = number
                 break
         place = f"[{self.name}] {key}" if self.name else key
-        return InputError(message, file=self.path, line=own, field=visible_line(place))
+        error = SettingError(message, file=self.path, line=own, field=visible_line(place))
+        error.place, error.instead = (*self.place, key), instead
+        return error
 
     def __contains__(self, key: str) -> bool:
         """Whether the file holds ``key``; asking makes the key a known one."""
@@ -146,12 +203,17 @@ class Section:
                 alike = [name for name in present if f"{key}_".lower().startswith(f"{name}_".lower())]
                 alike = alike or difflib.get_close_matches(key, present, n=1, cutoff=0.6)
                 hint = f"; {visible_line(alike[0])!r} is not a key here, did you mean {key!r}?" if alike else ""
-                raise self.fail(key, f"is missing{hint}")
+                missing = self.fail(key, f"is missing{hint}", instead=example_of(accepted(check)))
+                missing.kind, missing.meant = "missing", alike[0] if alike else ""
+                raise missing
             return default
         try:
             return check(self.data[key])
         except ValueError as error:
-            raise self.fail(key, f"{error}; got {visible_line(repr(self.data[key]))[:80]}") from None
+            wrong = self.fail(key, f"{error}; got {visible_line(repr(self.data[key]))[:80]}")
+            wrong.kind = "value"
+            wrong.instead = example_of(accepted(check)) if default is _REQUIRED else None
+            raise wrong from None
 
     def section(self, key: str, *, required: bool = True) -> Section:
         """Return the sub-section ``key`` (an empty one if it is absent and not required)."""
@@ -160,13 +222,16 @@ class Section:
         usual = None
         if self.defaults is not None:
             usual, value = self.defaults.section(key, required=False), self.data.get(key, {})
-        return Section(value, path=self.path, text=self.text, name=full, defaults=usual)
+        return Section(value, path=self.path, text=self.text, name=full, place=(*self.place, key), defaults=usual)
 
     def sections(self, key: str) -> list[Section]:
         """Return the sub-sections of an array of tables (``[[key]]``), empty if absent."""
         full = f"{self.name}.{key}" if self.name else key
         tables = self.take(key, _tables, [])
-        found = [Section(table, path=self.path, text=self.text, name=full) for table in tables]
+        found = [
+            Section(table, path=self.path, text=self.text, name=full, place=(*self.place, key, nth))
+            for nth, table in enumerate(tables)
+        ]
         for nth, section in enumerate(found):
             section._nth = nth
         return found
@@ -190,7 +255,9 @@ class Section:
         """Raise InputError for the first key that was never asked for."""
         for key in self.data:
             if key not in self._known:
-                raise self.fail(key, f"is not a known key; {nearest(key, self._known)}")
+                unknown = self.fail(key, f"is not a known key; {nearest(key, self._known)}")
+                unknown.kind = "unknown"
+                raise unknown
         if self.defaults is not None:
             self.defaults.finish()
 
@@ -253,11 +320,18 @@ def setting(
         would have it.
     """
     if stated is not None:
-        default = check(stated) if unit == 1.0 else unit * check(stated)
+        default = _scaled(check(stated), unit)
     metadata = {"check": check, "key": key, "unit": unit, "required": required or default is _REQUIRED}
     metadata |= {"stated": default if stated is None and unit == 1.0 else stated, "meaning": meaning}
     metadata |= {"text": meaning, "name": name, "metavar": metavar, "choices": (), "within": None}
     return field(metadata=metadata) if default is _REQUIRED else field(default=default, metadata=metadata)
+
+
+def _scaled(value: Any, unit: float) -> Any:
+    """A value of the file in the unit of its field, number by number."""
+    if unit == 1.0:
+        return value
+    return tuple(unit * item for item in value) if isinstance(value, tuple) else unit * value
 
 
 def axis_setting(
@@ -297,6 +371,31 @@ def table_setting(kind: type[T], *, key: str = "", meaning: str = "") -> Any:
     return field(default_factory=kind, metadata={"check": kind, "key": key, "kind": kind, "meaning": meaning})
 
 
+def part_setting(
+    schema: Callable[[], Schema] | Mapping[str, Schema] | None = None,
+    default: Any = _REQUIRED,
+    *,
+    factory: Callable[[], Any] | None = None,
+    key: str = "",
+    required: bool = False,
+    meaning: str = "",
+) -> Any:
+    """Declare a field whose keys a reader with rules of its own takes.
+
+    Parameters
+    ----------
+    schema : what the key may hold, as a JSON schema made when it is asked for, or what each of several keys may hold;
+        without one a table of any content.
+    key : the key of the file if it is not the name of the field.
+    default, factory : value of the field for programs.
+    required : the file must have the key.
+    """
+    data = {"part": schema or (lambda: {"type": "object"}), "key": key, "required": required, "meaning": meaning}
+    if factory is not None:
+        return field(default_factory=factory, metadata=data)
+    return field(metadata=data) if default is _REQUIRED else field(default=default, metadata=data)
+
+
 def take_axes(section: Section, item: Field[Any]) -> tuple[Any, Any, Any]:
     """Return the values of X, Y and Z of a field that :func:`axis_setting` declares."""
     data, key = item.metadata, item.metadata["key"] or item.name
@@ -328,28 +427,33 @@ def declared_settings(kind: type) -> list[tuple[DeclaredKey, str]]:
 
 def take_settings(kind: type[T], section: Section, /, **given: Any) -> T:
     """Return a ``kind`` with the settings that it declares from a section, and the fields that are ``given``."""
+    return kind(**given, **stated_settings(kind, section, given))
+
+
+def stated_settings(kind: type, section: Section, without: Container[str] = ()) -> dict[str, Any]:
+    """Return the values by field that a section states of what ``kind`` declares, but for the fields ``without``."""
+    values: dict[str, Any] = {}
     for item in fields(cast(Any, kind)):
-        if "check" not in item.metadata or item.name in given:
+        if "check" not in item.metadata or item.name in without:
             continue
         if "axes" in item.metadata:
-            given[item.name] = take_axes(section, item)
+            values[item.name] = take_axes(section, item)
             continue
         if "kind" in item.metadata:
             part = section.section(item.metadata["key"] or item.name, required=False)
-            given[item.name] = read_settings(item.metadata["kind"], part)
+            values[item.name] = read_settings(item.metadata["kind"], part)
             continue
         key, check, unit = (item.metadata[name] for name in ("key", "check", "unit"))
         key, default = key or item.name, item.metadata["stated"]
         if "load" in item.metadata:
             paths = section.files(key) if item.metadata["several"] else section.file(key)
             load = item.metadata["load"]
-            given[item.name] = load(paths) if load and paths is not None else paths
+            values[item.name] = load(paths) if load and paths is not None else paths
             continue
         found = section.take(key, check, *(() if item.metadata["required"] else (default,)))
         if key in section:
-            scaled = [unit * value for value in found] if isinstance(found, tuple) and unit != 1.0 else None
-            given[item.name] = tuple(scaled) if scaled else found if unit == 1.0 else unit * found
-    return kind(**given)
+            values[item.name] = _scaled(found, unit)
+    return values
 
 
 def read_settings(kind: type[T], section: Section, /, **given: Any) -> T:
@@ -373,9 +477,207 @@ def unless_stated(settings: T, section: Section, **usual: Any) -> T:
     return cast(T, replace(cast(Any, settings), **found))
 
 
+# --- JSON schemas of what is declared -----------------------------------------------------------------------------
+
+
+def section_schema(*kinds: type, **more: Schema) -> dict[str, Any]:
+    """Return the JSON schema of a section with the keys that dataclasses declare, and ``more`` properties by key.
+
+    The description of a key is its declared meaning, else what the docstring of its dataclass says of the field. A
+    property of ``more`` with ``"required": True`` in place of its list of keys is a key that the section must have.
+    """
+    properties: dict[str, Any] = {}
+    required = [key for key, schema in more.items() if schema.get("required") is True]
+    for kind in kinds:
+        described = _described_fields(kind)
+        for item in fields(cast(Any, kind)):
+            data = item.metadata
+            key, said = data.get("key") or item.name, data.get("meaning") or described.get(item.name, "")
+            if isinstance(data.get("part"), Mapping):
+                properties |= {each: {**schema, "description": said} for each, schema in data["part"].items()}
+            elif {"check", "part"} & set(data):
+                properties[key] = _property(item, said)
+                required += [key] if data.get("required") else []
+    properties |= {
+        key: {word: value for word, value in schema.items() if word != "required" or value is not True}
+        for key, schema in more.items()
+    }
+    return table_schema(properties, required)
+
+
+def table_schema(properties: Mapping[str, Schema], required: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the JSON schema of a table with these keys and no others."""
+    needed = {"required": list(required)} if required else {}
+    return {"type": "object", "additionalProperties": False, "properties": dict(properties), **needed}
+
+
+def array_schema(items: Schema, least: int = 0) -> dict[str, Any]:
+    """Return the JSON schema of an array."""
+    return {"type": "array", "items": items, **({"minItems": least} if least else {})}
+
+
+def _property(item: Field[Any], meaning: str) -> dict[str, Any]:
+    """The schema of the keys of one field."""
+    data = item.metadata
+    described = {"description": meaning} if meaning else {}
+    if "part" in data:
+        return {**data["part"](), **described}
+    if "kind" in data:
+        return {**section_schema(data["kind"]), **described}
+    if "axes" in data:
+        one = accepted(data["check"])
+        pairs = zip(AXES, data["axes"], strict=True)
+        found = {letter: {**one, **({} if default is None else {"default": default})} for letter, default in pairs}
+        return {**table_schema(found), **described}
+    shown = DeclaredKey(item.name, data["required"], data["stated"], data["check"]).shown
+    default = {} if data["required"] or shown is None else {"default": shown}
+    return {**accepted(data["check"]), **described, **default}
+
+
+def _described_fields(kind: type) -> dict[str, str]:
+    """What the section "Parameters" of the docstrings of a dataclass and its bases say of each field, on one line."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        for names, text in re.findall(
+            r"^(\w+(?:, \w+)*) : (.+(?:\n {4}.*)*)", inspect.cleandoc(base.__doc__ or ""), re.M
+        ):
+            found |= dict.fromkeys(names.split(", "), " ".join(text.replace("``", "").split()))
+    return found
+
+
+def example_of(schema: Schema) -> Any:
+    """Return a simple value that a schema takes, None for a schema that says nothing."""
+    for key in ("const", "default"):
+        if key in schema:
+            return schema[key]
+    for key in ("examples", "enum"):
+        if key in schema:
+            return schema[key][0]
+    for key in ("anyOf", "oneOf"):
+        if key in schema:
+            return example_of(schema[key][0])
+    kind, least = schema.get("type"), schema.get("minItems", 0)
+    simple = {"string": "x", "boolean": False, "object": {}}
+    if kind in ("number", "integer"):
+        low, above = schema.get("minimum", 0), schema.get("exclusiveMinimum")
+        return above + 1 if above is not None else max(low, 0)
+    return [example_of(schema.get("items", {})) for _ in range(least)] if kind == "array" else simple.get(str(kind))
+
+
+# --- every problem of a file at once ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What speaks against a file: what its reader refuses, in the order of the file, and what it warns of."""
+
+    problems: tuple[InputError, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def problems_of(path: str | Path, read: Callable[[Section], object], apart: Sequence[str] = ()) -> Findings:
+    """Return everything in a TOML file that ``read`` refuses: it reads again and again, each time without what was wrong.
+
+    A key that is unknown or wrong is left out for the next time, one that must be there gets a value that its check
+    takes. What several keys do wrong together is not said where one of them was wrong by itself. ``apart`` names the
+    tables whose entries have nothing to do with each other.
+    """
+    try:
+        root = read_toml(path)
+    except InputError as error:
+        return Findings((error,))
+    attempt = _Attempt(deepcopy(root.data), tuple(apart))
+    while True:
+        try:
+            with warnings.catch_warnings(record=True) as heard:
+                warnings.simplefilter("always", CompgenWarning)
+                read(Section(deepcopy(attempt.data), path=root.path, text=root.text))
+            break
+        except InputError as error:
+            if not attempt.without(error, root.path):
+                break
+    ordered = sorted(attempt.found, key=lambda error: error.line or 0)
+    said = [str(item.message) for item in heard if issubclass(item.category, CompgenWarning)]
+    return Findings(tuple(ordered), tuple(dict.fromkeys(said)))
+
+
+class _Attempt:
+    """The data of a file on the way to what its reader takes, and the problems found so far."""
+
+    def __init__(self, data: dict[str, Any], apart: tuple[str, ...]) -> None:
+        self.data, self.apart = data, apart
+        self.found: list[InputError] = []
+        self.left_out: set[Place] = set()
+        self.replaced: set[Place] = set()
+
+    def without(self, error: InputError, path: Path | None) -> bool:
+        """Keep a problem, and change the data so that reading gets past it; False if that cannot be."""
+        own = isinstance(error, SettingError) and error.file == path
+        key_error = error if isinstance(error, SettingError) and own else None
+        place = _place_naming(self.data, path, error.file) if key_error is None else key_error.place
+        altered = self.left_out | self.replaced
+        follows = any(place[: len(known)] == known for known in altered)
+        # what keys do wrong together is known only where none of them was changed
+        depends = key_error is not None and key_error.kind == "others"
+        touched = any(self._entry(known) in ((), self._entry(place)) for known in altered)
+        if not follows and not (depends and touched):
+            self.found.append(error)
+        return (key_error is not None and self._mended(key_error)) or self._smaller(place)
+
+    def _mended(self, error: SettingError) -> bool:
+        """Take an unknown key away, put a key under its right name, or give it a value that would do."""
+        table, key = self._table(error.place[:-1]), error.place[-1]
+        if table is None:
+            return False
+        if error.kind == "unknown":
+            return table.pop(key, None) is not None
+        if error.meant in table:
+            table[key] = table.pop(error.meant)
+        elif error.instead is not None and error.place not in self.replaced:
+            table[key] = deepcopy(error.instead)
+            self.replaced.add(error.place)
+        else:
+            return False
+        return True
+
+    def _smaller(self, place: Place) -> bool:
+        """Leave out the key at a place, or the smallest table around it; False if nothing of it is left."""
+        for length in range(len(place), 0, -1):
+            table, key = self._table(place[: length - 1]), place[length - 1]
+            if table is not None and key in table:
+                del table[key]
+                self.left_out.add(place[:length])
+                return True
+        return False
+
+    def _table(self, place: Place) -> dict[Any, Any] | None:
+        """The table at a place, None if there is none."""
+        found: Any = self.data
+        for key in place:
+            try:
+                found = found[key]
+            except (KeyError, IndexError, TypeError):
+                return None
+        return found if isinstance(found, dict) else None
+
+    def _entry(self, place: Place) -> Place:
+        """The entry that a place is in, of those that have nothing to do with each other; none: the file as a whole."""
+        return place[:2] if place and place[0] in self.apart else ()
+
+
+def _place_naming(data: Any, path: Path | None, file: str | Path | None, at: Place = ()) -> Place:
+    """Where the data of the file ``path`` name another ``file``; () if they do not."""
+    if isinstance(data, str):
+        return at if file is not None and path is not None and path.parent / data == Path(file) else ()
+    inside = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    places = (_place_naming(value, path, file, (*at, key)) for key, value in inside)
+    return next((place for place in places if place), ())
+
+
 # --- checks: each returns the clean value or raises ValueError with what is expected -----------------------------
 
 
+@accepts({"type": "number", "minimum": -LARGEST, "maximum": LARGEST})
 def number(value: Any) -> float:
     """A finite number; zero, or of a size from SMALLEST to LARGEST, so that its square is one as well."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < math.inf:
@@ -385,6 +687,7 @@ def number(value: Any) -> float:
     return float(value)
 
 
+@accepts({"type": "number", "exclusiveMinimum": 0, "maximum": LARGEST})
 def positive(value: Any) -> float:
     """A finite number above zero."""
     result = number(value)
@@ -396,6 +699,7 @@ def positive(value: Any) -> float:
 def multiple_of(quantum: Decimal) -> Callable[[Any], float]:
     """A positive length in whole multiples of ``quantum``, mm."""
 
+    @accepts(accepted(positive))
     def check(value: Any) -> float:
         if Decimal(repr(positive(value))) % quantum:
             raise ValueError(f"a multiple of {quantum} mm is expected")
@@ -404,6 +708,7 @@ def multiple_of(quantum: Decimal) -> Callable[[Any], float]:
     return check
 
 
+@accepts({"type": "number", "minimum": 0, "maximum": LARGEST})
 def not_negative(value: Any) -> float:
     """A finite number, zero or more."""
     result = number(value)
@@ -414,7 +719,9 @@ def not_negative(value: Any) -> float:
 
 def whole(minimum: int, maximum: int | None = None) -> Callable[[Any], int]:
     """A whole number within limits."""
+    limits = {"minimum": minimum} if maximum is None else {"minimum": minimum, "maximum": maximum}
 
+    @accepts({"type": "integer", **limits})
     def check(value: Any) -> int:
         upper = math.inf if maximum is None else maximum
         if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= upper:
@@ -425,6 +732,7 @@ def whole(minimum: int, maximum: int | None = None) -> Callable[[Any], int]:
     return check
 
 
+@accepts({"type": "boolean"})
 def flag(value: Any) -> bool:
     """``true`` or ``false``."""
     if not isinstance(value, bool):
@@ -432,6 +740,7 @@ def flag(value: Any) -> bool:
     return value
 
 
+@accepts({"type": "string", "maxLength": 200, "pattern": r"^[^\u0000-\u001f]*\S[^\u0000-\u001f]*$"})
 def text(value: Any) -> str:
     """One line of text, at most 200 characters."""
     if not isinstance(value, str) or not value.strip() or len(value) > 200 or any(ord(char) < 32 for char in value):
@@ -439,6 +748,7 @@ def text(value: Any) -> str:
     return value
 
 
+@accepts({"type": "string", "maxLength": 200, "pattern": r"^[^\u0000-\u001f=]*[^\s=][^\u0000-\u001f=]*$"})
 def name(value: Any) -> str:
     """A text without "=", which separates a name from its value in comments and commands."""
     if "=" in text(value):
@@ -446,6 +756,7 @@ def name(value: Any) -> str:
     return str(value)
 
 
+@accepts({"type": "string", "pattern": r"^[^\u0000-\u001f]*\S[^\u0000-\u001f]*$"})
 def text_of_path(value: Any) -> str:
     """A path as text: not empty, without control characters."""
     if not isinstance(value, str) or not value.strip() or any(ord(char) < 32 for char in value):
@@ -453,6 +764,7 @@ def text_of_path(value: Any) -> str:
     return value
 
 
+@accepts({"anyOf": [accepted(text_of_path), array_schema(accepted(text_of_path), 1)]})
 def texts_of_paths(value: Any) -> tuple[str, ...]:
     """A path, or a list of paths, as text."""
     if isinstance(value, list) and value:
@@ -465,6 +777,7 @@ def texts_of_paths(value: Any) -> tuple[str, ...]:
 def choice(*allowed: str) -> Callable[[Any], str]:
     """One of the given words."""
 
+    @accepts({"enum": list(allowed)})
     def check(value: Any) -> str:
         if value not in allowed:
             raise ValueError(f"one of {', '.join(map(repr, allowed))} is expected")
@@ -476,12 +789,13 @@ def choice(*allowed: str) -> Callable[[Any], str]:
 def word_for(values: Mapping[str, T]) -> Callable[[Any], T]:
     """One of the given words, as the value that it stands for."""
     check = choice(*values)
-    return lambda value: values[check(value)]
+    return accepts(accepted(check))(lambda value: values[check(value)])
 
 
 def share(most: float, whole: str) -> Callable[[Any], float]:
     """A number from 0 to ``most``, which is a share of ``whole`` (for the message)."""
 
+    @accepts({"type": "number", "minimum": 0, "maximum": most})
     def check(value: Any) -> float:
         result = not_negative(value)
         if result > most:
@@ -491,6 +805,7 @@ def share(most: float, whole: str) -> Callable[[Any], float]:
     return check
 
 
+@accepts(array_schema(accepted(number)))
 def numbers(value: Any) -> tuple[float, ...]:
     """A list of finite numbers."""
     if not isinstance(value, list):
@@ -498,6 +813,7 @@ def numbers(value: Any) -> tuple[float, ...]:
     return tuple(number(item) for item in value)
 
 
+@accepts({**array_schema(accepted(number), 3), "maxItems": 3})
 def vector3(value: Any) -> tuple[float, float, float]:
     """Three finite numbers, for X, Y and Z."""
     if not isinstance(value, list) or len(value) != 3:
@@ -506,6 +822,7 @@ def vector3(value: Any) -> tuple[float, float, float]:
     return x, y, z
 
 
+@accepts(array_schema(accepted(vector3), 1))
 def vectors3(value: Any) -> tuple[tuple[float, float, float], ...]:
     """A list of tool offsets, each three finite numbers."""
     if not isinstance(value, list) or not value:
@@ -513,6 +830,7 @@ def vectors3(value: Any) -> tuple[tuple[float, float, float], ...]:
     return tuple(vector3(item) for item in value)
 
 
+@accepts({**array_schema(accepted(number), 2), "maxItems": 2, "examples": [[0.0, 1.0]]})
 def interval(value: Any) -> tuple[float, float]:
     """Two finite numbers, the lower one first."""
     if not isinstance(value, list) or len(value) != 2:
@@ -523,6 +841,7 @@ def interval(value: Any) -> tuple[float, float]:
     return lower, upper
 
 
+@accepts({**array_schema(accepted(number), 2), "examples": [[0.0, 1.0]]})
 def ascending(value: Any) -> tuple[float, ...]:
     """At least two numbers in ascending order."""
     items = numbers(value)
@@ -531,6 +850,7 @@ def ascending(value: Any) -> tuple[float, ...]:
     return items
 
 
+@accepts({"type": "object"})
 def table(value: Any) -> dict[str, Any]:
     """A table of keys and values."""
     if not isinstance(value, dict):
@@ -538,6 +858,7 @@ def table(value: Any) -> dict[str, Any]:
     return value
 
 
+@accepts({"type": "array", "items": {"type": "object"}})
 def _tables(value: Any) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
         raise ValueError("an array of tables ([[section]]) is expected")

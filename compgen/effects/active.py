@@ -13,7 +13,7 @@ hold and what not.
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,7 +29,6 @@ from compgen.effects.base import ANY_STATION, DisplacementEffect, Effect
 from compgen.effects.catalogue import catalogue, listed
 from compgen.effects.optics import DeadPath
 from compgen.effects.readings import Readings, legendre
-from compgen.errors import InputError
 
 #: The names of stations in the names of effects and of their parameters.
 STATION_NAME = re.compile(r"(?:station_drift|length_step|tracer_runout)_(.+)")
@@ -92,7 +91,7 @@ def dead_path_stations(keys: Iterable[str]) -> list[str]:
 
 
 def _read(machine: Machine, known: dict[str, Effect], name: str, raw: toml_files.Section) -> ActiveEffect:
-    section = toml_files.Section(raw.data, path=raw.path, text=raw.text, name=raw.name)
+    section = raw.again()
     effect = known.get(name)
     if effect is None or not effect.card.parameters:
         names = [other for other, one in {**listed(), **known}.items() if one.card.parameters]
@@ -101,12 +100,54 @@ def _read(machine: Machine, known: dict[str, Effect], name: str, raw: toml_files
             if effect is None
             else f"{name} has no parameters, so it cannot be switched on; it is found in residuals"
         )
-        raise InputError(message, file=raw.path, line=raw.fail("", "").line, field=f"[{raw.name}]")
+        raise section.fail("", message)
     effect, values = read_values(effect, section)
     if isinstance(effect, Periodic) and effect.pitch_mm(machine) is None:
         raise section.fail("pitch_mm", "is missing, and the machine file has no screw_pitch_mm for this axis")
     section.finish()
     return ActiveEffect(effect, values)
+
+
+@toml_files.accepts({"type": "integer", "minimum": 1, "maximum": 12})
+def _degree(value: Any) -> int:
+    return toml_files.whole(1, 12)(int(value) if isinstance(value, float) and value.is_integer() else value)
+
+
+#: Checks of settings that may not be any number.
+_SETTING_CHECKS: Mapping[str, Callable[[Any], float]] = {"degree": _degree}
+
+
+def keys_schema(effect: Effect, **more: toml_files.Schema) -> dict[str, Any]:
+    """Return the JSON schema of a section with the parameters and settings of an effect, and ``more`` properties."""
+    number, card = toml_files.accepted(toml_files.number), effect.card
+    parameters = {item.name: {**number, "description": item.meaning} for item in card.parameters}
+    named = {name: schema for name, schema in parameters.items() if ANY_STATION not in name}
+    patterns = {station_pattern(name): schema for name, schema in parameters.items() if name not in named}
+    settings = {
+        item.name: {
+            **toml_files.accepted(_SETTING_CHECKS.get(item.name, toml_files.number)),
+            "description": item.meaning,
+        }
+        for item in card.settings
+    }
+    schema = toml_files.section_schema(**more, **named, **settings)
+    schema["required"] = [*more, *(item.name for item in card.settings if item.needed)]
+    if patterns:
+        return {**schema, "patternProperties": patterns}
+    return {**schema, "anyOf": [{"required": [name]} for name in named]}
+
+
+def station_pattern(name: str) -> str:
+    """Return the pattern of a name in which :data:`ANY_STATION` is the name of a station."""
+    return "^" + re.escape(name).replace(re.escape(ANY_STATION), ".+") + "$"
+
+
+def effects_schema() -> dict[str, Any]:
+    """Return the JSON schema of the ``[effects.NAME]`` sections of a machine file."""
+    known = {name: keys_schema(effect) for name, effect in listed().items() if effect.card.parameters}
+    of_stations = {station_pattern(name): schema for name, schema in known.items() if ANY_STATION in name}
+    plain = {name: schema for name, schema in known.items() if ANY_STATION not in name}
+    return {**toml_files.table_schema(plain), "patternProperties": of_stations}
 
 
 def read_values(effect: Effect, section: toml_files.Section) -> tuple[Effect, FloatArray]:
@@ -116,7 +157,7 @@ def read_values(effect: Effect, section: toml_files.Section) -> tuple[Effect, Fl
     """
     settings: dict[str, float] = {}
     for setting in effect.card.settings:
-        value = section.take(setting.name, _degree if setting.name == "degree" else toml_files.number, None)
+        value = section.take(setting.name, _SETTING_CHECKS.get(setting.name, toml_files.number), None)
         if value is not None:
             settings[setting.name] = float(value)
         elif setting.needed:
@@ -130,10 +171,6 @@ def read_values(effect: Effect, section: toml_files.Section) -> tuple[Effect, Fl
         raise section.fail(names[0], f"is missing; expected at least one of {', '.join(names)}")
     values = [section.take(p.name, toml_files.number, 0.0) * p.si_per_unit for p in effect.card.parameters]
     return effect, np.array(values)
-
-
-def _degree(value: Any) -> int:
-    return toml_files.whole(1, 12)(int(value) if isinstance(value, float) and value.is_integer() else value)
 
 
 def displacement_of(effects: Sequence[ActiveEffect], readings: Readings) -> tuple[FloatArray, list[str]]:

@@ -13,7 +13,7 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +23,7 @@ from compgen.data import toml_files
 from compgen.data.files import read_bytes, read_text, sha256_of, write_file
 from compgen.data.messages import nearest
 from compgen.data.names import ERROR_NAMES, MM_PER_UM, error_named
-from compgen.data.toml_files import Section, setting, table_setting, take_settings
+from compgen.data.toml_files import Section, accepted, accepts, part_setting, setting, table_setting, take_settings
 from compgen.errors import InputError
 
 # --- schedules -----------------------------------------------------------------------------------------------------
@@ -74,6 +74,7 @@ class Every:
 Schedule = Cron | Every
 
 
+@accepts({"type": "string", "pattern": r"^\s*(@[A-Za-z]+|\S+(\s+\S+){4})\s*$"})
 def cron(value: object) -> Cron:
     """Return a cron expression as numbers; ValueError says what is wrong with which field."""
     if not isinstance(value, str):
@@ -155,9 +156,12 @@ def cron_expression(schedule: Schedule) -> str | None:
 # --- the job file --------------------------------------------------------------------------------------------------
 
 PATTERNS = ("*.lengths.csv", "*.deviations.csv", "*.sixdof.csv")
+#: The store where a job file names none.
+STORE = "recal.sqlite"
 MACHINE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
+@accepts({"type": "number", "minimum": 0.5, "exclusiveMaximum": 1.0})
 def _confidence(value: Any) -> float:
     result = toml_files.number(value)
     if not 0.5 <= result < 1.0:
@@ -165,6 +169,12 @@ def _confidence(value: Any) -> float:
     return result
 
 
+@accepts(
+    {
+        "anyOf": [{"type": "string"}, toml_files.array_schema({"type": "string"}, 1)],
+        "examples": [[next(iter(CONTROLLERS))]],
+    }
+)
 def _controllers(value: Any) -> tuple[str, ...]:
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
@@ -175,6 +185,7 @@ def _controllers(value: Any) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
+@accepts(toml_files.array_schema({"type": "string", "pattern": r"^(?!\.\.)[^/]+$"}, 1))
 def _patterns(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list) or not value or not all(isinstance(item, str) and item for item in value):
         raise ValueError("a list of file patterns, for example ['*.lengths.csv'], is expected")
@@ -183,6 +194,9 @@ def _patterns(value: Any) -> tuple[str, ...]:
     return tuple(value)
 
 
+@accepts(
+    {"anyOf": [{"type": "string", "pattern": r"\S"}, toml_files.array_schema({"type": "string", "minLength": 1}, 1)]}
+)
 def command_words(value: Any) -> tuple[str, ...]:
     """Return a command as its words: a list, or one text that is split as a shell does."""
     words = shlex.split(value) if isinstance(value, str) else value
@@ -191,8 +205,23 @@ def command_words(value: Any) -> tuple[str, ...]:
     return tuple(words)
 
 
+@accepts(accepted(toml_files.text_of_path))
 def _path(value: Any) -> Path:
     return Path(toml_files.text_of_path(value))
+
+
+#: Keys of ``[identify]``, each with its check.
+_IDENTIFY: Mapping[str, Callable[[Any], Any]] = {
+    "u_length_um": toml_files.not_negative,
+    "u_length_um_per_m": toml_files.not_negative,
+    "u_deviation_um": toml_files.not_negative,
+    "temperature": toml_files.flag,
+    "small_deviations": toml_files.flag,
+}
+#: Keys of ``[tolerances]``: the error, or "volume", and the size of its unit in mm or rad.
+_TOLERANCES: Mapping[str, tuple[str, float]] = {
+    f"{name}_{error_named(name).unit}": (name, error_named(name).si_per_unit) for name in ERROR_NAMES
+} | {"volume_um": ("volume", MM_PER_UM)}
 
 
 @dataclass(frozen=True)
@@ -316,8 +345,16 @@ class MachineJob:
         meaning="A measurement that takes longer is stopped and set aside; by `run` and `watch`.",
     )
     policy: Policy = table_setting(Policy)
-    identify: Mapping[str, Any] = field(default_factory=dict)
-    tolerances: Mapping[str, float] = field(default_factory=dict)
+    identify: Mapping[str, Any] = part_setting(
+        lambda: toml_files.table_schema({key: accepted(check) for key, check in _IDENTIFY.items()}),
+        factory=dict,
+        meaning="How measurements are identified, as the options of `volcomp identify`.",
+    )
+    tolerances: Mapping[str, float] = part_setting(
+        lambda: toml_files.table_schema(dict.fromkeys(_TOLERANCES, accepted(toml_files.positive))),
+        factory=dict,
+        meaning="Limits of the drift, by error or of the volume.",
+    )
     others: tuple[OtherInbox, ...] = field(default=(), compare=False, repr=False)
     settings: str = field(default="", compare=False, repr=False)
     original: Path | None = field(default=None, compare=False, repr=False)
@@ -369,7 +406,7 @@ class Job:
 
 def read_job(path: str | Path) -> Job:
     """Read a job file strictly; InputError with file, line and key for whatever is unknown, missing or impossible."""
-    return _job_of(toml_files.read_toml(path), Path(path).absolute())
+    return job_of(toml_files.read_toml(path), Path(path).absolute())
 
 
 def job_of_text(text: str, path: Path) -> Job:
@@ -377,23 +414,49 @@ def job_of_text(text: str, path: Path) -> Job:
     import tomllib
 
     try:
-        return _job_of(Section(tomllib.loads(text), path=path, text=text), path.absolute())
+        return job_of(Section(tomllib.loads(text), path=path, text=text), path.absolute())
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"is not valid TOML: {error}", file=path) from error
 
 
-def _job_of(root: Section, path: Path) -> Job:
+def job_schema() -> dict[str, Any]:
+    """Return the JSON schema of a job file."""
+    keys = toml_files.section_schema(MachineJob)
+    required, known = keys.pop("required"), {"enum": sorted(CONTROLLERS)}
+    keys["properties"]["controllers"] |= {"anyOf": [known, toml_files.array_schema(known, 1)]}
+    store = {**accepted(toml_files.text_of_path), "default": STORE, "description": "SQLite file, or URL of a database."}
+    machines = {
+        "type": "object",
+        "description": "The machines by name.",
+        "propertyNames": {"pattern": f"^{MACHINE_NAME.pattern}$"},
+        "additionalProperties": keys,
+    }
+    defaults = {**keys, "description": "Keys of every machine that does not say otherwise."}
+    # what a machine needs may also be among the defaults
+    needed = [
+        {
+            "anyOf": [
+                {"required": ["defaults"], "properties": {"defaults": {"required": [key]}}},
+                {"properties": {"machines": {"additionalProperties": {"required": [key]}}}},
+            ]
+        }
+        for key in required
+    ]
+    whole = toml_files.table_schema({"store": store, "defaults": defaults, "machines": machines})
+    return {**whole, "allOf": needed}
+
+
+def job_of(root: Section, path: Path) -> Job:
+    """Read the root of a job file as :func:`read_job` does."""
     folder = path.parent
-    store = root.take("store", toml_files.text_of_path, "recal.sqlite")
+    store = root.take("store", toml_files.text_of_path, STORE)
     defaults = root.section("defaults", required=False)
     every = root.section("machines", required=False)
     machines = {}
     for name in every.data:
         if not MACHINE_NAME.fullmatch(name):
             raise every.fail(name, "is not a name: letters, digits, '.', '_' and '-', at most 64, are allowed")
-        section = every.section(name)
-        keys = Section(section.data, path=root.path, text=root.text, name=section.name, defaults=defaults)
-        machines[name] = _machine(name, keys, folder)
+        machines[name] = _machine(name, every.section(name).again(defaults=defaults), folder)
     if not machines:  # the defaults are checked before there is one
         required = dict.fromkeys((item.name for item in fields(MachineJob) if item.metadata.get("required")), "")
         keys = Section({}, path=path, defaults=defaults)
@@ -427,6 +490,7 @@ def _machine(name: str, keys: Section, folder: Path) -> MachineJob:
             "measured_with",
             "is missing; say 'active' if the compensation stays on while the machine is measured, 'bare' if it is "
             "switched off. The wrong one compensates twice or not at all",
+            instead="bare",
         )
     job = take_settings(MachineJob, keys, name=name, **_mappings(keys))
     keys.finish()
@@ -459,19 +523,14 @@ def _schedule(job: MachineJob, keys: Section) -> Schedule | None:
 def _mappings(keys: Section) -> dict[str, Mapping[str, Any]]:
     """The sections ``identify``, in the units of the file, and ``tolerances``, in mm and rad by error or "volume"."""
     section = keys.section("tolerances", required=False)
-    units = {f"{name}_{error_named(name).unit}": (name, error_named(name).si_per_unit) for name in ERROR_NAMES}
-    units["volume_um"] = ("volume", MM_PER_UM)
-    given = {key: section.take(key, toml_files.positive, None) for key in units}
+    given = {key: section.take(key, toml_files.positive, None) for key in _TOLERANCES}
     section.finish()
-    tolerances = {units[key][0]: size * units[key][1] for key, size in given.items() if size is not None}
+    tolerances = {_TOLERANCES[key][0]: size * _TOLERANCES[key][1] for key, size in given.items() if size is not None}
     section = keys.section("identify", required=False)
-    names = ("u_length_um", "u_length_um_per_m", "u_deviation_um")
-    found: dict[str, Any] = {name: section.take(name, toml_files.not_negative, None) for name in names}
-    found["temperature"] = section.take("temperature", toml_files.flag, True)
-    found["small_deviations"] = (
-        section.take("small_deviations", toml_files.flag, False) or None
-    )  # so that the hash stays
+    found: dict[str, Any] = {name: section.take(name, check, None) for name, check in _IDENTIFY.items()}
     section.finish()
+    found["temperature"] = found["temperature"] is not False
+    found["small_deviations"] = found["small_deviations"] or None  # so that the hash stays
     return {"tolerances": tolerances, "identify": {name: item for name, item in found.items() if item is not None}}
 
 

@@ -7,8 +7,8 @@ Signals = S_g errors + S_s systematics + S_d drift; :func:`error_matrix`, :func:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Vector3
 from compgen.data.messages import nearest
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.toml_files import setting
+from compgen.data.toml_files import part_setting, setting
 
 # Constants of the six-DOF laser instrument, and which error of which axis each of its channels sees.
 #
@@ -44,6 +44,7 @@ ROTATIONS = ((2, 1, 0), (2, 0, 1), (0, 1, 2))
 HANDEDNESS = (1, -1, -1)
 
 
+@toml_files.accepts({**toml_files.accepted(toml_files.number), "not": {"const": 0}, "examples": [30.0]})
 def _separation(value: Any) -> float:
     result = toml_files.number(value)
     if result == 0.0:
@@ -51,6 +52,7 @@ def _separation(value: Any) -> float:
     return result
 
 
+@toml_files.accepts({"type": "number", "exclusiveMinimum": 1.0, "exclusiveMaximum": 4.0, "examples": [1.5]})
 def _glass(value: Any) -> float:
     result = toml_files.number(value)
     if not 1.0 < result < 4.0:
@@ -114,6 +116,13 @@ TURNED_ERRORS = np.array([-1.0, -1.0, 1.0, 1.0, -1.0, -1.0])
 TURNED_DRIFT = np.array([-1.0, 1.0])
 
 
+@toml_files.accepts({"enum": [1, -1]})
+def _beam_direction(value: Any) -> int:
+    if value not in (1, -1) or isinstance(value, bool):
+        raise ValueError("1 (beam along the positive axis at the target) or -1 is expected")
+    return int(value)
+
+
 @dataclass(frozen=True)
 class SetUp:
     """How one axis is measured.
@@ -126,8 +135,8 @@ class SetUp:
     """
 
     axis: int
-    mode: int = 1
-    beam_direction: int = 1
+    mode: int = setting(toml_files.whole(1, 2), 1, required=True)
+    beam_direction: int = setting(_beam_direction, 1)
 
     @property
     def sense(self) -> float:
@@ -322,6 +331,7 @@ Line = Literal["ls", "minzone"]
 SQUARENESS_SIGNS = (-1.0, 1.0, -1.0)
 
 
+@toml_files.accepts({"anyOf": [{"enum": [1, -1]}, {**toml_files.array_schema({"enum": [1, -1]}, 3), "maxItems": 3}]})
 def _signs(value: Any) -> tuple[float, float, float]:
     """One sign for all three, or a list of three: +1 keeps the program's own convention, -1 turns it."""
     turns = toml_files.numbers(value) if isinstance(value, list) else (toml_files.number(value),) * 3
@@ -331,17 +341,23 @@ def _signs(value: Any) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _beam_direction(value: Any) -> int:
-    if value not in (1, -1) or isinstance(value, bool):
-        raise ValueError("1 (beam along the positive axis at the target) or -1 is expected")
-    return int(value)
-
-
+@toml_files.accepts({"anyOf": [{"const": 0}, toml_files.accepted(toml_files.vector3)]})
 def _offset(value: Any) -> Vector3:
     """Three numbers, or 0."""
     if not isinstance(value, bool) and value == 0:
         return (0.0, 0.0, 0.0)
     return toml_files.vector3(value)
+
+
+#: Constants whose standard uncertainty an instrument file may state.
+U_CONSTANTS = (
+    *(item.name for item in fields(Optics)),
+    *("distance_first_mm", "drift_gain_percent", "parallel_drift_um", "displacement_ppm"),
+)
+
+
+#: Signals whose standard deviation an instrument file may state.
+NOISE = ("displacement_um", "qd_um", "psd_um")
 
 
 @dataclass(frozen=True)
@@ -361,7 +377,7 @@ class AxisSetUp:
     distance_first_mm: float | None = setting(toml_files.number, None)
     position_mm: Vector3 | None = setting(toml_files.vector3, None)
     target_offset_mm: Vector3 = setting(_offset, (0.0, 0.0, 0.0))
-    systematics: Mapping[str, float] = field(default_factory=dict)
+    systematics: Mapping[str, float] = part_setting(factory=dict)
 
 
 @dataclass(frozen=True)
@@ -381,21 +397,30 @@ class SixDofInstrument:
     """
 
     optics: Optics
-    axes: Mapping[int, AxisSetUp]
+    axes: Mapping[int, AxisSetUp] = part_setting(
+        lambda: {
+            **toml_files.table_schema(
+                {
+                    letter: toml_files.section_schema(SetUp, AxisSetUp, systematics=systematics_schema(axis))
+                    for axis, letter in enumerate(AXES)
+                }
+            ),
+            "minProperties": 1,
+        },
+        required=True,
+    )
     line: Line = setting(toml_files.choice("ls", "minzone"), "ls")
     as_printed: bool = setting(toml_files.flag, False)
     squareness_signs: tuple[float, float, float] = setting(_signs, SQUARENESS_SIGNS, key="squareness_sign")
-    u_systematics: Mapping[str, float] = field(default_factory=dict)
-    u_constants: Mapping[str, float] = field(default_factory=dict)
-    noise: Mapping[str, float] = field(default_factory=dict)
+    u_systematics: Mapping[str, float] = part_setting(
+        lambda: systematics_schema(check=toml_files.not_negative), factory=dict
+    )
+    u_constants: Mapping[str, float] = part_setting(lambda: _numbers_schema(U_CONSTANTS), factory=dict)
+    noise: Mapping[str, float] = part_setting(lambda: _numbers_schema(NOISE), factory=dict)
     source: Path | None = None
 
 
-#: Constants whose standard uncertainty an instrument file may state.
-U_CONSTANTS = (
-    *(item.name for item in fields(Optics)),
-    *("distance_first_mm", "drift_gain_percent", "parallel_drift_um", "displacement_ppm"),
-)
+_KIND = toml_files.choice("sixdof-laser")
 
 
 def known_systematics(axis: int | None = None) -> tuple[str, ...]:
@@ -407,25 +432,33 @@ def known_systematics(axis: int | None = None) -> tuple[str, ...]:
 
 def read_instrument(path: str | Path) -> SixDofInstrument:
     """Read an instrument TOML strictly; InputError with file, line and key."""
-    root = toml_files.read_toml(path)
-    root.take("kind", toml_files.choice("sixdof-laser"))
+    return instrument_of(toml_files.read_toml(path))
+
+
+def instrument_schema() -> dict[str, Any]:
+    """Return the JSON schema of an instrument file."""
+    kind = {**toml_files.accepted(_KIND), "description": "kind of the instrument", "required": True}
+    common = {**systematics_schema(), "description": "calibrated parameters of every axis that has them"}
+    return toml_files.section_schema(Optics, SixDofInstrument, kind=kind, systematics=common)
+
+
+def instrument_of(root: toml_files.Section) -> SixDofInstrument:
+    """Read the root of an instrument TOML as :func:`read_instrument` does."""
+    root.take("kind", _KIND)
     optics = toml_files.take_settings(Optics, root)
     common = read_systematics(root.section("systematics", required=False))
     u_common = read_systematics(root.section("u_systematics", required=False), check=toml_files.not_negative)
-    noise = _read_numbers(root.section("noise", required=False), ("displacement_um", "qd_um", "psd_um"))
+    noise = _read_numbers(root.section("noise", required=False), NOISE)
     section = root.section("axes")
     axes = {}
     for axis, letter in enumerate(AXES):
         if letter not in section:
             continue
         entry = section.section(letter)
-        mode = entry.take("mode", toml_files.whole(1, 2))
-        direction = entry.take("beam_direction", _beam_direction, 1)
+        set_up = toml_files.take_settings(SetUp, entry, axis=axis)
         own = read_systematics(entry.section("systematics", required=False), axis)
         known = {name: value for name, value in common.items() if name in known_systematics(axis)}
-        axes[axis] = toml_files.read_settings(
-            AxisSetUp, entry, set_up=SetUp(axis, mode, direction), systematics={**known, **own}
-        )
+        axes[axis] = toml_files.read_settings(AxisSetUp, entry, set_up=set_up, systematics={**known, **own})
     section.finish()
     if not axes:
         raise section.fail("X", "no axis is described; give [axes.X], [axes.Y] or [axes.Z]")
@@ -437,7 +470,7 @@ def read_instrument(path: str | Path) -> SixDofInstrument:
         u_systematics=u_common,
         u_constants=_read_numbers(root.section("u_constants", required=False), U_CONSTANTS),
         noise={name.removesuffix("_um"): value * MM_PER_UM for name, value in noise.items()},
-        source=Path(path),
+        source=root.path,
     )
 
 
@@ -445,6 +478,17 @@ def _read_numbers(section: toml_files.Section, names: tuple[str, ...]) -> dict[s
     found = {name: section.take(name, toml_files.not_negative) for name in names if name in section}
     section.finish()
     return found
+
+
+def _numbers_schema(names: Sequence[str]) -> dict[str, Any]:
+    return toml_files.table_schema(dict.fromkeys(names, toml_files.accepted(toml_files.not_negative)))
+
+
+def systematics_schema(axis: int | None = None, check: Callable[[Any], float] = toml_files.number) -> dict[str, Any]:
+    """Return the JSON schema of what :func:`read_systematics` reads."""
+    names = known_systematics(axis)
+    keys = [f"{name}_{unit}" for name in names for unit in UNITS[name.partition("_")[0]]]
+    return toml_files.table_schema(dict.fromkeys(keys, toml_files.accepted(check)))
 
 
 def read_systematics(

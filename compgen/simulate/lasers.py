@@ -18,7 +18,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine, Vector3
 from compgen.data.names import AXES, BODY_DIAGONALS, MM_PER_UM, SECONDS_PER_MIN
-from compgen.data.toml_files import setting
+from compgen.data.toml_files import accepts, part_setting, setting
 from compgen.errors import InputError
 from compgen.simulate.effects import LengthEffect, RunEffect, SimulatedEffect
 from compgen.simulate.trajectory import (
@@ -57,7 +57,9 @@ class LaserTracer:
     rate_hz : readings a second of each station while the machine moves, without stops; None reads at stops.
     """
 
-    stations: tuple[Station, ...]
+    stations: tuple[Station, ...] = part_setting(
+        lambda: toml_files.array_schema(toml_files.section_schema(Station), 1), required=True
+    )
     noise_um: float = setting(toml_files.not_negative, 0.1)
     noise_um_per_m: float = setting(toml_files.not_negative, 0.15)
     in_turn: bool = setting(toml_files.word_for({"at-once": False, "in-turn": True}), False, key="reading")
@@ -125,12 +127,21 @@ def read_laser_tracer(section: toml_files.Section) -> LaserTracer:
 OVERRUN = 0.02
 
 
+@accepts({**toml_files.array_schema({"enum": list(AXES)}, 1), "uniqueItems": True})
 def _axes(value: Any) -> tuple[int, ...]:
     if not isinstance(value, list) or not value or not set(value) <= set(AXES) or len(set(value)) < len(value):
         raise ValueError("a list of different axes, e.g. ['X', 'Y'], is expected")
     return tuple(AXES.index(letter) for letter in value)
 
 
+@accepts(
+    {
+        "anyOf": [
+            toml_files.accepted(toml_files.positive),
+            toml_files.array_schema(toml_files.accepted(toml_files.positive)),
+        ]
+    }
+)
 def _dwells(value: Any) -> float | tuple[float, ...]:
     return tuple(toml_files.positive(item) for item in value) if isinstance(value, list) else toml_files.positive(value)
 
@@ -258,6 +269,7 @@ def read_axis_laser(section: toml_files.Section) -> AxisLaser:
 # A simulated laser along diagonals of the travel (ISO 230-6): ``*.diagonals.csv``.
 
 
+@accepts({**toml_files.array_schema({"enum": list(DIAGONALS)}, 1), "uniqueItems": True})
 def _names(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list) or not value or not set(value) <= set(DIAGONALS) or len(set(value)) < len(value):
         raise ValueError(f"a list of different diagonals is expected, of {', '.join(DIAGONALS)}")

@@ -11,7 +11,7 @@ import inspect
 import re
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,10 +29,19 @@ from compgen.data.machine import Machine
 from compgen.data.names import SECONDS_PER_MIN
 from compgen.data.records import ARCHIVE
 from compgen.data.registry import call_problem
+from compgen.data.toml_files import part_setting, setting
 from compgen.errors import InputError
 from compgen.instruments.sixdof_readings import SixDof, format_sixdof
 from compgen.kinematics.exact_chain import tip_position
-from compgen.simulate.effects import Effect, LengthEffect, RunEffect, Sights, SimulatedEffect, read_effects
+from compgen.simulate.effects import (
+    Effect,
+    LengthEffect,
+    RunEffect,
+    Sights,
+    SimulatedEffect,
+    effects_schema,
+    read_effects,
+)
 from compgen.simulate.lasers import (
     AxisLaser,
     DiagonalLaser,
@@ -57,7 +66,15 @@ from compgen.simulate.trajectory import (
     read_trajectory,
     with_temperatures,
 )
-from compgen.simulate.truth import RandomErrors, TruthPlan, child_seeds, draw_truth, random_stream, read_truth_plan
+from compgen.simulate.truth import (
+    RandomErrors,
+    TruthPlan,
+    child_seeds,
+    draw_truth,
+    random_stream,
+    read_truth_plan,
+    truth_schema,
+)
 
 # What an effect or an instrument of a plug-in must be; said when it is registered.
 
@@ -128,19 +145,54 @@ INSTRUMENTS: dict[str, Callable[[toml_files.Section], AnyInstrument]] = {
 }
 
 
+@toml_files.accepts({"type": "string", "pattern": r"^[A-Za-z0-9][A-Za-z0-9._-]{0,80}$"})
+def _file_name(value: Any) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,80}", value):
+        raise ValueError("a file name of letters, digits, '.', '_' and '-' without an ending is expected")
+    return value
+
+
+def _instruments_schema() -> dict[str, Any]:
+    """The instruments by their ``type``; the class that a reader says it returns declares the keys."""
+    found = []
+    for name, reader in INSTRUMENTS.items():
+        made, kind = typing.get_type_hints(reader).get("return"), {"const": name, "required": True}
+        if (
+            isinstance(made, type)
+            and is_dataclass(made)
+            and any({"check", "part"} & set(item.metadata) for item in fields(made))
+        ):
+            found.append(toml_files.section_schema(made, type=kind))
+        else:  # a plug-in that reads key by key
+            found.append({"type": "object", "required": ["type"], "properties": {"type": {"const": name}}})
+    return {"oneOf": found}
+
+
 @dataclass(frozen=True, repr=False)
 class Scenario(Displayed):
     """A simulated measurement; ``name`` begins the names of its files, ``seed`` starts every random number."""
 
-    instrument: AnyInstrument
-    seed: int
-    name: str = "simulated"
-    errors: TruthPlan = field(default_factory=lambda: TruthPlan(random=RandomErrors()))
-    trajectory: Trajectory = field(default_factory=Trajectory)
+    instrument: AnyInstrument = part_setting(lambda: _instruments_schema(), required=True, meaning="what measures")
+    seed: int = setting(toml_files.whole(0), meaning="starts every random number")
+    name: str = setting(_file_name, "simulated", meaning="begins the names of the files")
+    errors: TruthPlan = part_setting(
+        truth_schema, factory=lambda: TruthPlan(random=RandomErrors()), meaning="the true errors of the machine"
+    )
+    trajectory: Trajectory = part_setting(
+        lambda: toml_files.section_schema(Trajectory), factory=Trajectory, meaning="the points that are visited"
+    )
     source: Path | None = None
-    effects: tuple[SimulatedEffect, ...] = ()
-    session: Session | None = None
-    temperatures: Mapping[str, Temperature] = field(default_factory=dict)
+    effects: tuple[SimulatedEffect, ...] = part_setting(
+        effects_schema, (), meaning="what acts besides the geometric errors"
+    )
+    session: Session | None = part_setting(
+        lambda: toml_files.section_schema(Session), None, meaning="how often the lines are run, and how"
+    )
+    temperatures: Mapping[str, Temperature] = part_setting(
+        lambda: {"type": "object", "additionalProperties": toml_files.section_schema(Temperature)},
+        factory=dict,
+        meaning="temperatures by channel; the column is temp_NAME_c",
+    )
 
     def overview(self) -> Overview:
         """Name, seed, instrument, and the number of effects."""
@@ -163,17 +215,18 @@ def read_scenario(path: str | Path) -> Scenario:
     >>> scenario.name, scenario.seed
     ('zha-gantry', 190)
     """
-    root = toml_files.read_toml(path)
-    source = Path(path)
-    name = root.take("name", _file_name, "simulated")
-    seed = root.take("seed", toml_files.whole(0))
+    return scenario_of(toml_files.read_toml(path), Path(path))
+
+
+def scenario_of(root: toml_files.Section, source: Path) -> Scenario:
+    """Read the root of a scenario TOML as :func:`read_scenario` does."""
+    stated = toml_files.stated_settings(Scenario, root)
     errors = read_truth_plan(root.section("errors", required=False), source.parent)
     instrument = root.section("instrument")
     kind = instrument.take("type", toml_files.choice(*INSTRUMENTS))
     scenario = Scenario(
         instrument=INSTRUMENTS[kind](instrument),
-        seed=seed,
-        name=name,
+        **stated,
         errors=errors,
         trajectory=read_trajectory(root.section("trajectory", required=False)),
         source=source,
@@ -195,12 +248,6 @@ def read_scenario(path: str | Path) -> Scenario:
         if key in root.data:
             raise root.fail(key, f"belongs to other instruments; {text}")
     return scenario
-
-
-def _file_name(value: Any) -> str:
-    if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,80}", value):
-        raise ValueError("a file name of letters, digits, '.', '_' and '-' without an ending is expected")
-    return value
 
 
 # Run a scenario on a virtual machine: true errors -> tips -> readings -> files.

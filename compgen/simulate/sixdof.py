@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine, Vector3
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.toml_files import setting
+from compgen.data.toml_files import part_setting, setting
 from compgen.errors import InputError
 from compgen.instruments.sixdof_instrument import (
     DIRECTIONS,
@@ -26,6 +26,7 @@ from compgen.instruments.sixdof_instrument import (
     known_systematics,
     read_instrument,
     read_systematics,
+    systematics_schema,
 )
 from compgen.instruments.sixdof_readings import SixDof
 from compgen.instruments.sixdof_reduction import expected_away
@@ -376,6 +377,30 @@ _UNITS = np.array([MM_PER_UM] * 3 + [RAD_PER_ARCSEC] * 3)
 _NOISE = {"displacement_um": (0,), "qd_um": (1, 2, 3, 4), "psd_um": (5, 6)}
 
 
+#: Keys of positions that are equally spaced.
+_SPAN = ("from", "to", "step")
+
+
+@toml_files.accepts(
+    {
+        "anyOf": [
+            toml_files.accepted(toml_files.ascending),
+            toml_files.table_schema(dict.fromkeys(_SPAN, toml_files.accepted(toml_files.number)), _SPAN),
+        ]
+    }
+)
+def _positions(value: Any) -> tuple[float, ...]:
+    """Target positions: a list, or a table with from, to and step."""
+    if not isinstance(value, dict):
+        return toml_files.ascending(value)
+    if set(value) != set(_SPAN):
+        raise ValueError("a list of positions, or { from = .., to = .., step = .. }, is expected")
+    low, high, step = (toml_files.number(value[key]) for key in _SPAN)
+    if not (high > low and step > 0 and (high - low) / step < 10000):
+        raise ValueError("from below to, and a step above zero, are expected")
+    return tuple((low + step * np.arange(int(np.floor((high - low) / step + 1e-9)) + 1)).tolist())
+
+
 @dataclass(frozen=True)
 class SimulatedSixDof:
     """How the axes are measured.
@@ -394,13 +419,20 @@ class SimulatedSixDof:
     seconds : time between readings.
     """
 
-    instrument: SixDofInstrument
-    uncalibrated: Mapping[str, float] = field(default_factory=dict)
+    instrument: SixDofInstrument = part_setting(
+        lambda: toml_files.accepted(toml_files.text_of_path), key="file", required=True, meaning="the instrument file"
+    )
+    uncalibrated: Mapping[str, float] = part_setting(lambda: systematics_schema(), factory=dict)
     runs: int = setting(toml_files.whole(1, 100), 3)
     there_and_back: bool = setting(toml_files.flag, False)
-    positions_mm: tuple[FloatArray | None, FloatArray | None, FloatArray | None] = (None, None, None)
-    scatter: FloatArray = field(default_factory=lambda: np.zeros((3, 6)))
-    noise_mm: FloatArray = field(default_factory=lambda: np.zeros(9))
+    positions_mm: tuple[FloatArray | None, FloatArray | None, FloatArray | None] = part_setting(
+        lambda: toml_files.table_schema(dict.fromkeys(AXES, toml_files.accepted(_positions))), (None, None, None)
+    )
+    scatter: FloatArray = part_setting(
+        lambda: {"anyOf": [{"const": "table3"}, toml_files.table_schema(dict.fromkeys(AXES, _sizes_schema(_KEYS)))]},
+        factory=lambda: np.zeros((3, 6)),
+    )
+    noise_mm: FloatArray = part_setting(lambda: _sizes_schema(_NOISE), factory=lambda: np.zeros(9), key="noise")
     drift_rad: float = setting(toml_files.not_negative, 0.0, key="drift_arcsec_per_reading", unit=RAD_PER_ARCSEC)
     reversal_mm: Vector3 = setting(toml_files.vector3, (0.0, 0.0, 0.0), key="reversal_um", unit=MM_PER_UM)
     seconds: float = setting(toml_files.positive, 5.0, key="seconds_per_reading")
@@ -500,16 +532,8 @@ def read_sixdof_measurement(section: toml_files.Section) -> SimulatedSixDof:
     return measurement
 
 
-def _positions(value: Any) -> tuple[float, ...]:
-    """Target positions: a list, or a table with from, to and step."""
-    if not isinstance(value, dict):
-        return toml_files.ascending(value)
-    if set(value) != {"from", "to", "step"}:
-        raise ValueError("a list of positions, or { from = .., to = .., step = .. }, is expected")
-    low, high, step = (toml_files.number(value[key]) for key in ("from", "to", "step"))
-    if not (high > low and step > 0 and (high - low) / step < 10000):
-        raise ValueError("from below to, and a step above zero, are expected")
-    return tuple((low + step * np.arange(int(np.floor((high - low) / step + 1e-9)) + 1)).tolist())
+def _sizes_schema(keys: Iterable[str]) -> dict[str, Any]:
+    return toml_files.table_schema(dict.fromkeys(keys, toml_files.accepted(toml_files.not_negative)))
 
 
 def _noise(section: toml_files.Section, instrument: SixDofInstrument) -> FloatArray:

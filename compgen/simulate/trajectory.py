@@ -19,7 +19,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine, Vector3
 from compgen.data.names import AXES, SECONDS_PER_HOUR, SECONDS_PER_MIN
 from compgen.data.records import approach_of
-from compgen.data.toml_files import setting
+from compgen.data.toml_files import part_setting, setting
 from compgen.errors import InputError
 from compgen.simulate.truth import counts
 
@@ -41,6 +41,7 @@ class Line:
     points: int = setting(toml_files.whole(2))
 
 
+@toml_files.accepts(toml_files.accepted(toml_files.vectors3))
 def _tools(value: Any) -> tuple[Vector3, ...]:
     tools = toml_files.vectors3(value)
     if len(set(tools)) != len(tools):
@@ -64,10 +65,13 @@ class Trajectory:
     start_mm : where the machine comes from; default the machine's reference point.
     """
 
-    kind: str = "grid"
-    counts: tuple[int, int, int] | None = None
-    levels_mm: tuple[FloatArray | None, FloatArray | None, FloatArray | None] = (None, None, None)
-    lines: tuple[Line, ...] = ()
+    kind: str = part_setting(lambda: {"enum": [*BLOCKS, "lines"], "default": "grid"}, "grid", key="type")
+    counts: tuple[int, int, int] | None = setting(counts, None, key="levels")
+    levels_mm: tuple[FloatArray | None, FloatArray | None, FloatArray | None] = part_setting(
+        {f"{axis.lower()}_mm": toml_files.array_schema(toml_files.accepted(toml_files.number), 1) for axis in AXES},
+        (None, None, None),
+    )
+    lines: tuple[Line, ...] = part_setting(lambda: toml_files.array_schema(toml_files.section_schema(Line), 1), ())
     there_and_back: bool = setting(toml_files.word_for({"there-and-back": True, "once": False}), True, key="runs")
     tools_mm: tuple[Vector3, ...] = setting(_tools, ())
     feed_mm_min: float = setting(toml_files.positive, 1000.0)
@@ -269,6 +273,7 @@ LEAD_IN = 0.05
 
 
 def _different(check: Callable[[Any], float]) -> Callable[[Any], tuple[float, ...]]:
+    @toml_files.accepts({**toml_files.array_schema(toml_files.accepted(check), 1), "uniqueItems": True})
     def conditions(value: Any) -> tuple[float, ...]:
         items = tuple(toml_files.not_negative(item) for item in toml_files.numbers(value))
         if not items or len(set(items)) != len(items):

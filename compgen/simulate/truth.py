@@ -30,6 +30,7 @@ HARMONICS = 3
 PeakRange = tuple[float, float]
 
 
+@toml_files.accepts({**toml_files.array_schema(toml_files.accepted(toml_files.not_negative), 2), "maxItems": 2})
 def _peak_range(value: Any) -> PeakRange:
     items = toml_files.numbers(value)
     if len(items) != 2 or not 0 <= items[0] <= items[1]:
@@ -37,17 +38,28 @@ def _peak_range(value: Any) -> PeakRange:
     return items[0], items[1]
 
 
+_COUNT = toml_files.whole(2, 10001)
+
+
+@toml_files.accepts(
+    {
+        "anyOf": [
+            toml_files.accepted(_COUNT),
+            {**toml_files.array_schema(toml_files.accepted(_COUNT), 3), "maxItems": 3},
+        ]
+    }
+)
 def counts(value: Any) -> tuple[int, int, int]:
     """One whole number for all three axes, or three for X, Y and Z, each at least 2 (a check for TOML values)."""
     items = value if isinstance(value, list) else [value] * 3
     if len(items) != 3:
         raise ValueError("a whole number, or three for X, Y and Z, is expected")
-    x, y, z = (toml_files.whole(2, 10001)(item) for item in items)
+    x, y, z = (_COUNT(item) for item in items)
     return x, y, z
 
 
-def _peak(key: str, unit: float) -> Any:
-    return toml_files.setting(_peak_range, (10 * unit, 30 * unit), key=key, unit=unit)
+def _peak(key: str, unit: float, meaning: str) -> Any:
+    return toml_files.setting(_peak_range, key=key, unit=unit, stated=[10.0, 30.0], meaning=meaning)
 
 
 @dataclass(frozen=True)
@@ -57,9 +69,15 @@ class RandomErrors:
     ``nodes`` gives the number of nodes of the curves on X, Y, Z; None takes the machine's nodes.
     """
 
-    linear_peak_mm: PeakRange = _peak("linear_peak_um", MM_PER_UM)
-    angular_peak_rad: PeakRange = _peak("angular_peak_urad", RAD_PER_URAD)
-    squareness_peak_rad: PeakRange = _peak("squareness_peak_urad", RAD_PER_URAD)
+    linear_peak_mm: PeakRange = _peak(
+        "linear_peak_um", MM_PER_UM, "smallest and largest peak of drawn linear errors, um"
+    )
+    angular_peak_rad: PeakRange = _peak(
+        "angular_peak_urad", RAD_PER_URAD, "smallest and largest peak of drawn angular errors, urad"
+    )
+    squareness_peak_rad: PeakRange = _peak(
+        "squareness_peak_urad", RAD_PER_URAD, "smallest and largest peak of drawn squareness errors, urad"
+    )
     nodes: tuple[int, int, int] | None = toml_files.setting(counts, None)
 
 
@@ -75,6 +93,32 @@ class TruthPlan:
 
     given: ErrorTable = field(default_factory=ErrorTable)
     random: RandomErrors | None = None
+
+
+def truth_schema() -> dict[str, Any]:
+    """Return the JSON schema of the ``[errors]`` section of a scenario."""
+    values = toml_files.accepted(toml_files.numbers)
+    curve = {
+        "name": toml_files.accepted(_curve_name),
+        "position_mm": toml_files.accepted(toml_files.ascending),
+        "value_um": values,
+        "value_urad": values,
+    }
+    either = {"oneOf": [{"required": ["value_um"]}, {"required": ["value_urad"]}]}
+    angles = dict.fromkeys(SQUARENESS_NAMES, toml_files.accepted(toml_files.number))
+    return toml_files.section_schema(
+        RandomErrors,
+        file={**toml_files.accepted(toml_files.text), "description": "*.errors.csv with the true errors"},
+        random={
+            **toml_files.accepted(toml_files.flag),
+            "description": "draw what is not given; by default without a file",
+        },
+        curve={
+            **toml_files.array_schema({**toml_files.table_schema(curve, ["name", "position_mm"]), **either}),
+            "description": "error curves that are given",
+        },
+        squareness_urad={**toml_files.table_schema(angles), "description": "squareness errors that are given, urad"},
+    )
 
 
 def read_truth_plan(section: toml_files.Section, folder: Path) -> TruthPlan:
@@ -117,6 +161,7 @@ def _read_curve(entry: toml_files.Section, error: ErrorName) -> Curve:
     return Curve(position_mm, value * error.si_per_unit, np.full(len(value), np.nan))
 
 
+@toml_files.accepts({"enum": list(CURVE_NAMES)})
 def _curve_name(value: Any) -> str:
     if value in SQUARENESS_NAMES:
         raise ValueError("a squareness error is a constant; it belongs in [errors.squareness_urad]")

@@ -14,7 +14,6 @@ from compgen.controls import CONTROLLERS, AnyController, SourceFile, Term, contr
 from compgen.controls.shared.base import Usage
 from compgen.controls.shared.grids import curve_nodes_mm
 from compgen.controls.shared.terms import error_terms, one_dimensional_terms, product_terms
-from compgen.data import toml_files
 from compgen.data.comparison import Residuals, residuals_twice
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
@@ -440,8 +439,7 @@ def _variants(machine: Machine, name: str) -> list[tuple[ControlResult, Machine]
 def _with_settings(machine: Machine, name: str, changes: Mapping[str, Any]) -> Machine:
     section = machine.controller_settings(name)
     data = {**section.data, **changes}
-    changed = toml_files.Section(data, path=section.path, text=section.text, name=section.name)
-    return replace(machine, controllers={**machine.controllers, name: changed})
+    return replace(machine, controllers={**machine.controllers, name: section.again(data)})
 
 
 def _control_result(

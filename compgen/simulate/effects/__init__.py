@@ -7,6 +7,7 @@ from compgen.simulate.effects.forward import (
     RunEffect,
     Sights,
     SimulatedEffect,
+    effects_schema,
     read_effects,
 )
 
@@ -21,5 +22,6 @@ __all__ = [
     "RunEffect",
     "Sights",
     "SimulatedEffect",
+    "effects_schema",
     "read_effects",
 ]

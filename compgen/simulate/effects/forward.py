@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,8 @@ from compgen.data.machine import Machine
 from compgen.data.messages import nearest
 from compgen.data.names import AXES, ERROR_INDEX, SECONDS_PER_MIN, error_named
 from compgen.data.registry import Registry, call_problem, why_missing
-from compgen.effects import DisplacementEffect, Effect, catalogue, listed, readings_of_points
-from compgen.effects.active import STATION_NAME, dead_path_stations, read_values
+from compgen.effects import ANY_STATION, DisplacementEffect, Effect, catalogue, listed, readings_of_points
+from compgen.effects.active import STATION_NAME, dead_path_stations, keys_schema, read_values, station_pattern
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import tip_position
 from compgen.simulate.trajectory import Stops
@@ -481,6 +482,23 @@ STATION_EFFECTS = {"station_drift": station_drift, "length_step": length_step, "
 SimulatedEffect = Displacement | LengthEffect | RunEffect
 #: Reader of a section ``[[effects]]`` of a scenario by its ``name``; plug-ins add to it.
 EFFECTS = Registry()
+
+
+def effects_schema() -> dict[str, Any]:
+    """Return the JSON schema of the sections ``[[effects]]`` of a scenario."""
+    known = {name: effect for name, effect in listed().items() if effect.card.parameters}
+    names = [
+        {"pattern": station_pattern(name)} if ANY_STATION in name else {"const": name} for name in (*EFFECTS, *known)
+    ]
+    rules = [
+        {
+            "if": {"required": ["name"], "properties": {"name": which}},
+            "then": keys_schema(known[name], name={"type": "string"}) if name in known else {},
+        }
+        for name, which in zip((*EFFECTS, *known), names, strict=True)
+    ]
+    one = {"type": "object", "required": ["name"], "properties": {"name": {"type": "string", "anyOf": names}}}
+    return toml_files.array_schema({**one, "allOf": rules})
 
 
 def read_effects(sections: list[toml_files.Section]) -> tuple[SimulatedEffect, ...]:
