@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable
 from compgen.data.files import FOLDERS, read_bytes, working_folder
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine, load_machine
@@ -43,7 +44,7 @@ from compgen.fleet.records import (
 from compgen.fleet.store import Store
 from compgen.identify import IdentifyOptions, joint_covariance
 from compgen.identify.covariance import FILE_NAME as COVARIANCE
-from compgen.identify.covariance import covariance_or_independent
+from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.pipeline import RunResult, identified_reversal, run
 from compgen.tables import ReadTables, parse_tables, program_version, read_tables, verify
 from compgen.tables.active import ActiveTables
@@ -69,12 +70,73 @@ class Judgement:
 
 
 @dataclass(frozen=True)
+class Past:
+    """What the store knows about a machine: decisions, tables with figures, measurements, events; all of them."""
+
+    decisions: Sequence[DecisionRecord]
+    tables: Sequence[TableRecord]
+    measurements: Sequence[MeasurementRecord]
+    events: Sequence[EventRecord]
+
+    @property
+    def swaps(self) -> list[DecisionRecord]:
+        """Decisions that changed the active tables, since the folder was given to this store."""
+        return [item for item in self.decisions if AFTER[item.kind] == "active" and item.at >= self._since]
+
+    @property
+    def stated(self) -> str | None:
+        """What a file or a person said last of the tables that were on, since the folder was given to this store."""
+        said = [(item.received_at, item.active_table) for item in self.measurements if item.active_table is not None]
+        said += [(item.at, str(item.summary[STATED])) for item in self.tables if STATED in item.summary]
+        return max((item for item in said if item[0] >= self._since), default=(None, None))[1]
+
+    @property
+    def _since(self) -> datetime:
+        adopted = [item.at for item in self.events if item.kind == ADOPTED]
+        return max(adopted, default=datetime.min.replace(tzinfo=UTC))
+
+
+@dataclass(frozen=True)
+class Case:
+    """One measurement to be judged: how its machine is recalibrated, what the store knows of it, and the time now.
+
+    ``said`` is what a person or the file says of the tables that were on while it was made, None if neither does;
+    ``taken`` are the tables whose effect is taken out of the readings, None if none were on.
+    """
+
+    store: Store
+    job: MachineJob
+    record: MachineRecord
+    machine: Machine
+    measurement: MeasurementRecord
+    past: Past
+    now: datetime
+    said: str | None
+    taken: TableRecord | None
+
+    @property
+    def version_taken(self) -> int | None:
+        """Version of the tables whose effect is taken out."""
+        return None if self.taken is None else self.taken.version
+
+
+@dataclass(frozen=True)
 class ActiveState:
     """The tables that are active now: parsed by control, their version, and the errors that they were made from."""
 
     version: int
     tables: Mapping[str, ReadTables]
     identification: IdentificationRecord
+
+    @classmethod
+    def of(cls, case: Case) -> ActiveState | None:
+        """Return those of the machine of a case, None if no tables are active."""
+        on = active_of(case.past.tables)
+        if on is None:
+            return None
+        read = {control: _tables_read(case.store, case.machine, on, control) for control in on.controllers}
+        known = {control: found for control, found in read.items() if found is not None}
+        return cls(on.version, known, case.store.identification(on.identification_id))
 
 
 def judge_measurement(
@@ -110,14 +172,12 @@ def judge_misfit(judgement: Judgement, result: RunResult) -> None:
             judgement.reservations.append(f"{RESERVATION}{found.controller}: {found.headline}")
 
 
-def judge_order(
-    judgement: Judgement, store: Store, measurement: MeasurementRecord, tables: Sequence[TableRecord]
-) -> None:
+def judge_order(judgement: Judgement, case: Case) -> None:
     """Hold what was measured before a proposal that waits, so that it does not take that proposal's place."""
-    for table in tables:
+    for table in case.past.tables:
         if table.state == "pending":
-            made = store.identification(table.identification_id).measured_at
-            if measurement.measured_at < made:
+            made = case.store.identification(table.identification_id).measured_at
+            if case.measurement.measured_at < made:
                 judgement.hold.append(
                     f"version {table.version}, which waits, comes from a newer measurement ({_day(made)})"
                 )
@@ -126,41 +186,13 @@ def judge_order(
 # --- which tables were on while the machine was measured --------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Past:
-    """What the store knows about a machine: decisions, tables with figures, measurements, events; all of them."""
-
-    decisions: Sequence[DecisionRecord]
-    tables: Sequence[TableRecord]
-    measurements: Sequence[MeasurementRecord]
-    events: Sequence[EventRecord]
-
-    @property
-    def swaps(self) -> list[DecisionRecord]:
-        """Decisions that changed the active tables, since the folder was given to this store."""
-        return [item for item in self.decisions if AFTER[item.kind] == "active" and item.at >= self._since]
-
-    @property
-    def stated(self) -> str | None:
-        """What a file or a person said last of the tables that were on, since the folder was given to this store."""
-        said = [(item.received_at, item.active_table) for item in self.measurements if item.active_table is not None]
-        said += [(item.at, str(item.summary[STATED])) for item in self.tables if STATED in item.summary]
-        return max((item for item in said if item[0] >= self._since), default=(None, None))[1]
-
-    @property
-    def _since(self) -> datetime:
-        adopted = [item.at for item in self.events if item.kind == ADOPTED]
-        return max(adopted, default=datetime.min.replace(tzinfo=UTC))
-
-
-def judge_assumption(
-    judgement: Judgement, job: MachineJob, measurement: MeasurementRecord, past: Past, now: datetime, taken: int | None
-) -> None:
-    """Hold where the time of the measurement does not say which tables were on; ``taken`` is the version taken out.
+def judge_assumption(judgement: Judgement, case: Case) -> None:
+    """Hold where the time of the measurement does not say which tables were on.
 
     Only for a measurement that does not say it itself, of a machine that is measured with its tables on. A wrong
     assumption goes into the errors in full: the new tables then undo the compensation, or apply it twice.
     """
+    job, measurement, past, taken = case.job, case.measurement, case.past, case.version_taken
     swaps, margin = past.swaps, timedelta(minutes=job.policy.clock_minutes)
     if not swaps:
         said = past.stated
@@ -188,7 +220,7 @@ def judge_assumption(
                 f"it was measured {away:.0f} min from the decision of {_day(swap.at)} that changed the active tables; "
                 f"{job.policy.clock_minutes:g} min are required, because clocks differ"
             )
-        elif inside and _doubtful(swap, past, now):
+        elif inside and _doubtful(swap, past, case.now):
             doubts.append(f"the clock went back, so the time of the decision of {_day(swap.at)} is not certain")
     if doubts:
         judgement.hold.append(
@@ -231,37 +263,30 @@ def _seen(event: EventRecord) -> datetime:
         return event.at
 
 
-def judge_likeness(
-    judgement: Judgement,
-    store: Store,
-    about: tuple[MachineJob, Machine, MeasurementRecord],
-    result: RunResult,
-    past: Past,
-    taken: int | None,
-) -> None:
+def judge_likeness(judgement: Judgement, case: Case, result: RunResult) -> None:
     """Hold where the machine seems to have changed by what some tables add, or by the opposite.
 
     The change is that against the errors behind the active tables, or behind the last ones that were; it is compared with
-    what each version adds that is or was active. ``taken`` is the version that was taken out of the readings.
+    what each version adds that is or was active.
     """
-    job, machine, measurement = about
-    were_active, last = _were_active(store, job, machine, past)
+    machine, taken = case.machine, case.version_taken
+    were_active, last = _were_active(case)
     if last is None:
         return
-    identified, old_errors = result.identification, store.errors_of(last)
-    if not set(old_errors.names) <= set(identified.errors.names):
+    old_errors = case.store.errors_of(last)
+    if not set(old_errors.names) <= set(result.identification.errors.names):
         return  # held for that; a part of the errors has no field to compare
     points = Points(volume_points(machine))
     adds = {version: _added(machine, tables, points) for version, tables in were_active.items()}
     added = {f"version {version}": field for version, field in adds.items()}
-    order, now = list(adds), active_of(past.tables)
-    active = None if now is None else now.version
+    order, on = list(adds), active_of(case.past.tables)
+    active = None if on is None else on.version
     if taken in adds:  # the clock may be late: a later version was on already
         later = order[order.index(taken) + 1 :]
         added |= {f"version {version} in place of version {taken}": adds[version] - adds[taken] for version in later}
     missing = {f"version {version}": adds[version] for version in order if version in (taken, active)}
-    new = (identified.errors, joint_covariance(identified) if identified.has_covariance else None)
-    found = likeness(machine, new, (old_errors, store.covariance_of(last)), added, missing)
+    old = (old_errors, case.store.covariance_of(last))
+    found = likeness(machine, _identified(result), old, added, missing)
     if found is None:
         return
     judgement.figures["likeness"] = found.summary()
@@ -271,24 +296,24 @@ def judge_likeness(
     judgement.hold.append(
         f"the machine seems to have changed by {what} {found.field} adds ({found.words()}): as if {found.field} {seems} "
         f"while the machine was measured, but {was} taken out; "
-        f"{how_to_state(job.name, measurement, version)}; if the machine has really changed, approve with --override"
+        f"{how_to_state(case.job.name, case.measurement, version)}; if the machine has really changed, approve with --override"
     )
 
 
-def _were_active(
-    store: Store, job: MachineJob, machine: Machine, past: Past
-) -> tuple[dict[int, ReadTables], IdentificationRecord | None]:
+def _were_active(case: Case) -> tuple[dict[int, ReadTables], IdentificationRecord | None]:
     """Return the tables that are or were active, by version in the order in which they became so, and the last errors."""
-    by_id = {table.id: table for table in past.tables}
-    order = [item.table_id for item in past.decisions if AFTER[item.kind] == "active" and item.table_id is not None]
+    by_id = {table.id: table for table in case.past.tables}
+    order = [
+        item.table_id for item in case.past.decisions if AFTER[item.kind] == "active" and item.table_id is not None
+    ]
     known = [by_id[key] for key in dict.fromkeys(order[::-1])][:LOOKED_BACK][::-1]
     found: dict[int, ReadTables] = {}
     for table in known:
-        control = next((name for name in job.controllers if name in table.controllers), table.controllers[0])
-        read = _tables_read(store, machine, table, control)
+        control = next((name for name in case.job.controllers if name in table.controllers), table.controllers[0])
+        read = _tables_read(case.store, case.machine, table, control)
         if read is not None:
             found[table.version] = read
-    return found, store.identification(known[-1].identification_id) if found else None
+    return found, case.store.identification(known[-1].identification_id) if found else None
 
 
 def _added(machine: Machine, tables: ReadTables, points: Points) -> FloatArray:
@@ -299,12 +324,11 @@ def _added(machine: Machine, tables: ReadTables, points: Points) -> FloatArray:
     )
 
 
-def judge_twins(
-    judgement: Judgement, store: Store, job: MachineJob, machine: MachineRecord, measurement: MeasurementRecord
-) -> None:
+def judge_twins(judgement: Judgement, case: Case) -> None:
     """Hold what came for another machine as well: readings belong to one machine."""
-    found = [f"{name} ({what})" for name, what in store.same_files_of_others(machine, measurement)]
-    contents = store.contents_of(measurement)
+    store, job = case.store, case.job
+    found = [f"{name} ({what})" for name, what in store.same_files_of_others(case.record, case.measurement)]
+    contents = store.contents_of(case.measurement)
     for other in job.others:
         if not any(text.startswith(f"{other.name} (") for text in found) and holds_one_of(other, contents.values()):
             where = "the same inbox" if other.inbox.resolve() == job.inbox.resolve() else "its inbox"
@@ -313,7 +337,7 @@ def judge_twins(
         judgement.figures["also_came_for"] = found
         judgement.hold.append(
             f"the same file also came for {', '.join(found)}; readings belong to one machine. Give each machine an inbox of "
-            "its own and remove the file from the wrong one; then reject the version of the wrong machine with `compgen "
+            "its own and remove the file from the wrong one; then reject the version of the wrong machine with `volcomp "
             "recal reject` and approve that of the right one with --override"
         )
 
@@ -351,20 +375,22 @@ def shows_all(judgement: Judgement, store: Store, result: RunResult, active: Act
     return not missing
 
 
-def judge_change(
-    judgement: Judgement, store: Store, machine: Machine, result: RunResult, active: ActiveState, policy: Policy
-) -> Change | None:
+def _identified(result: RunResult) -> tuple[ErrorTable, Covariance | None]:
+    """Return the errors of a run and their covariance, as far as it is known."""
+    found = result.identification
+    return found.errors, joint_covariance(found) if found.has_covariance else None
+
+
+def judge_change(judgement: Judgement, case: Case, result: RunResult, active: ActiveState) -> Change | None:
     """Compare with the errors behind the active tables: the change must exceed its uncertainty."""
-    identified = result.identification
-    new = covariance_or_independent(
-        identified.errors, joint_covariance(identified) if identified.has_covariance else None
-    )
-    old_errors = store.errors_of(active.identification)
-    old = covariance_or_independent(old_errors, store.covariance_of(active.identification))
+    errors, covariance = _identified(result)
+    new = covariance_or_independent(errors, covariance)
+    old_errors = case.store.errors_of(active.identification)
+    old = covariance_or_independent(old_errors, case.store.covariance_of(active.identification))
     if new is None or old is None:
         judgement.hold.append("the uncertainty of the errors is not known, so the change cannot be judged")
         return None
-    change = change_between(machine, (identified.errors, new), (old_errors, old), policy.confidence)
+    change = change_between(case.machine, (errors, new), (old_errors, old), case.job.policy.confidence)
     judgement.figures["change"] = change.summary()
     if not change.significant:
         judgement.hold.append(
@@ -486,27 +512,27 @@ def process(
     CompgenError
         for a measurement that cannot be used, or does not determine the errors.
     """
-    said = measurement.active_table if stated is None else stated
     started = time.monotonic()
     settings = job.settings_sha256()
     machine = load_machine(job.machine)
     if job.original is not None:  # as manifest and messages name it
         machine = replace(machine, source=job.original, copy=machine.source)
-    tables = store.tables(record)
-    now = store.now()
+    past = store.together(
+        lambda: Past(store.decisions(record), store.tables(record), store.measurements(record), store.events(record))
+    )
+    said = measurement.active_table if stated is None else stated
+    taken = _active_then(job, measurement, past, said)
+    case = Case(store, job, record, machine, measurement, past, store.now(), said, taken)
     with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
-        paths = write_files(Path(folder) / "measurement", store.contents_of(measurement))
-        past = Past(store.decisions(record), tables, store.measurements(record), store.events(record))
-        measured = _active_then(job, measurement, past, said)
-        was_active = None if measured is None else _tables_read(store, machine, measured, job.controllers[0])
-        if measured is not None and was_active is None:
-            holds = f"version {measured.version} was active, but holds no tables of {job.controllers[0]}"
+        was_active = None if taken is None else _tables_read(store, machine, taken, job.controllers[0])
+        if taken is not None and was_active is None:
+            holds = f"version {taken.version} was active, but holds no tables of {job.controllers[0]}"
             raise InputError(f"{holds}; is the control right?")
         outcome = run(
             machine,
-            paths,
+            write_files(Path(folder) / "measurement", store.contents_of(measurement)),
             job.controllers,
             Path(folder) / "out",
             identify_options=IdentifyOptions(**job.identify),
@@ -517,33 +543,18 @@ def process(
             limits=SafetyLimits(job.policy.max_step_um),
             allow_misfit=True,  # a misfit that refuses the tables of `run` holds them back here: judge_misfit
         )
-        on = active_of(tables)
-        active = None
-        if on is not None:
-            read = {control: _tables_read(store, machine, on, control) for control in on.controllers}
-            known = {control: found for control, found in read.items() if found is not None}
-            active = ActiveState(on.version, known, store.identification(on.identification_id))
-        judgement = _judged(store, job, machine, measurement, (outcome, active, now))
-        judge_order(judgement, store, measurement, tables)
-        taken = None if measured is None else measured.version
-        if said is not None:
-            judgement.figures[STATED] = said
-        elif job.measured_with == "active":
-            judge_assumption(judgement, job, measurement, past, now, taken)
-        if outcome.accepted:
-            judge_likeness(judgement, store, (job, machine, measurement), outcome, past, taken)
-        judge_twins(judgement, store, job, record, measurement)
+        judgement = _judged(case, outcome)
         told = [str(item.message) for item in caught if issubclass(item.category, CompgenWarning)]
         judgement.figures["warnings"] = [without_folder(text) for text in told]
-        files = _tables_of(outcome, Path(folder) / "out")
-        result = _result(Path(folder) / "out", machine, outcome, files, judgement)
+        result = _result(Path(folder) / "out", machine, outcome, judgement)
     kept = NewResult(
         **result,
-        active_table_id=None if measured is None else measured.id,
+        active_table_id=None if taken is None else taken.id,
         approve=job.approval == "auto",
         settings_sha256=settings,
         seconds=time.monotonic() - started,
     )
+    on = active_of(past.tables)
     return Processed(kept, None if on is None else on.id)
 
 
@@ -598,55 +609,50 @@ def _tables_read(store: Store, machine: Machine, table: TableRecord, control: st
 # --- judgement -----------------------------------------------------------------------------------------------------
 
 
-def _judged(
-    store: Store,
-    job: MachineJob,
-    machine: Machine,
-    measurement: MeasurementRecord,
-    state: tuple[RunResult, ActiveState | None, datetime],
-) -> Judgement:
-    result, active, now = state
-    judgement = Judgement()
+def _judged(case: Case, result: RunResult) -> Judgement:
+    """Look at all rules, in the order in which a person reads their reasons."""
+    judgement, active, policy = Judgement(), ActiveState.of(case), case.job.policy
     latest = None if active is None else active.identification.measured_at
-    judge_measurement(judgement, job.policy, measurement, now, latest)
+    judge_measurement(judgement, policy, case.measurement, case.now, latest)
     new: dict[str, ReadTables] = {}
     for item in result.results:
         if item.verification.accepted:
             control = item.verification.controller
             names = {path.name: path for path in item.paths}
-            new[control] = read_tables(machine, [names[Path(name).name] for name in item.export.files], control)
-    if active is not None and result.accepted and shows_all(judgement, store, result, active):
-        judge_change(judgement, store, machine, result, active, job.policy)
-        judge_tables(judgement, machine, result, new, active)
+            new[control] = read_tables(case.machine, [names[Path(name).name] for name in item.export.files], control)
+    if active is not None and result.accepted and shows_all(judgement, case.store, result, active):
+        judge_change(judgement, case, result, active)
+        judge_tables(judgement, case.machine, result, new, active)
     if result.accepted:
-        apply_limits(judgement, machine, new, {} if active is None else active.tables, job.policy)
+        apply_limits(judgement, case.machine, new, {} if active is None else active.tables, policy)
     judge_misfit(judgement, result)
     judgement.figures["active_version"] = None if active is None else active.version
     judgement.figures["result"] = {item.verification.controller: item.verification.summary() for item in result.results}
     if not result.accepted:
         reasons = [reason for item in result.results for reason in item.verification.reasons]
         judgement.hold[:0] = list(dict.fromkeys(reasons))
+    judge_order(judgement, case)
+    if case.said is not None:
+        judgement.figures[STATED] = case.said
+    elif case.job.measured_with == "active":
+        judge_assumption(judgement, case)
+    if result.accepted:
+        judge_likeness(judgement, case, result)
+    judge_twins(judgement, case)
     return judgement
 
 
-def _tables_of(result: RunResult, folder: Path) -> list[StoredTableFile]:
-    """Return the files of every control by their names below the control's own folder."""
-    files = []
-    for item in result.results:
+def _result(folder: Path, machine: Machine, outcome: RunResult, judgement: Judgement) -> dict[str, Any]:
+    """Return the fields of a :class:`NewResult` that come from the chain, whose files are in ``folder``."""
+    judgement.figures["tables"] = {item.verification.controller: list(item.export.files) for item in outcome.results}
+    files: list[StoredTableFile] = []  # of every control, by their names below the control's own folder
+    for item in outcome.results:
         control = item.verification.controller
-        root = folder / control if len(result.results) > 1 else folder
+        root = folder / control if len(outcome.results) > 1 else folder
         names = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
         files += [
             StoredTableFile(control, name, read_bytes(root / name)) for name in names if name not in NOT_OF_A_CONTROL
         ]
-    return files
-
-
-def _result(
-    folder: Path, machine: Machine, outcome: RunResult, files: Sequence[StoredTableFile], judgement: Judgement
-) -> dict[str, Any]:
-    """Return the fields of a :class:`NewResult` that come from the chain."""
-    judgement.figures["tables"] = {item.verification.controller: list(item.export.files) for item in outcome.results}
     covariance = folder / COVARIANCE
     assert machine.file is not None
     return {
