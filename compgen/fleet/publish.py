@@ -449,7 +449,6 @@ def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list
 
 def untold(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any]]]:
     """Return what should be told and was not yet, oldest first, by a name that stays."""
-    known, since = _told(store, machine), (store.now() - OLDEST).isoformat()
     every, decisions, attempts = store.together(
         lambda: (store.tables(machine, figures=False), store.decisions(machine), store.attempts(machine))
     )
@@ -471,6 +470,7 @@ def untold(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, An
         if attempt.outcome == "failed":
             message = {"machine": machine.name, "event": "failed", "reason": attempt.message}
             found.append((f"attempt {attempt.id}", {**message, "at": attempt.at.isoformat()}))
+    known, since = _told(store, machine), (store.now() - OLDEST).isoformat()
     fresh = [item for item in found if item[0] not in known and item[1]["at"] >= since]
     return sorted(fresh, key=lambda item: str(item[1]["at"]))
 

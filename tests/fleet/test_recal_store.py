@@ -403,7 +403,7 @@ def test_a_result_that_comes_between_two_reads_is_in_both_or_in_none(store, monk
         (found,) = overview.status(store, job)
         assert (found.measurements, found.waiting, found.active) == (1, (1,), None)
     elif read == "news":
-        assert [message["version"] for _, message in notify._news(store, machine)] == [1]
+        assert [message["version"] for _, message in notify.untold(store, machine)] == [1]
     elif read == "page":
         found = serve_history.history(store, serve_history.ErrorCache(store), machine)
         assert [table.version for table in found.tables] == [1]
