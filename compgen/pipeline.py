@@ -22,10 +22,17 @@ from compgen.data.files import OutputFolder, Provenance, sha256_of_file, working
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
+from compgen.data.stated import StatedNumbers
 from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.foreign.source import open_measurement
 from compgen.identify import Identification, IdentifyOptions, covariance
-from compgen.identify.any_measurement import Measurement, describe, evidence_files, identify_measurement
+from compgen.identify.any_measurement import (
+    Measurement,
+    MixedMeasurement,
+    describe,
+    evidence_files,
+    identify_measurement,
+)
 from compgen.identify.reversal_errors import SIGNIFICANT
 
 if TYPE_CHECKING:
@@ -269,13 +276,31 @@ def identify_bare(
     measurement: Measurement | ErrorTable,
     options: IdentifyOptions | None = None,
     active: ActiveTables | None = None,
+    reversal: ReversalCurves | None = None,
 ) -> Identification:
     """Identify the machine without the tables that were active while it was measured, if there were any.
+
+    ``reversal`` is known otherwise, and takes the place of a measured one of the same axis.
+    """
+    result = _identify_bare(machine, measurement, options, active)
+    if reversal is None:
+        return result
+    measured = {} if result.reversal_curves is None else result.reversal_curves.curves
+    return replace(result, reversal_curves=ReversalCurves({**measured, **reversal.curves}, {"machine": machine.name}))
+
+
+def _identify_bare(
+    machine: Machine,
+    measurement: Measurement | ErrorTable,
+    options: IdentifyOptions | None,
+    active: ActiveTables | None,
+) -> Identification:
+    """Identify without the tables that were active.
 
     Errors that another program identified are used as given. ``corrections["active_tables"]`` of the result says what
     was taken out.
     """
-    if active is None and not isinstance(measurement, ErrorTable):
+    if active is None and not isinstance(measurement, ErrorTable | MixedMeasurement):
         return identify_measurement(machine, measurement, options)
     from compgen.data.deviations import Deviations
     from compgen.foreign.converted import given_errors
@@ -283,6 +308,10 @@ def identify_bare(
 
     if active is None and isinstance(measurement, ErrorTable):
         return given_errors(machine, measurement)
+    if active is None and isinstance(measurement, MixedMeasurement):
+        tables_of = {name: part for name, part in measurement.parts if isinstance(part, ErrorTable)}
+        known = {name: given_errors(machine, table, whole=False) for name, table in tables_of.items()}
+        return identify_measurement(machine, measurement, options, known)
     if active is None or not isinstance(measurement, Lengths | Deviations):
         raise InputError(
             "tables that were active (--active) can be taken out of lengths and deviations only; measure anything else with "
@@ -350,6 +379,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     allow_unverified: bool = False,
     active: ActiveTables | None = None,
     instrument: str | Path | None = None,
+    stated: StatedNumbers | None = None,
     limits: SafetyLimits | None = None,
     allow_misfit: bool = False,
     progress: Progress = lambda _: None,
@@ -359,7 +389,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     Parameters
     ----------
     machine : the machine.
-    measurements : ``*.lengths.csv``, ``*.deviations.csv``, ``*.sixdof.csv`` files.
+    measurements : files of any kinds, also of errors; what they determine together is identified.
     controllers : names of the controls; with one its files are in ``folder``, with several each has its own
         sub-folder.
     folder : output folder.
@@ -368,6 +398,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     allow_unverified : export formats that no public document fully describes.
     active : tables that were active while the machine was measured; the new ones take their place.
     instrument : the instrument file of six-DOF readings.
+    stated : squareness, backlash and scales that are known without a file.
     limits : what the steps of the tables must not exceed.
     allow_misfit : residuals that are too large, or that a step or a drift explains, are a reservation, and no reason to
         refuse the tables.
@@ -403,11 +434,12 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         controller_named(name).read_settings(machine)
         tables.usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
-    measurement = open_measurement(measurements, instrument)
+    numbers = stated or StatedNumbers()
+    measurement = open_measurement(measurements, instrument, stated=numbers.errors(machine))
     provenance = provenance_of(machine.file, *measurements, instrument)
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):
-        identification = identify_bare(machine, measurement, identify_options, active)
+        identification = identify_bare(machine, measurement, identify_options, active, numbers.reversal())
     progress("fitting smooth curves")
     known = None if not identification.has_covariance else covariance.joint_covariance(identification)
     fitted = fit(machine, identification.errors, fit_options or FitOptions(), covariance=known)

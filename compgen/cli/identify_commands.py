@@ -15,11 +15,13 @@ from compgen.cli.shared_options import (
     machine_argument,
     mapper,
     measurements_argument,
+    stated_options,
 )
 from compgen.cli.terminal import progress, stdout
 from compgen.data.files import OutputFolder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
+from compgen.data.stated import StatedNumbers
 from compgen.errors import InputError
 from compgen.foreign.source import open_measurement
 from compgen.identify import IdentifyOptions
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 @machine_argument
 @measurements_argument
 @instrument_option
+@stated_options
 @out_option
 @identify_options
 @active_options("--controller")
@@ -57,6 +60,7 @@ def identify_command(
     machine: Machine,
     measurements: tuple[Path, ...],
     instrument: Path | None,
+    stated: StatedNumbers,
     out: Path,
     options: IdentifyOptions,
     active: ActiveTables | None,
@@ -89,10 +93,10 @@ def identify_command(
     OutputFolder(out)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
-        measurement = open_measurement(measurements, instrument)
+        measurement = open_measurement(measurements, instrument, stated=stated.errors(machine))
         show(f"identifying: {describe(measurement)}")
         with failure_reported(out):
-            result = identify_bare(machine, measurement, options, active)
+            result = identify_bare(machine, measurement, options, active, stated.reversal())
         checked = None
         if replicates is not None:
             if active is not None or not isinstance(measurement, Lengths):

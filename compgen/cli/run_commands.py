@@ -22,12 +22,14 @@ from compgen.cli.shared_options import (
     machine_argument,
     measurements_argument,
     sample_options,
+    stated_options,
     templates_option,
     unverified_option,
 )
 from compgen.cli.terminal import progress, say, say_paths, stdout
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
+from compgen.data.stated import StatedNumbers
 from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions
 from compgen.identify import IdentifyOptions
@@ -125,6 +127,7 @@ def report_beside(folder: Path) -> Path | None:
 @controller_option(multiple=True)
 @sample_options
 @instrument_option
+@stated_options
 @out_option
 @identify_options
 @fitting_options
@@ -146,6 +149,7 @@ def run_command(
     measurements: tuple[Path, ...],
     controller: tuple[str, ...],
     instrument: Path | None,
+    stated: StatedNumbers,
     out: Path,
     options: IdentifyOptions,
     fitting: FitOptions,
@@ -183,6 +187,7 @@ def run_command(
             allow_misfit=allow_misfit,
             progress=show,
             instrument=instrument,
+            stated=stated,
         )
         if not no_report:
             show("drawing the report")

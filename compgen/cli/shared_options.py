@@ -19,6 +19,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.files import read_bytes, sha256_of
 from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
 from compgen.data.messages import nearest
+from compgen.data.stated import StatedNumbers
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
 from compgen.resources import data_folder
@@ -101,6 +102,10 @@ def mapper(workers: int, cluster: str | None) -> Iterator[Map]:
 identify_options = options_of(
     IdentifyOptions, "options", read={"stations": lambda given: given if given == "nominal" else read_stations(given)}
 )
+
+
+#: Numbers that are known without a file; the command receives ``stated``.
+stated_options = options_of(StatedNumbers, "stated")
 
 
 def fitting_options(command: Command) -> Command:
@@ -344,5 +349,5 @@ explain_option = click.option(
     is_flag=True,
     help="Write explain.md: what the table corrects, what stays and why, what the next option would buy, limits used.",
 )
-measurements_argument = click.argument("measurements", nargs=-1, required=True, type=PATH)
+measurements_argument = click.argument("measurements", nargs=-1, type=PATH)
 errors_argument = click.argument("errors", type=PATH)

@@ -18,9 +18,10 @@ import numpy as np
 from compgen.data.axis_runs import AxisRuns, join_axis_runs, read_axis_runs, read_diagonals
 from compgen.data.csv_files import CsvTable, read_csv
 from compgen.data.deviations import Deviations, join_deviations, read_deviations, read_parts
-from compgen.data.error_table import ErrorTable, read_errors
+from compgen.data.error_table import Curve, ErrorTable, read_errors
 from compgen.data.lengths import Lengths, join_lengths, read_lengths
 from compgen.data.machine import Machine
+from compgen.data.names import error_named
 from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions, fit
 from compgen.foreign.detect import import_file
@@ -42,27 +43,30 @@ _NATIVE_READERS: dict[str | None, Callable[[Path], Plain]] = {
 }
 
 
-def converted_measurement(
+def converted_parts(
     paths: Sequence[str | Path], kinds: Sequence[str | None], axis: str | None = None
-) -> Plain | ErrorTable:
-    """Return what measurement files of which some are foreign hold; ``kinds`` are those of the native ones."""
-    if len(paths) == 1:
-        data = _settled(Path(paths[0]), axis).data
-        if isinstance(data, Capture):
-            raise InputError("holds a capture over time, from which no errors are identified", file=Path(paths[0]))
-        return data
-    parts: list[Plain] = [_measured(Path(path), kind, axis) for path, kind in zip(paths, kinds, strict=True)]
-    if len({type(part) for part in parts}) > 1:
-        raise InputError("holds another kind of measurement than the first file; identify them one after the other",
-                         file=paths[-1])  # fmt: skip
-    # where all imported files say when they were measured, their times count from the earliest of them
-    dated = all(part.metadata.get("measured_at") and "time_s" in part.covariates for part in parts)
-    begun = [datetime.fromisoformat(part.metadata["measured_at"]) for part in parts if dated and not any(kinds)]
-    if len({time.tzinfo is None for time in begun}) == 1:
-        for k, part in enumerate(parts):
-            later = part.covariates["time_s"] + (begun[k] - min(begun)).total_seconds()
-            parts[k] = replace(part, covariates={**part.covariates, "time_s": later})
-    return _joined(parts)
+) -> list[tuple[str, Plain | ErrorTable]]:
+    """Return what files of which some are foreign hold, one entry for each kind of measurement and each file of errors.
+
+    ``kinds`` are those of the native ones. Where all imported files of a kind say when they were measured, their times count
+    from the earliest of them.
+    """
+    found = [(Path(path).name, _measured(Path(path), kind, axis)) for path, kind in zip(paths, kinds, strict=True)]
+    parts: list[tuple[str, Plain | ErrorTable]] = []
+    for kind in dict.fromkeys(type(data) for _, data in found):
+        own = [(name, data) for name, data in found if type(data) is kind]
+        if kind is ErrorTable or len(own) == 1:
+            parts += own
+            continue
+        measured = [data for _, data in own if not isinstance(data, ErrorTable)]
+        dated = all(data.metadata.get("measured_at") and "time_s" in data.covariates for data in measured)
+        begun = [datetime.fromisoformat(data.metadata["measured_at"]) for data in measured if dated and not any(kinds)]
+        if len({time.tzinfo is None for time in begun}) == 1:
+            for k, data in enumerate(measured):
+                later = data.covariates["time_s"] + (begun[k] - min(begun)).total_seconds()
+                measured[k] = replace(data, covariates={**data.covariates, "time_s": later})
+        parts.append((", ".join(name for name, _ in own), _joined(measured)))
+    return parts
 
 
 def describe_native(path: Path, kind: str) -> tuple[dict[str, Any], object]:
@@ -94,14 +98,13 @@ def _described(table: CsvTable, name: str) -> str:
     return f"{known.min():.6g} to {known.max():.6g}" if known.size else "empty"
 
 
-def _measured(path: Path, kind: str | None, axis: str | None) -> Plain:
+def _measured(path: Path, kind: str | None, axis: str | None) -> Plain | ErrorTable:
     if kind in _NATIVE_READERS:
         return _NATIVE_READERS[kind](path)
-    item = _settled(path, axis)
-    if not isinstance(item.data, Lengths | Deviations | AxisRuns):
-        hint = "; errors go to fit, export and verify" if isinstance(item.data, ErrorTable) else ""
-        raise InputError(f"holds {item.kind}, from which no errors are identified{hint}", file=path)
-    return item.data
+    data = _settled(path, axis).data
+    if isinstance(data, Capture):
+        raise InputError("holds a capture over time, from which no errors are identified", file=path)
+    return data
 
 
 def _settled(path: Path, axis: str | None = None) -> Imported:
@@ -138,18 +141,24 @@ def _joined(parts: Sequence[Plain]) -> Plain:
 # Errors that another program identified, in place of an identification here.
 
 
-def given_errors(machine: Machine, table: ErrorTable) -> Identification:
+def given_errors(machine: Machine, table: ErrorTable, *, whole: bool = True) -> Identification:
     """Return errors of a foreign file as what an identification hands on.
 
     They are brought to the zeros that every identification has (positioning and angles at the reference point, straightness
-    at both ends; squareness takes up the lines), without smoothing; ``details`` says what that moved.
+    at both ends; squareness takes up the lines), without smoothing; ``details`` says what that moved. Of a table that is not
+    the ``whole`` of what is known and contains no squareness, the lines are left out: how a straightedge lay says nothing
+    about the machine.
 
     Raises
     ------
     InputError
         for errors that the machine's travel or chain does not fit.
     """
+    if not whole and not table.squareness:
+        table = table.replace(curves={name: _levelled(name, curve) for name, curve in table.curves.items()})
     zeroed = fit(machine, table, FitOptions(smoothness=0.0))
+    if not whole and not table.squareness:
+        zeroed = replace(zeroed, errors=zeroed.errors.replace(squareness={}))
     errors = zeroed.errors.replace(
         metadata={**metadata_of(machine, table.metadata), "source": "given by another program"}
     )
@@ -167,3 +176,12 @@ def given_errors(machine: Machine, table: ErrorTable) -> Identification:
             "frame_change": zeroed.to_dict()["frame_change"],
         },
     )
+
+
+def _levelled(name: str, curve: Curve) -> Curve:
+    """A straightness curve without the line through its ends; any other curve as it is."""
+    if not error_named(name).is_straightness:
+        return curve
+    at = curve.position_mm
+    ends = np.interp(at, at[[0, -1]], curve.value[[0, -1]])
+    return Curve(at, curve.value - ends, curve.u)

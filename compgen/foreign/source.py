@@ -16,7 +16,7 @@ from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_bytes
 from compgen.data.records import ARCHIVE, format_of_columns
 from compgen.errors import InputError
-from compgen.identify.any_measurement import Measurement, read_measurement
+from compgen.identify.any_measurement import Measurement, MixedMeasurement, OneKind, read_measurement
 
 # Reading foreign files: limits of size, encodings, and what a file is that cannot be read at all.
 
@@ -401,15 +401,19 @@ def native_format(path: Path) -> str | None:
 
 
 def open_measurement(
-    paths: Sequence[str | Path], instrument: str | Path | None = None, axis: str | None = None
+    paths: Sequence[str | Path],
+    instrument: str | Path | None = None,
+    axis: str | None = None,
+    stated: ErrorTable | None = None,
 ) -> Measurement | ErrorTable:
-    """Read measurement files, native and foreign ones; a foreign file of errors gives those.
+    """Read measurement files of any kinds, native and foreign ones, and files of errors.
 
     Parameters
     ----------
-    paths : files of one kind (lengths, deviations, axis runs); six-DOF readings as ``read_measurement`` takes them.
+    paths : files; those of one kind are one measurement, several kinds a mixture. A single file of errors gives those.
     instrument : the instrument TOML of six-DOF readings.
     axis : the axis of foreign files that measure along one and do not say which; native files do.
+    stated : errors that are known without a file.
 
     Raises
     ------
@@ -424,13 +428,32 @@ def open_measurement(
             file=known,
             field="--axis",
         )
-    if not paths or all(kinds) or "sixdof" in kinds or instrument is not None:
-        return read_measurement(paths, instrument)
-    if len(paths) == 1 and Path(paths[0]).name.lower().endswith(_NATIVE_SUFFIXES):
-        return read_measurement(paths, instrument)  # the native reader says best what is missing
-    from compgen.foreign.converted import converted_measurement
+    parts: list[tuple[str, OneKind | ErrorTable]] = []
+    measured = [k for k, kind in enumerate(kinds) if kind != "errors"]
+    foreign = any(kinds[k] is None and not _native_name(paths[k]) for k in measured)
+    posed = [k for k in measured if kinds[k] == "sixdof"] if foreign else []
+    plain = [paths[k] for k in measured if k not in posed]
+    if foreign:
+        from compgen.foreign.converted import converted_parts
 
-    return converted_measurement(paths, kinds, axis)
+        parts += converted_parts(plain, [kinds[k] for k in measured if k not in posed], axis)
+        plain = [paths[k] for k in posed]
+    if plain or instrument is not None or not (paths or stated):
+        found = read_measurement(plain, instrument)
+        parts += (
+            found.parts
+            if isinstance(found, MixedMeasurement)
+            else [(", ".join(Path(path).name for path in plain), found)]
+        )
+    parts += [(Path(paths[k]).name, read_errors(paths[k])) for k, kind in enumerate(kinds) if kind == "errors"]
+    if stated is not None:
+        parts.append(("command line", stated))
+    return parts[0][1] if len(parts) == 1 else MixedMeasurement(tuple(parts))
+
+
+def _native_name(path: str | Path) -> bool:
+    """Whether the name says that a file is native: its reader says best what is missing."""
+    return Path(path).name.lower().endswith(_NATIVE_SUFFIXES)
 
 
 def open_errors(path: str | Path) -> ErrorTable:

@@ -5,10 +5,11 @@ What reads and identifies a kind is imported when a file of that kind is there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, overload
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from compgen.data.lengths import MOST_WHOLE, Lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import ARCHIVE, detect_format
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.identification import Identification
 from compgen.identify.options import IdentifyOptions
@@ -34,35 +35,35 @@ if TYPE_CHECKING:
 SMALLEST_UM = 0.1
 
 
+OneKind: TypeAlias = "Lengths | LengthArchive | Deviations | AxisRuns | SixDofMeasurement"
+
+
 @dataclass(frozen=True)
 class MixedMeasurement:
-    """Lengths or deviations, and six-DOF readings, of the same machine."""
+    """Several measurements of the same machine, each of one kind, and errors that are known otherwise; with their names."""
 
-    other: Lengths | Deviations
-    sixdof: SixDofMeasurement
+    parts: tuple[tuple[str, OneKind | ErrorTable], ...]
+
+    def first(self) -> OneKind | None:
+        """Return the first measurement among the parts."""
+        return next((part for _, part in self.parts if not isinstance(part, ErrorTable)), None)
 
 
-Measurement: TypeAlias = "Lengths | LengthArchive | Deviations | AxisRuns | SixDofMeasurement | MixedMeasurement"
+Measurement: TypeAlias = "OneKind | MixedMeasurement"
 
 
-@overload
-def read_measurement(
-    paths: Sequence[str | Path], instrument: None = None
-) -> Lengths | LengthArchive | Deviations | AxisRuns: ...
-@overload
-def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None) -> Measurement: ...
 def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement:
     """Read measurement files by their columns: ``*.lengths.csv``, ``*.deviations.csv``, ``*.axis.csv``, ``*.sixdof.csv``.
 
     Parameters
     ----------
-    paths : files; six-DOF readings may be combined with lengths or deviations.
+    paths : files of any kinds; those of one kind are one measurement.
     instrument : the instrument TOML of the six-DOF readings.
 
     Raises
     ------
     InputError
-        for lengths together with deviations, six-DOF readings without an instrument file, or one without such readings.
+        for six-DOF readings without an instrument file, or one without such readings.
     """
     if len(paths) == 1 and instrument is None and str(paths[0]).lower().endswith(ARCHIVE):
         from compgen.data.length_archive import open_archive
@@ -70,56 +71,52 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
         archive = open_archive(paths[0])
         if len(archive) > MOST_WHOLE:
             return archive
-    posed = [path for path in paths if detect_format(path) == "sixdof"]
-    others = [path for path in paths if path not in posed]
-    if posed and instrument is None:
+    kinds: dict[str, list[str | Path]] = {}
+    for path in paths:
+        found = detect_format(path)  # of a file that is no measurement, the reader of lengths says best what is missing
+        kinds.setdefault(
+            found if found in ("part", "axis", "deviations", "sixdof", "diagonals") else "lengths", []
+        ).append(path)
+    if "diagonals" in kinds:
+        text = "contains measured diagonals, from which no errors can be identified; use accuracy or compare"
+        raise InputError(text, file=kinds["diagonals"][0])
+    if "sixdof" in kinds and instrument is None:
         message = (
             "contains six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
         )
-        raise InputError(message, file=posed[0])
-    if instrument is not None and not posed:
+        raise InputError(message, file=kinds["sixdof"][0])
+    if instrument is not None and "sixdof" not in kinds:
         raise InputError(
             f"--instrument {instrument} was given, but no file contains six-DOF readings (*.sixdof.csv with axis, "
             "position_mm, y_qd1_mm, ...)"
         )
-    if not posed:
-        return _read_others(others)
-    from compgen.identify.six_dof import SixDofMeasurement
-    from compgen.instruments.sixdof_instrument import read_instrument
-    from compgen.instruments.sixdof_readings import read_sixdof
-
-    sixdof = SixDofMeasurement(read_sixdof(posed), read_instrument(str(instrument)))
-    if not others:
-        return sixdof
-    from compgen.data.deviations import Deviations
-
-    other = _read_others(others)
-    if not isinstance(other, Lengths | Deviations):
-        raise InputError("contains axis runs, and another file six-DOF readings; give only one of them", file=others[0])
-    return MixedMeasurement(other, sixdof)
+    parts = [(_names(files), _read_kind(kind, files, instrument)) for kind, files in (kinds or {"lengths": []}).items()]
+    return parts[0][1] if len(parts) == 1 else MixedMeasurement(tuple(parts))
 
 
-def _read_others(paths: Sequence[str | Path]) -> Lengths | Deviations | AxisRuns:
-    kinds = [detect_format(path) for path in paths]
-    if "diagonals" in kinds:
-        text = "contains measured diagonals, from which no errors can be identified; use accuracy or compare"
-        raise InputError(text, file=paths[kinds.index("diagonals")])
-    if not {"part", "axis", "deviations"} & set(kinds):
-        return read_lengths(paths)
+def _names(files: Sequence[str | Path]) -> str:
+    names = [Path(file).name for file in files]
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _read_kind(kind: str, files: Sequence[str | Path], instrument: str | Path | None) -> OneKind:
+    if kind == "lengths":
+        return read_lengths(files)
+    if kind == "sixdof":
+        from compgen.identify.six_dof import SixDofMeasurement
+        from compgen.instruments.sixdof_instrument import read_instrument
+        from compgen.instruments.sixdof_readings import read_sixdof
+
+        return SixDofMeasurement(read_sixdof(files), read_instrument(str(instrument)))
     from compgen.data.axis_runs import read_axis_runs
     from compgen.data.deviations import read_deviations, read_parts
 
-    # format, what another file lacks or has, reader
-    known: tuple[tuple[str, str, Callable[[Sequence[str | Path]], Deviations | AxisRuns]], ...] = (
-        ("part", "contains no features of a part, but another file does", read_parts),
-        ("axis", "contains no axis runs, but another file does", read_axis_runs),
-        ("deviations", "contains tracer lengths, and another file deviations", read_deviations),
-    )
-    kind, contrast, read = next(item for item in known if item[0] in kinds)
-    if set(kinds) != {kind}:
-        odd = next(path for path, found in zip(paths, kinds, strict=True) if found != kind)
-        raise InputError(f"{contrast}; identify them separately", file=odd)
-    return read(paths)
+    readers: Mapping[str, Callable[[Sequence[str | Path]], Deviations | AxisRuns]] = {
+        "part": read_parts,
+        "axis": read_axis_runs,
+        "deviations": read_deviations,
+    }
+    return readers[kind](files)
 
 
 def describe(measurement: Measurement | ErrorTable) -> str:
@@ -127,9 +124,9 @@ def describe(measurement: Measurement | ErrorTable) -> str:
     if isinstance(measurement, Lengths):
         return f"{len(measurement)} lengths of {len(measurement.stations)} stations"
     if isinstance(measurement, ErrorTable):
-        return f"{len(measurement.names)} errors of another program"
+        return f"{len(measurement.names)} known errors"
     if isinstance(measurement, MixedMeasurement):
-        return f"{describe(measurement.other)}, {describe(measurement.sixdof)}"
+        return ", ".join(describe(part) for _, part in measurement.parts)
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import PART, Deviations
     from compgen.data.length_archive import LengthArchive
@@ -145,9 +142,15 @@ def describe(measurement: Measurement | ErrorTable) -> str:
 
 
 def identify_measurement(
-    machine: Machine, measurement: Measurement, options: IdentifyOptions | None = None
+    machine: Machine,
+    measurement: Measurement,
+    options: IdentifyOptions | None = None,
+    known: Mapping[str, Identification] | None = None,
 ) -> Identification:
-    """Identify from any kind; InputError for options that belong to another kind."""
+    """Identify from any kind or mixture; InputError for options that belong to another kind.
+
+    ``known`` are the errors of a mixture that are known otherwise, by the name of their part.
+    """
     chosen = options or IdentifyOptions()
     if isinstance(measurement, Lengths):
         if chosen.u_deviation_um is not None:
@@ -161,18 +164,16 @@ def identify_measurement(
         return identify_archive(machine, measurement, chosen)
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import Deviations
-    from compgen.identify.merging import merge
     from compgen.identify.positions import identify_deviations
     from compgen.identify.single_axes import identify_axis_runs
     from compgen.identify.six_dof import identify_sixdof
 
     if isinstance(measurement, MixedMeasurement):
-        first = identify_measurement(machine, measurement.other, chosen)
-        return merge(machine, first, identify_sixdof(machine, measurement.sixdof))
+        return _identify_mixed(machine, measurement, chosen, known or {})
     if isinstance(measurement, Deviations | AxisRuns) and not chosen.small_deviations:
         # deviations that are all zero, or so small that their unit must be another one
-        known = measurement.deviation_mm[np.isfinite(measurement.deviation_mm)]
-        largest_um = float(np.max(np.abs(known), initial=0.0)) / MM_PER_UM
+        measured = measurement.deviation_mm[np.isfinite(measurement.deviation_mm)]
+        largest_um = float(np.max(np.abs(measured), initial=0.0)) / MM_PER_UM
         if largest_um < SMALLEST_UM:
             message = "all deviations are zero; was nothing measured? Give the measured values"
             if largest_um:
@@ -205,6 +206,55 @@ def identify_measurement(
             "whose uncertainties the instrument file gives ([noise], [u_constants], [u_systematics])"
         )
     return identify_sixdof(machine, measurement)
+
+
+def _identify_mixed(
+    machine: Machine, measurement: MixedMeasurement, options: IdentifyOptions, known: Mapping[str, Identification]
+) -> Identification:
+    """Identify every part alone as far as it goes, and all of them together."""
+    from compgen.data.axis_runs import AxisRuns
+    from compgen.data.deviations import Deviations
+    from compgen.identify.merging import merge
+    from compgen.identify.six_dof import SixDofMeasurement
+    from compgen.identify.together import Part, identify_together
+
+    parts = []
+    for name, part in measurement.parts:
+        if isinstance(part, ErrorTable):
+            parts.append(Part(name, None, known[name]))
+            continue
+        try:
+            with warnings.catch_warnings():
+                if isinstance(part, AxisRuns):  # they warn of what others may have measured
+                    warnings.simplefilter("ignore", CompgenWarning)
+                alone = identify_measurement(machine, part, _applicable(part, options))
+        except UndeterminedError:
+            if not isinstance(part, Deviations):
+                raise
+            alone = None
+        parts.append(Part(name, part, alone))
+    # six-DOF readings measure all errors: compared with those of one other instrument, and averaged
+    posed = [part.alone for part in parts if isinstance(part.measurement, SixDofMeasurement)]
+    others = [part.alone for part in parts if isinstance(part.measurement, Lengths | Deviations)]
+    if len(parts) == 2 and posed and posed[0] is not None and others and others[0] is not None:
+        return merge(machine, others[0], posed[0])
+    return identify_together(machine, parts, options)
+
+
+def _applicable(part: OneKind, options: IdentifyOptions) -> IdentifyOptions:
+    """The options that apply to one kind of several."""
+    plain = IdentifyOptions()
+    if isinstance(part, Lengths):
+        return replace(options, u_deviation_um=None)
+    return replace(
+        options,
+        u_length_um=None,
+        u_length_um_per_m=None,
+        method=plain.method,
+        stations=None,
+        systematic=plain.systematic,
+        u_deviation_um=options.u_deviation_um if type(part).__name__ == "Deviations" else None,
+    )
 
 
 # What a later report needs beside the results of an identification: the machine file, and the residuals.
@@ -242,6 +292,7 @@ def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, re
     columns["residual_um"] = -result.residual_mm / MM_PER_UM
     columns["used"] = result.accepted.astype(np.float64)
     digits = {"x_mm": 3, "y_mm": 3, "z_mm": 3, "residual_um": 4, "used": 0}
-    described = measurement.other if isinstance(measurement, MixedMeasurement) else measurement
-    stated = {key: described.metadata[key] for key in MEASURED_WITH if described.metadata.get(key)}
+    described = measurement.first() if isinstance(measurement, MixedMeasurement) else measurement
+    metadata = {} if described is None else described.metadata
+    stated = {key: metadata[key] for key in MEASURED_WITH if metadata.get(key)}
     return format_csv(columns, {"machine": machine.name, "method": result.method, **stated}, digits)

@@ -27,7 +27,7 @@ from compgen.data.names import ERROR_INDEX, LARGEST, SQUARENESS_NAMES, error_nam
 from compgen.errors import InputError
 from compgen.identify.adjust.propagation import Contribution, Systematic, SystematicInputs, responses
 from compgen.identify.adjust.unknowns import ErrorParameters
-from compgen.identify.identification import Identification, worst_uncertainty
+from compgen.identify.identification import Identification, table_of_values, worst_uncertainty
 from compgen.kinematics.first_order import c_matrix
 
 FILE_NAME = "identified.covariance.npz"
@@ -139,6 +139,18 @@ def joint_covariance(result: Identification) -> Covariance:
 def covariance_of_values(errors: ErrorTable, factor: FloatArray, machine: str = "") -> Covariance:
     """Covariance of error values that a factor (k, r) in the order of the errors file describes; no stations."""
     return Covariance(*errors.labels(), (), np.zeros(0, dtype=np.int64), factor, machine)
+
+
+def values_with_factor(
+    layout: ErrorParameters, unknowns: FloatArray, factor: FloatArray
+) -> tuple[ErrorTable, FloatArray]:
+    """Return the errors of a layout, and a factor of the covariance of their values in the order of the errors file."""
+    values, rows = [], {}
+    for name, position_mm, columns, matrix in error_values(layout):
+        rows[name] = matrix @ factor[columns]
+        values.append((name, position_mm, matrix @ unknowns[columns], np.linalg.norm(rows[name], axis=1)))
+    errors = table_of_values(values)
+    return errors, np.vstack([rows[name] for name in errors.names])
 
 
 def values_at_nodes(errors: ErrorTable, names: Sequence[str], position_mm: FloatArray) -> FloatArray:

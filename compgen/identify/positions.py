@@ -30,14 +30,13 @@ from compgen.identify.adjust.unknowns import (
     error_parameters,
     parameters_for_tools,
 )
-from compgen.identify.covariance import error_values
+from compgen.identify.covariance import values_with_factor
 from compgen.identify.identification import (
     AdjustedReadings,
     Identification,
     error_table,
     judged,
     not_among,
-    table_of_values,
 )
 from compgen.identify.options import IdentifyOptions, deviation_sigma
 from compgen.identify.reference_conditions import without_effects
@@ -231,6 +230,23 @@ def observed_positions(layout: ErrorParameters, readings: _Readings, *, free_sca
     )
 
 
+def position_observations(
+    machine: Machine, layout: ErrorParameters, deviations: Deviations, options: IdentifyOptions
+) -> Observations:
+    """Return measured positions as readings of the errors of a layout, each set-up with a pose of its own.
+
+    Raises
+    ------
+    InputError
+        for positions outside the travel, temperatures without the coefficient of expansion of the part.
+    """
+    check_travel(machine, deviations.position_mm, deviations.origin)
+    deviations, _ = without_effects(machine, deviations)
+    deviations = _at_20_degrees(deviations if deviations.poses else aligned(deviations))
+    readings = _readings(machine, deviations, deviation_sigma(deviations, options)[0])
+    return observed_positions(layout, readings, free_scale=options.part_scale == "free")
+
+
 def _free_pose_result(
     deviations: Deviations, readings: _Readings, solution: Determined, accepted: NDArray[np.bool_], source: str
 ) -> Identification:
@@ -238,11 +254,7 @@ def _free_pose_result(
     adjusted = AdjustedReadings(
         -solution.residual, readings.sigma_mm, accepted, source, solution.rank, solution.freedom, too_few=too_few
     )
-    values, rows = [], {}  # the factor of the covariance of the values goes in the order of the errors file
-    for name, position_mm, span, matrix in error_values(solution.layout):
-        rows[name] = matrix @ (solution.factor * adjusted.u_scale)[span]
-        values.append((name, position_mm, matrix @ solution.unknowns[span], np.linalg.norm(rows[name], axis=1)))
-    errors = table_of_values(values)
+    errors, values_factor = values_with_factor(solution.layout, solution.unknowns, solution.factor * adjusted.u_scale)
     ambiguous = "a part of it is not told apart from the pose, the scale or other errors"
     return replace(
         _result(adjusted, errors, solution.layout, deviations, readings.row, readings.component),
@@ -251,7 +263,7 @@ def _free_pose_result(
             *(f"{name}: {ambiguous}" for name in solution.partly),
         ),
         condition=solution.condition,
-        values_factor=np.vstack([rows[name] for name in errors.names]),
+        values_factor=values_factor,
         details={
             "poses": [pose.summary() for pose in _poses(deviations, readings, solution, adjusted.u_scale)],
             "range_mm": {

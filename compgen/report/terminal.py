@@ -53,6 +53,16 @@ def identification_table(result: Identification) -> Group:
     if result.method == "given":
         text = f"{result.details['values']} values of errors given in {one_line(result.details['file'])}; not identified here"
         return Group(Text(text), _errors_table(result))
+    if result.method == "together":
+        listed = [
+            f"{part['name']}: {', '.join(part['errors'])}"
+            + (f" from {part['readings']} readings" if part["readings"] else "")
+            for part in result.details["parts"]
+        ]
+        quality = f"{len(result.errors.names)} errors, residual {result.rms_um:.3f} um rms"
+        disagree = [f"{name} against the others: largest En {max(en.values()):.2f} ({max(en, key=lambda key: en[key])})"
+                    for name, en in result.details.get("en", {}).items() if en]  # fmt: skip
+        return Group(Text("\n".join([*listed, quality, *disagree])), _errors_table(result))
     lengths = result.method != "deviations"
     used = f"{result.readings_used} of {result.readings} "
     used += (

@@ -45,6 +45,7 @@ class Observations:
     value, sigma : (k,), in any unit that both share.
     at_mm : position of each axis, (k, 3), or nan where the reading says nothing about the errors of that axis.
     shows : which curves of the layout a reading is about, (k, curves).
+    covered : errors that are known over the whole travel, wherever the readings were.
     """
 
     design: FloatArray
@@ -53,6 +54,7 @@ class Observations:
     sigma: FloatArray
     at_mm: FloatArray
     shows: NDArray[np.bool_]
+    covered: frozenset[str] = frozenset()
 
     def __len__(self) -> int:
         """Return the number of readings."""
@@ -70,6 +72,7 @@ def stacked(parts: Sequence[Observations]) -> Observations:
         np.concatenate([part.sigma for part in parts]),
         np.vstack([part.at_mm for part in parts]),
         np.vstack([part.shows for part in parts]),
+        frozenset().union(*(part.covered for part in parts)),
     )
 
 
@@ -230,6 +233,8 @@ def _far_nodes(
     """
     unreached, tied = {}, {}
     for number, curve in enumerate(layout.curves):
+        if curve.error.name in observations.covered:
+            continue
         along = observations.at_mm[accepted & observations.shows[:, number], curve.error.axis]
         along = along[np.isfinite(along)]
         hats = hat_matrix(curve.nodes_mm, along)

@@ -177,7 +177,7 @@ def misfit_of(
     degrees_of_freedom: int,
     scaled_by: float,
     source: str,
-    series: Callable[[], ResidualSeries],
+    series: Callable[[], ResidualSeries] | None = None,
 ) -> Misfit:
     """Judge the size of the residuals, and look for causes where it is beyond the limit.
 
@@ -186,7 +186,7 @@ def misfit_of(
     noise_alone = chi_square_limit(degrees_of_freedom, FALSE_ALARM) / degrees_of_freedom
     limit = noise_alone * (ASSUMED_FACTOR**2 if source == "assumed" else 1.0)
     misfit = Misfit(reduced_chi_square, degrees_of_freedom, limit, scaled_by, source)
-    if not reduced_chi_square > noise_alone:
+    if series is None or not reduced_chi_square > noise_alone:
         return misfit
     readings = series()
     # causes that take away most of the sum of squares, the strongest first

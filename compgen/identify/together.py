@@ -1,0 +1,327 @@
+"""Several measurements of one machine in one adjustment: axis runs, lengths, positions, six-DOF readings, known errors.
+
+Readings are linear in the errors, or nearly so: what each kind has unknown beside them (where a laser was set to zero, the
+pose of a plate) stays its own. What no reading determines is not identified. Where each error comes from one source only and
+directly, as pitch from a laser and squareness from a granite square, nothing has to be adjusted: the results are joined as
+they are, at the targets that were measured.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import numpy as np
+from scipy.special import stdtrit
+
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.csv_files import FloatArray
+from compgen.data.deviations import Deviations
+from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
+from compgen.data.machine import Machine
+from compgen.data.names import MM_PER_UM, error_named
+from compgen.errors import CompgenWarning, UndeterminedError
+from compgen.identify.adjust.determined import Determined, Observations, columns_of, least_squares, stacked
+from compgen.identify.adjust.residual_tests import misfit_of
+from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
+from compgen.identify.covariance import error_values, joint_covariance, normalized_error, values_with_factor
+from compgen.identify.identification import Identification, not_among, uncertainty_scale, worst_uncertainty
+from compgen.identify.merging import FALSE_ALARM, MANY, projected
+from compgen.identify.options import ASSUMED_U_DEVIATION_UM, IdentifyOptions
+from compgen.identify.positions import position_observations
+from compgen.kinematics.first_order import modelled_errors
+
+#: No value is known better than this, um and urad.
+FINEST = 1e-3
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of several measurements: what to call it, the measurement, and what it determines alone (None: too little)."""
+
+    name: str
+    measurement: object
+    alone: Identification | None
+
+
+def identify_together(machine: Machine, parts: Sequence[Part], options: IdentifyOptions) -> Identification:
+    """Identify what several measurements determine together.
+
+    Parameters
+    ----------
+    machine : chain, nodes, reference point and the errors that its model contains.
+    parts : the measurements; errors that are known otherwise have no ``measurement``.
+    options : those that apply to the kinds of the measurements.
+
+    Raises
+    ------
+    UndeterminedError
+        where no error at all is determined, or a kind that is not linear does not determine its own unknowns.
+    """
+    known = [part.alone for part in parts if part.alone is not None]
+    listed = list(chain.from_iterable(result.errors.names for result in known))
+    direct = all(part.measurement is None or isinstance(part.measurement, AxisRuns) for part in parts)
+    if direct and len(listed) == len(set(listed)):
+        return _joined(machine, parts, known)
+    return _adjusted(machine, parts, options)
+
+
+def _joined(machine: Machine, parts: Sequence[Part], known: Sequence[Identification]) -> Identification:
+    """The errors of all results, none of which is in two of them; each keeps the positions at which it was measured."""
+    errors = ErrorTable(
+        dict(chain.from_iterable(result.errors.curves.items() for result in known)),
+        dict(chain.from_iterable(result.errors.squareness.items() for result in known)),
+        known[0].errors.metadata,
+    )
+    u = errors.uncertainties()
+    whole = bool(np.isfinite(u).all())
+    return replace(
+        _common(parts, known),
+        errors=errors,
+        degrees_of_freedom=sum(result.degrees_of_freedom for result in known),
+        unobservable=not_among(errors, "no file contains it"),
+        rank=sum(result.rank for result in known),
+        unknowns=sum(result.unknowns for result in known),
+        worst_u=worst_uncertainty(errors) if whole else {},
+        layout=error_parameters(machine, errors.names),
+        values_factor=np.diag(u) if whole else None,
+        details={"parts": [_described(part) for part in parts]},
+    )
+
+
+def _adjusted(machine: Machine, parts: Sequence[Part], options: IdentifyOptions) -> Identification:
+    """One least-squares adjustment of everything, and how the parts agree."""
+    layouts = [part.alone.layout for part in parts if part.alone is not None and part.alone.adjustment is not None]
+    layout = max(layouts, key=lambda item: item.size, default=error_parameters(machine, modelled_errors(machine)))
+    found = [_observed(machine, layout, part, options) for part in parts]
+    everything = stacked(found)
+    solution = least_squares(layout, everything, np.ones(len(everything), dtype=bool))
+    agreement = _agreement(layout, parts, found)
+    freedom = solution.freedom
+    reduced = float(np.sum((solution.residual / everything.sigma) ** 2)) / freedom if freedom > 0 else 1.0
+    u_scale = uncertainty_scale(reduced, "stated")
+    errors, factor = values_with_factor(solution.layout, solution.unknowns, u_scale * solution.factor)
+    known = [part.alone for part in parts if part.alone is not None]
+    texts = _contradictions(agreement)
+    for text in texts:
+        warnings.warn(text, CompgenWarning, stacklevel=4)
+    common = _common(parts, known)
+    return replace(
+        common,
+        objections=(*common.objections, *texts),
+        errors=errors.replace(metadata=known[0].errors.metadata),
+        degrees_of_freedom=freedom,
+        reduced_chi_square=reduced,
+        u_source="given",
+        u_scale=u_scale,
+        misfit=misfit_of(reduced, freedom, u_scale, "stated") if freedom > 0 else None,
+        unobservable=(
+            *not_among(errors, "no reading shows it"),
+            *(f"{name}: a part of it is not told apart from other unknowns" for name in solution.partly),
+        ),
+        rank=solution.rank,
+        unknowns=solution.rank,
+        condition=solution.condition,
+        worst_u=worst_uncertainty(errors),
+        layout=solution.layout,
+        adjustment=None,
+        values_factor=factor,
+        details={
+            "parts": [_described(part) for part in parts],
+            "en": agreement,
+            "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
+        },
+    )
+
+
+def _observed(machine: Machine, layout: ErrorParameters, part: Part, options: IdentifyOptions) -> Observations:
+    """What a part says about the errors of a layout.
+
+    Positions enter reading by reading. Lengths and six-DOF readings enter as the errors that they determine, with the joint
+    covariance of these: stations, dead lengths and rejected readings are settled then. Axis runs and known errors enter value
+    by value.
+    """
+    if isinstance(part.measurement, Deviations):
+        found = position_observations(machine, layout, part.measurement, options)
+        return found if part.alone is None else replace(found, sigma=found.sigma * part.alone.u_scale)
+    if part.alone is None:
+        text = f"{part.name}: the readings do not determine the errors and what else is unknown of them"
+        raise UndeterminedError(f"{text}; identify it alone to see what is missing", [])
+    if part.alone.method == "sixdof":
+        names, positions, values, factor, _ = projected(machine, layout, part.alone)
+        return _of_values(layout, names, positions, values, factor @ factor.T)
+    if part.alone.has_covariance and part.alone.method not in ("deviations", "axis-runs", "given"):
+        known = joint_covariance(part.alone)
+        return _of_values(layout, known.error, known.position_mm, part.alone.errors.values(), known.errors_covariance)
+    return _of_curves(layout, part.alone.errors)
+
+
+def _rows(layout: ErrorParameters, names: Sequence[str], position_mm: FloatArray) -> FloatArray:
+    """Derivative of error values by the unknowns, (k, size); zero for errors that the layout does not contain."""
+    rows, label = np.zeros((len(names), layout.size)), np.array(names)
+    curves = {curve.error.name: curve for curve in layout.curves}
+    for name, columns in columns_of(layout):
+        own = label == name
+        rows[own, columns] = (
+            layout.basis(curves[name].error.axis, position_mm[own]) @ curves[name].free if name in curves else 1.0
+        )
+    return rows
+
+
+def _of_values(
+    layout: ErrorParameters,
+    names: Sequence[str],
+    position_mm: FloatArray,
+    value: FloatArray,
+    covariance: FloatArray,
+) -> Observations:
+    """Error values with a covariance, as independent readings of unit variance: nothing is seen where it has no extent.
+
+    Values without uncertainty (a curve where it is zero by definition) say nothing. Every curve counts as read everywhere.
+    """
+    design = _rows(layout, names, position_mm)
+    size, direction = np.linalg.eigh(covariance)
+    seen = size > 1e-12 * size[-1]
+    whiten = (direction[:, seen] / np.sqrt(size[seen])).T
+    count = int(np.count_nonzero(seen))
+    return Observations(
+        design=whiten @ design,
+        others=np.zeros((count, 0)),
+        value=whiten @ value,
+        sigma=np.ones(count),
+        at_mm=np.full((count, 3), np.nan),
+        shows=np.zeros((count, len(layout.curves)), dtype=bool),
+        covered=frozenset(names),
+    )
+
+
+def _of_curves(layout: ErrorParameters, errors: ErrorTable) -> Observations:
+    """Values of errors as independent readings, each curve with a constant of its own, straightness with a line.
+
+    An uncertainty that is not known is taken as usual.
+    """
+    names = [name for name, rows in errors.rows().items() for _ in range(rows.stop - rows.start)]
+    position_mm = np.concatenate(
+        [errors.curves[name].position_mm if name in errors.curves else [np.nan] for name in errors.names]
+    )
+    label, axis = np.array(names), np.array([error_named(name).axis for name in names])
+    unit = np.array([error_named(name).si_per_unit for name in names])
+    u = errors.uncertainties()
+    at_mm = np.full((len(names), 3), np.nan)
+    at_mm[np.arange(len(names)), axis] = position_mm
+    free = []
+    for name, curve in errors.curves.items():
+        own = (label == name).astype(np.float64)
+        free.append(own)
+        if error_named(name).is_straightness:
+            free.append(own * np.nan_to_num(position_mm - curve.position_mm.mean()))
+    return Observations(
+        design=_rows(layout, names, position_mm),
+        others=np.column_stack(free) if free else np.zeros((len(names), 0)),
+        value=errors.values(),
+        sigma=np.where(np.isfinite(u), np.maximum(u, FINEST * unit), ASSUMED_U_DEVIATION_UM * unit),
+        at_mm=at_mm,
+        shows=label[:, None] == np.array([curve.error.name for curve in layout.curves], dtype=object)[None, :],
+    )
+
+
+def _agreement(
+    layout: ErrorParameters, parts: Sequence[Part], found: Sequence[Observations]
+) -> dict[str, dict[str, float]]:
+    """Largest E_n number of each error between a part alone and all others, by the part's name.
+
+    The coverage factor is chosen so that the probability of a false alarm holds for all values of a part together.
+    """
+    result: dict[str, dict[str, float]] = {}
+    pairs = range(len(parts)) if len(parts) > 2 else range(1)
+    for k in pairs:
+        others = stacked([item for j, item in enumerate(found) if j != k])
+        try:
+            one, other = (least_squares(layout, item, np.ones(len(item), dtype=bool)) for item in (found[k], others))
+        except UndeterminedError:
+            continue
+        result[parts[k].name] = _normalized(one, other)
+    return result
+
+
+def _normalized(one: Determined, other: Determined) -> dict[str, float]:
+    """Largest E_n number of each error that both determine wholly."""
+    sides = []
+    for side in (one, other):
+        sides.append(
+            {
+                name: (matrix @ side.unknowns[columns], np.linalg.norm(matrix @ side.factor[columns], axis=1))
+                for name, _, columns, matrix in error_values(side.layout)
+                if name not in side.partly
+            }
+        )
+    shared = [name for name in sides[0] if name in sides[1]]
+    count = sum(len(sides[0][name][0]) for name in shared)
+    k = -float(stdtrit(MANY, FALSE_ALARM / 2.0 / max(count, 1)))
+    found = {}
+    for name in shared:
+        (value, u), (against, u_against) = sides[0][name], sides[1][name]
+        expanded = k * np.hypot(u, u_against)
+        found[name] = float(np.max(normalized_error(value - against, expanded)[expanded > 0], initial=0.0))
+    return found
+
+
+def _contradictions(agreement: Mapping[str, Mapping[str, float]]) -> tuple[str, ...]:
+    """What has to be said of parts that disagree beyond their uncertainty; empty if everything agrees."""
+    texts = []
+    for name, numbers in agreement.items():
+        beyond = {error: value for error, value in numbers.items() if value > 1.0}
+        if beyond:
+            listed = ", ".join(f"{error} ({value:.1f})" for error, value in beyond.items())
+            texts.append(
+                f"{name} disagrees with the other measurements beyond the uncertainty of both in {listed} (En, 1 is the "
+                "limit); look at calibration, set-up, signs and the time between the measurements"
+            )
+    return tuple(texts)
+
+
+def _common(parts: Sequence[Part], known: Sequence[Identification]) -> Identification:
+    """What the results of all parts have in common: readings one after the other, stations, reversals, objections."""
+    measured = [part.alone for part in parts if part.alone is not None and part.measurement is not None]
+    residual = np.concatenate([np.zeros(0), *(result.residual_mm for result in measured)])
+    accepted = np.concatenate([np.zeros(0, dtype=bool), *(result.accepted for result in measured)])
+    reversal: dict[tuple[int, int], Curve] = {}
+    for result in known:
+        if result.reversal_curves is not None:
+            reversal |= result.reversal_curves.curves
+    return replace(
+        known[0],
+        method="together",
+        stations=tuple(chain.from_iterable(result.stations for result in known)),
+        residual_mm=residual,
+        accepted=accepted,
+        counted=None,
+        rms_um=float(np.sqrt(np.mean(residual[accepted] ** 2))) / MM_PER_UM if accepted.any() else 0.0,
+        rejected=tuple(chain.from_iterable(result.rejected for result in known)),
+        segments=tuple(chain.from_iterable(result.segments for result in known)),
+        reversal=next((result.reversal for result in known if result.reversal is not None), None),
+        reversal_curves=ReversalCurves(reversal, {"machine": known[0].layout.machine.name}) if reversal else None,
+        positions=next((result.positions for result in known if result.positions is not None), None),
+        corrections=dict(chain.from_iterable(result.corrections.items() for result in known)),
+        residual_tests=None,
+        systematic=None,
+        steps={},
+        objections=tuple(dict.fromkeys(chain.from_iterable(result.objections for result in known))),
+        misfit=next((result.misfit for result in known if result.misfit is not None and result.misfit.beyond), None),
+    )
+
+
+def _described(part: Part) -> dict[str, object]:
+    """The entry of a part in ``identify.json``."""
+    if part.alone is None:
+        return {"name": part.name, "method": "", "errors": [], "readings": 0}
+    return {
+        "name": part.name,
+        "method": part.alone.method,
+        "errors": list(part.alone.errors.names),
+        "readings": part.alone.readings if part.measurement is not None else 0,
+        "residual_rms_um": part.alone.rms_um,
+        "reduced_chi_square": part.alone.reduced_chi_square,
+    }
