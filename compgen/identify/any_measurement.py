@@ -216,12 +216,12 @@ def _identify_mixed(
     from compgen.data.deviations import Deviations
     from compgen.identify.merging import merge
     from compgen.identify.six_dof import SixDofMeasurement
-    from compgen.identify.together import Part, identify_together
+    from compgen.identify.together import Source, identify_together
 
     parts = []
     for name, part in measurement.parts:
         if isinstance(part, ErrorTable):
-            parts.append(Part(name, None, known[name]))
+            parts.append(Source(name, None, known[name]))
             continue
         try:
             with warnings.catch_warnings():
@@ -232,7 +232,7 @@ def _identify_mixed(
             if not isinstance(part, Deviations):
                 raise
             alone = None
-        parts.append(Part(name, part, alone))
+        parts.append(Source(name, part, alone))
     # six-DOF readings measure all errors: compared with those of one other instrument, and averaged
     posed = [part.alone for part in parts if isinstance(part.measurement, SixDofMeasurement)]
     others = [part.alone for part in parts if isinstance(part.measurement, Lengths | Deviations)]

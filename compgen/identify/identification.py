@@ -74,8 +74,8 @@ class Identification(Drawable):
     method : "joint", "two-step", "sixdof" for readings of the six-DOF instrument (the residuals are translations about
         the mean of their position), "merged" for those and others, "axis-runs" for
         runs along single axes, "together" for a mixture of these, "given" for errors of another program (no
-        residuals), or "deviations" where measured positions were given instead of lengths; then the residuals are those of the components dx, dy, dz, and ``u_length_um`` is their
-        standard uncertainty.
+        residuals), or "deviations" where measured positions were given instead of lengths; then the residuals are those
+        of the components dx, dy, dz, and ``u_length_um`` is their standard uncertainty.
     steps : figures of the single steps of the two-step method.
     positions : the positions that it measured in the machine frame, against the commanded ones.
     values_factor : where there is no adjustment: F (k, r) with F F^T the covariance of the error values in the order of

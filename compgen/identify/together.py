@@ -17,16 +17,17 @@ import numpy as np
 from scipy.special import stdtrit
 
 from compgen.data.axis_runs import AxisRuns
+from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, error_named
 from compgen.errors import CompgenWarning, UndeterminedError
-from compgen.identify.adjust.determined import Determined, Observations, columns_of, least_squares, stacked
+from compgen.identify.adjust.determined import Observations, determined_values, least_squares, stacked
 from compgen.identify.adjust.residual_tests import misfit_of
 from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
-from compgen.identify.covariance import error_values, joint_covariance, normalized_error, values_with_factor
+from compgen.identify.covariance import joint_covariance, values_with_factor
 from compgen.identify.identification import Identification, not_among, uncertainty_scale, worst_uncertainty
 from compgen.identify.merging import FALSE_ALARM, MANY, projected
 from compgen.identify.options import ASSUMED_U_DEVIATION_UM, IdentifyOptions
@@ -35,10 +36,12 @@ from compgen.kinematics.first_order import modelled_errors
 
 #: No value is known better than this, um and urad.
 FINEST = 1e-3
+#: So many positions of each error are compared between two measurements.
+MOST_COMPARED = 50
 
 
 @dataclass(frozen=True)
-class Part:
+class Source:
     """One of several measurements: what to call it, the measurement, and what it determines alone (None: too little)."""
 
     name: str
@@ -46,7 +49,7 @@ class Part:
     alone: Identification | None
 
 
-def identify_together(machine: Machine, parts: Sequence[Part], options: IdentifyOptions) -> Identification:
+def identify_together(machine: Machine, parts: Sequence[Source], options: IdentifyOptions) -> Identification:
     """Identify what several measurements determine together.
 
     Parameters
@@ -68,7 +71,7 @@ def identify_together(machine: Machine, parts: Sequence[Part], options: Identify
     return _adjusted(machine, parts, options)
 
 
-def _joined(machine: Machine, parts: Sequence[Part], known: Sequence[Identification]) -> Identification:
+def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identification]) -> Identification:
     """The errors of all results, none of which is in two of them; each keeps the positions at which it was measured."""
     errors = ErrorTable(
         dict(chain.from_iterable(result.errors.curves.items() for result in known)),
@@ -91,13 +94,16 @@ def _joined(machine: Machine, parts: Sequence[Part], known: Sequence[Identificat
     )
 
 
-def _adjusted(machine: Machine, parts: Sequence[Part], options: IdentifyOptions) -> Identification:
+def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOptions) -> Identification:
     """One least-squares adjustment of everything, and how the parts agree."""
     layouts = [part.alone.layout for part in parts if part.alone is not None and part.alone.adjustment is not None]
     layout = max(layouts, key=lambda item: item.size, default=error_parameters(machine, modelled_errors(machine)))
-    found = [_observed(machine, layout, part, options) for part in parts]
-    everything = stacked(found)
-    solution = least_squares(layout, everything, np.ones(len(everything), dtype=bool))
+    around = None
+    for _ in range(2 if any(isinstance(part.measurement, Deviations) for part in parts) else 1):
+        found = [_observed(machine, layout, part, options, around) for part in parts]
+        everything = stacked(found)
+        solution = least_squares(layout, everything, np.ones(len(everything), dtype=bool))
+        around = solution.on(layout)
     agreement = _agreement(layout, parts, found)
     freedom = solution.freedom
     reduced = float(np.sum((solution.residual / everything.sigma) ** 2)) / freedom if freedom > 0 else 1.0
@@ -136,15 +142,17 @@ def _adjusted(machine: Machine, parts: Sequence[Part], options: IdentifyOptions)
     )
 
 
-def _observed(machine: Machine, layout: ErrorParameters, part: Part, options: IdentifyOptions) -> Observations:
-    """What a part says about the errors of a layout.
+def _observed(
+    machine: Machine, layout: ErrorParameters, part: Source, options: IdentifyOptions, around: FloatArray | None
+) -> Observations:
+    """What a part says about the errors of a layout; ``around`` are errors (size,) that are nearly right.
 
     Positions enter reading by reading. Lengths and six-DOF readings enter as the errors that they determine, with the joint
     covariance of these: stations, dead lengths and rejected readings are settled then. Axis runs and known errors enter value
     by value.
     """
     if isinstance(part.measurement, Deviations):
-        found = position_observations(machine, layout, part.measurement, options)
+        found = position_observations(machine, layout, part.measurement, options, around)
         return found if part.alone is None else replace(found, sigma=found.sigma * part.alone.u_scale)
     if part.alone is None:
         text = f"{part.name}: the readings do not determine the errors and what else is unknown of them"
@@ -158,18 +166,6 @@ def _observed(machine: Machine, layout: ErrorParameters, part: Part, options: Id
     return _of_curves(layout, part.alone.errors)
 
 
-def _rows(layout: ErrorParameters, names: Sequence[str], position_mm: FloatArray) -> FloatArray:
-    """Derivative of error values by the unknowns, (k, size); zero for errors that the layout does not contain."""
-    rows, label = np.zeros((len(names), layout.size)), np.array(names)
-    curves = {curve.error.name: curve for curve in layout.curves}
-    for name, columns in columns_of(layout):
-        own = label == name
-        rows[own, columns] = (
-            layout.basis(curves[name].error.axis, position_mm[own]) @ curves[name].free if name in curves else 1.0
-        )
-    return rows
-
-
 def _of_values(
     layout: ErrorParameters,
     names: Sequence[str],
@@ -181,7 +177,7 @@ def _of_values(
 
     Values without uncertainty (a curve where it is zero by definition) say nothing. Every curve counts as read everywhere.
     """
-    design = _rows(layout, names, position_mm)
+    design = layout.value_rows(names, position_mm)
     size, direction = np.linalg.eigh(covariance)
     seen = size > 1e-12 * size[-1]
     whiten = (direction[:, seen] / np.sqrt(size[seen])).T
@@ -218,7 +214,7 @@ def _of_curves(layout: ErrorParameters, errors: ErrorTable) -> Observations:
         if error_named(name).is_straightness:
             free.append(own * np.nan_to_num(position_mm - curve.position_mm.mean()))
     return Observations(
-        design=_rows(layout, names, position_mm),
+        design=layout.value_rows(names, position_mm),
         others=np.column_stack(free) if free else np.zeros((len(names), 0)),
         value=errors.values(),
         sigma=np.where(np.isfinite(u), np.maximum(u, FINEST * unit), ASSUMED_U_DEVIATION_UM * unit),
@@ -228,44 +224,45 @@ def _of_curves(layout: ErrorParameters, errors: ErrorTable) -> Observations:
 
 
 def _agreement(
-    layout: ErrorParameters, parts: Sequence[Part], found: Sequence[Observations]
+    layout: ErrorParameters, parts: Sequence[Source], found: Sequence[Observations]
 ) -> dict[str, dict[str, float]]:
     """Largest E_n number of each error between a part alone and all others, by the part's name.
 
     The coverage factor is chosen so that the probability of a false alarm holds for all values of a part together.
     """
     result: dict[str, dict[str, float]] = {}
-    pairs = range(len(parts)) if len(parts) > 2 else range(1)
-    for k in pairs:
+    for k in range(len(parts)) if len(parts) > 2 else range(1):
         others = stacked([item for j, item in enumerate(found) if j != k])
         try:
             one, other = (least_squares(layout, item, np.ones(len(item), dtype=bool)) for item in (found[k], others))
         except UndeterminedError:
             continue
-        result[parts[k].name] = _normalized(one, other)
+        differences = {}
+        for name, position_mm in _positions_read(layout, found[k]).items():
+            rows = layout.value_rows([name] * len(position_mm), position_mm)
+            both = determined_values(layout, found[k], rows) & determined_values(layout, others, rows)
+            (value, u), (against, u_against) = (side.curve(name, position_mm[both]) for side in (one, other))
+            if both.any():
+                differences[name] = (value - against, np.hypot(u, u_against))
+        count = sum(len(u) for _, u in differences.values())
+        factor = -float(stdtrit(MANY, FALSE_ALARM / 2.0 / max(count, 1)))
+        result[parts[k].name] = {
+            name: float(normalized_error(value, factor * u).max()) for name, (value, u) in differences.items()
+        }
     return result
 
 
-def _normalized(one: Determined, other: Determined) -> dict[str, float]:
-    """Largest E_n number of each error that both determine wholly."""
-    sides = []
-    for side in (one, other):
-        sides.append(
-            {
-                name: (matrix @ side.unknowns[columns], np.linalg.norm(matrix @ side.factor[columns], axis=1))
-                for name, _, columns, matrix in error_values(side.layout)
-                if name not in side.partly
-            }
+def _positions_read(layout: ErrorParameters, read: Observations) -> dict[str, FloatArray]:
+    """Where a part says something about each error: at most ``MOST_COMPARED`` of its positions, else the nodes."""
+    positions = {name: np.array([np.nan]) for name in layout.squareness}
+    for number, curve in enumerate(layout.curves):
+        along = np.unique(read.at_mm[read.shows[:, number], curve.error.axis])
+        along = along[np.isfinite(along)]
+        some = (
+            along[np.unique(np.linspace(0, max(len(along) - 1, 0), MOST_COMPARED).astype(int))] if len(along) else along
         )
-    shared = [name for name in sides[0] if name in sides[1]]
-    count = sum(len(sides[0][name][0]) for name in shared)
-    k = -float(stdtrit(MANY, FALSE_ALARM / 2.0 / max(count, 1)))
-    found = {}
-    for name in shared:
-        (value, u), (against, u_against) = sides[0][name], sides[1][name]
-        expanded = k * np.hypot(u, u_against)
-        found[name] = float(np.max(normalized_error(value - against, expanded)[expanded > 0], initial=0.0))
-    return found
+        positions[curve.error.name] = some if len(some) else curve.nodes_mm
+    return positions
 
 
 def _contradictions(agreement: Mapping[str, Mapping[str, float]]) -> tuple[str, ...]:
@@ -282,7 +279,7 @@ def _contradictions(agreement: Mapping[str, Mapping[str, float]]) -> tuple[str, 
     return tuple(texts)
 
 
-def _common(parts: Sequence[Part], known: Sequence[Identification]) -> Identification:
+def _common(parts: Sequence[Source], known: Sequence[Identification]) -> Identification:
     """What the results of all parts have in common: readings one after the other, stations, reversals, objections."""
     measured = [part.alone for part in parts if part.alone is not None and part.measurement is not None]
     residual = np.concatenate([np.zeros(0), *(result.residual_mm for result in measured)])
@@ -313,7 +310,7 @@ def _common(parts: Sequence[Part], known: Sequence[Identification]) -> Identific
     )
 
 
-def _described(part: Part) -> dict[str, object]:
+def _described(part: Source) -> dict[str, object]:
     """The entry of a part in ``identify.json``."""
     if part.alone is None:
         return {"name": part.name, "method": "", "errors": [], "readings": 0}

@@ -497,8 +497,11 @@ def test_the_door_takes_own_files_as_they_are_and_foreign_ones_converted(tmp_pat
     assert both.axes == (0, 1)
     assert len(both) == 60
     assert len(seen) == 2
-    with pytest.warns(CompgenWarning), pytest.raises(InputError, match="another kind of measurement"):
-        open_measurement([LENGTHS, other])
+    with pytest.warns(CompgenWarning, match="measured minus target"):
+        (lengths_name, lengths), (runs_name, runs) = open_measurement([LENGTHS, other]).parts
+    assert (lengths_name, runs_name) == (LENGTHS.name, "y.rtl")
+    np.testing.assert_array_equal(lengths.length_mm, own.length_mm)
+    assert runs.axes == (1,)
 
 
 def test_exchange_files_come_in_any_encoding(tmp_path):

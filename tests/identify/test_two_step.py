@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -729,17 +728,6 @@ def test_options_of_lengths_are_refused_for_deviations(tmp_path, gantry_file, ca
     path.write_text("x_mm,y_mm,z_mm,dx_um\n0,100,-50,4\n")
     assert run_command(cli, ["identify", str(gantry_file), str(path), "--out", str(tmp_path / "out"), *extra]) == 2
     assert message in capsys.readouterr().err
-
-
-def test_lengths_and_deviations_do_not_go_together(tmp_path, gantry_file, make_errors):
-    lengths, positions = tmp_path / "m.lengths.csv", tmp_path / "a.deviations.csv"
-    lengths.write_text(format_lengths(measured(GANTRY, make_errors(GANTRY))))
-    positions.write_text("x_mm,y_mm,z_mm,dx_um\n0,100,-50,4\n")
-    result = CliRunner().invoke(
-        cli, ["identify", str(gantry_file), str(positions), str(lengths), "--out", str(tmp_path / "o")]
-    )
-    assert isinstance(result.exception, InputError)
-    assert "identify them separately" in str(result.exception)
 
 
 def test_the_stations_file_of_an_identification_serves_as_known_stations(tmp_path):

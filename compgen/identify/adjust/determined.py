@@ -30,6 +30,8 @@ WEAK = 0.25
 SEEN = 1e-6
 #: A part of an error is not determined if the readings show less than this share of one of its unknowns.
 WHOLLY = 1.0 - 1e-4
+#: A value is determined if less than this share of it lies beside the determined directions.
+BESIDE = 1e-4
 #: Curvature of a curve between neighbouring nodes where too few of them are seen to measure it, um and urad.
 USUAL_BEND = 2.0
 
@@ -97,6 +99,40 @@ class Determined:
     unreached: Mapping[str, FloatArray] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
 
+    def on(self, layout: ErrorParameters) -> FloatArray:
+        """The unknowns of a layout that contains more errors, (size,); zero for those that are not determined."""
+        whole = np.zeros(layout.size)
+        own = dict(self.layout.columns())
+        for name, columns in layout.columns():
+            if name in own:
+                whole[columns] = self.unknowns[own[name]]
+        return whole
+
+    def curve(self, name: str, position_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Values of an error at positions (m,) and their standard uncertainties, (m,) each, mm or rad."""
+        rows = self.layout.value_rows([name] * len(position_mm), position_mm)
+        return rows @ self.unknowns, np.linalg.norm(rows @ self.factor, axis=1)
+
+
+def determined_values(layout: ErrorParameters, observations: Observations, rows: FloatArray) -> NDArray[np.bool_]:
+    """Which values of errors, linear in the unknowns by ``rows`` (m, size), readings tell apart from all other unknowns, (m,).
+
+    At one height a positioning error is not told apart from an angle about a horizontal axis: neither value is determined,
+    although the direction that both share is.
+    """
+    unit = _kinds(layout)[1]
+    explained = _range(observations.others / observations.sigma[:, None])
+    design = observations.design * unit / observations.sigma[:, None]
+    rest = design - explained @ (explained.T @ design)
+    size = np.linalg.norm(rest, axis=0)
+    scale = np.where(size > SHOWS * size.max(initial=1e-300), size, size.max(initial=1e-300))
+    _, values, right = np.linalg.svd(rest / scale, full_matrices=False)
+    directions = right[values > SHOWS * values.max(initial=1e-300)].T
+    scaled = rows * unit / scale
+    beside = np.linalg.norm(scaled - scaled @ directions @ directions.T, axis=1)
+    size = np.linalg.norm(scaled, axis=1)
+    return np.asarray((size > 0) & (beside <= BESIDE * size))
+
 
 def least_squares(layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_]) -> Determined:
     """Adjust the errors of a layout and the other unknowns to the accepted readings, (k,).
@@ -106,16 +142,16 @@ def least_squares(layout: ErrorParameters, observations: Observations, accepted:
     UndeterminedError
         where no error at all is determined.
     """
-    names = [name for name, _ in columns_of(layout)]
+    names = [name for name, _ in layout.columns()]
     angular, unit = _kinds(layout)
     used = (accepted / observations.sigma)[:, None]
     shown, _ = _seen_directions(observations.design * unit * used, observations.others * used, angular)
     seen = np.einsum("ij,ij->i", shown, shown)  # how much of each unknown is determined, 0 to 1
-    kept = [name for name, columns in columns_of(layout) if seen[columns].max(initial=0.0) > SEEN]
+    kept = [name for name, columns in layout.columns() if seen[columns].max(initial=0.0) > SEEN]
     if not kept:
         raise UndeterminedError("the readings determine none of the machine's errors", [])
     smaller = error_parameters(layout.machine, kept)
-    columns = np.concatenate([np.arange(span.start, span.stop) for name, span in columns_of(layout) if name in kept])
+    columns = np.concatenate([np.arange(span.start, span.stop) for name, span in layout.columns() if name in kept])
     curves = [curve.error.name in kept for curve in layout.curves]
     observations = replace(observations, design=observations.design[:, columns], shows=observations.shows[:, curves])
     unreached, tied = _far_nodes(smaller, observations, accepted)
@@ -160,21 +196,14 @@ def _optimum(
         rank=rank,
         freedom=int(np.count_nonzero(accepted)) - rank - _range(others).shape[1],
         condition=float(values[0] / values[values > RCOND * values[0]][-1]),
-        partly=tuple(name for name, columns in columns_of(layout) if share[columns].min(initial=1.0) < WHOLLY),
+        partly=tuple(name for name, columns in layout.columns() if share[columns].min(initial=1.0) < WHOLLY),
     )
-
-
-def columns_of(layout: ErrorParameters) -> list[tuple[str, slice]]:
-    """Name and columns of every unknown error."""
-    first = layout.size - len(layout.squareness)
-    squareness = [(name, slice(first + k, first + k + 1)) for k, name in enumerate(layout.squareness)]
-    return [*((curve.error.name, curve.columns) for curve in layout.curves), *squareness]
 
 
 def _kinds(layout: ErrorParameters) -> tuple[NDArray[np.bool_], FloatArray]:
     """Which unknowns belong to angular curves, and the unit of each: mm, and for all angles mm at ``LEVER_MM``."""
     angular, unit = np.zeros(layout.size, dtype=bool), np.ones(layout.size)
-    for name, columns in columns_of(layout):
+    for name, columns in layout.columns():
         angular[columns] = error_named(name).kind == "angular"
         unit[columns] = 1.0 if error_named(name).kind == "linear" else 1.0 / LEVER_MM
     return angular, unit

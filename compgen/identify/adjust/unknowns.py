@@ -83,6 +83,27 @@ class ErrorParameters:
             design[:, :, self.size - len(self.squareness) + k] = columns[:, :, ERROR_INDEX[name]]
         return design
 
+    def columns(self) -> list[tuple[str, slice]]:
+        """Name and columns of every unknown error."""
+        first = self.size - len(self.squareness)
+        squareness = [(name, slice(first + k, first + k + 1)) for k, name in enumerate(self.squareness)]
+        return [*((curve.error.name, curve.columns) for curve in self.curves), *squareness]
+
+    def value_rows(self, names: Sequence[str], position_mm: FloatArray) -> FloatArray:
+        """Derivative of error values, by name and position (k,), by the unknowns: (k, size).
+
+        Zero for errors that are not among the unknowns; the position of a squareness error means nothing.
+        """
+        rows, label = np.zeros((len(names), self.size)), np.array(names)
+        curves = {curve.error.name: curve for curve in self.curves}
+        for name, columns in self.columns():
+            own = label == name
+            if name in curves:
+                rows[own, columns] = self.basis(curves[name].error.axis, position_mm[own]) @ curves[name].free
+            else:
+                rows[own, columns] = 1.0
+        return rows
+
     def output_positions_mm(self, axis: int) -> FloatArray:
         """Positions at which the curves of an axis are written: the nodes, for cubic curves with more in between."""
         nodes = self.machine.axes[axis].nodes_mm
