@@ -4,6 +4,7 @@ import re
 import time
 from dataclasses import replace
 from decimal import Decimal
+from fractions import Fraction
 from itertools import product
 from pathlib import Path
 
@@ -450,6 +451,7 @@ def test_tables_around_kept_ones_keep_their_order_and_their_multiplier():
 
 def test_tables_are_the_terms_of_both_directions_and_their_products():
     assert term_names(MIXED) == {"X(z)", "X(y)*z"}
+    assert term_names({index: MIXED[index] for index in (3, 5)}) == {"X(y)*z"}  # a factor is no term of its own
     assert term_names({0: table_of(1, 0, 0.1, direction=-1)}) == set()
 
 
@@ -472,6 +474,21 @@ def test_a_product_below_half_of_the_last_decimal_is_left_out(angle_rad, written
     terms = [straight, product_term]
     tables = folded_tables(terms, {term.name: term.start for term in terms}, flip=False, mode="S2")
     assert any(entry.multiplier for entry in tables.values()) is written
+
+
+@pytest.mark.parametrize("largest_rad", [1.7e-5, 2.3e-5, 7.1e-5])
+def test_the_fold_of_a_lever_is_the_nearest_to_its_line_in_the_last_decimal(largest_rad):
+    """What the control makes of the two nodes of the lever between them, and the table that cancels it at its own."""
+    x, z = np.array([0.0, 100.0]), np.array([-70.0, 20.0, 110.0, 200.0, 290.0])
+    terms = [
+        Term("X(z)", 2, z, (Monomial(0),), np.zeros(5)),
+        Term("X(x)*z", 0, x, (Monomial(0, 1, 2, 0.0),), np.array([0.0, largest_rad])),
+    ]
+    fold, _, lever = folded_tables(terms, {t.name: t.start for t in terms}, flip=False, mode="S4").values()
+    first, last = (int(value * 10**9) for value in lever.table.values)
+    for place, value in enumerate(fold.table.values):
+        exact = Fraction(first) + Fraction(place, 4) * (last - first)
+        assert abs(int(value * 10**9) + exact) <= Fraction(1, 2)
 
 
 @pytest.mark.parametrize(("sign", "plus"), [("error", +0.004), ("correction", -0.004)])
