@@ -15,7 +15,7 @@ from pathlib import Path
 
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import claims, decisions, logs
-from compgen.fleet.claims import ChangedMeanwhileError, keep_result
+from compgen.fleet.claims import keep_result
 from compgen.fleet.decisions import check_person
 from compgen.fleet.job import Job, MachineJob
 from compgen.fleet.process import ADOPTED, process, without_folder
@@ -154,8 +154,6 @@ def _follow(store: Store, job: MachineJob, machine: MachineRecord, done: str) ->
 # After machine file, instrument, policy or program changed: nothing old is replaced, there is one more identification of
 # the measurement and one more version of the tables, judged as any other. The history says who requested it and why.
 
-#: How often it is judged again because other tables became active meanwhile.
-JUDGED_AT_MOST = 5
 SHORTEST_HASH = 8
 #: Kind of the events that say why a measurement could not be processed again.
 REPROCESS_FAILED = "reprocess"
@@ -225,39 +223,26 @@ def _chosen(store: Store, machine: MachineRecord, requested: str | None) -> Meas
 def _again(
     store: Store, job: MachineJob, machine: MachineRecord, measurement: MeasurementRecord, request: ReprocessRequest
 ) -> tuple[TableRecord, int]:
-    for _ in range(JUDGED_AT_MOST):
-        claim = claims.take(store, measurement, claims.owner_name(), again=True)
-        if claim is None:
-            raise claims.ClaimLostError(f"{machine.name}: another runner works on {measurement.name}; try again later")
+    stated = "" if request.active_table is None else f" with active_table = {request.active_table}"
+    why = f"{measurement.name} processed again{stated}: {request.reason}"
+
+    def work(claim: claims.Claim) -> tuple[TableRecord, int]:
+        started = time.monotonic()
         done = [item for item in store.identifications(machine) if item.measurement_id == measurement.id]
         revision = 1 + max((item.revision for item in done), default=0)
         try:
-            return _kept(store, job, machine, (measurement, claim), request, revision), revision
-        except ChangedMeanwhileError:
-            claims.give_back(store, claim)
-        except BaseException as error:
-            claims.give_back(store, claim)
-            if isinstance(error, CompgenError):
-                told = f"{request.actor} ({request.reason}): {without_folder(str(error))}"
-                store.add_event(REPROCESS_FAILED, measurement.name, told, machine)
+            with claims.renewal(store, claim):
+                found = process(store, job, machine, measurement, request.active_table)
+        except CompgenError as error:
+            told = f"{request.actor} ({request.reason}): {without_folder(str(error))}"
+            store.add_event(REPROCESS_FAILED, measurement.name, told, machine)
             raise
-    raise claims.ClaimLostError(f"{machine.name}: other tables become active again and again; try again later")
+        result = replace(
+            found.result, seconds=time.monotonic() - started, revision=revision, actor=request.actor, reason=why
+        )
+        return keep_result(store, machine, claim, result, found.judged_against), revision
 
-
-def _kept(
-    store: Store,
-    job: MachineJob,
-    machine: MachineRecord,
-    work: tuple[MeasurementRecord, claims.Claim],
-    request: ReprocessRequest,
-    revision: int,
-) -> TableRecord:
-    measurement, claim = work
-    started = time.monotonic()
-    with claims.renewal(store, claim):
-        done = process(store, job, machine, measurement, request.active_table)
-    stated = "" if request.active_table is None else f" with active_table = {request.active_table}"
-    why = f"{measurement.name} processed again{stated}: {request.reason}"
-    who = {"revision": revision, "actor": request.actor, "reason": why}
-    result = replace(done.result, seconds=time.monotonic() - started, **who)  # type: ignore[arg-type]
-    return keep_result(store, machine, claim, result, done.judged_against)
+    try:
+        return claims.work_on(store, measurement, work, again=True)
+    except claims.ClaimLostError as error:
+        raise claims.ClaimLostError(f"{machine.name}: {measurement.name}: {error}; try again later") from error

@@ -12,20 +12,20 @@ import json
 import os
 import socket
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
 from compgen.data.files import json_values
 from compgen.errors import CompgenError
 from compgen.fleet import database, logs
-from compgen.fleet.database import put_blobs
+from compgen.fleet.database import inserted, put_blobs
 from compgen.fleet.decisions import add_decision, locked_decisions
 from compgen.fleet.records import (
     AUTOMATIC,
@@ -39,10 +39,14 @@ from compgen.fleet.records import (
 )
 from compgen.fleet.store import Store
 
+Result = TypeVar("Result")
+
 #: How long a claim counts without being renewed, s.
 LEASE_S = 900.0
 #: A claim is renewed when this share of its time is over.
 RENEWED_AT = 1.0 / 3.0
+#: How often a measurement is judged again because other tables became active meanwhile.
+JUDGED_AT_MOST = 5
 
 
 class ClaimLostError(CompgenError):
@@ -128,6 +132,39 @@ def take(
         if claim is None:
             in_hand.end(owner, measurement.id)
     return claim
+
+
+def work_on(
+    store: Store, measurement: MeasurementRecord, work: Callable[[Claim], Result], *, again: bool = False
+) -> Result:
+    """Do ``work`` on a measurement with a claim, which ends when the work keeps what came of it.
+
+    Where other tables became active meanwhile (ChangedMeanwhileError) the work is done again. Any other error ends it and
+    gives the claim back. With ``again`` a measurement that is done may be worked on too.
+
+    Raises
+    ------
+    ClaimLostError
+        if nothing was kept, because of another runner or of tables that change again and again; it says which.
+    """
+    for _ in range(JUDGED_AT_MOST):
+        claim = take(store, measurement, owner_name(), again=again)
+        if claim is None:
+            raise ClaimLostError("another runner works on it")
+        try:
+            return work(claim)
+        except ChangedMeanwhileError:
+            give_back(store, claim)
+        except (ClaimLostError, sa.exc.IntegrityError) as error:
+            forget(store, claim)
+            raise ClaimLostError("another runner took it over") from error
+        except BaseException:
+            try:
+                give_back(store, claim)
+            except (CompgenError, sa.exc.SQLAlchemyError) as error:  # must not hide the error on its way
+                logs.error("claim not given back", problem=str(error))
+            raise
+    raise ClaimLostError("other tables became active again and again")
 
 
 def renew(store: Store, claim: Claim, lease_s: float | None = None) -> Claim:
@@ -335,6 +372,30 @@ def keep_result(
 
 def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, claim: Claim, new: NewResult) -> int:
     now = store.now(connection)
+    versions = sa.select(sa.func.max(database.tables.c.version)).where(database.tables.c.machine_id == machine.id)
+    last = connection.execute(versions).scalar()
+    table = {
+        "machine_id": machine.id,
+        "version": (last or 0) + 1,
+        "identification_id": _insert_errors(connection, machine, claim, new, now),
+        "accepted": new.accepted,
+        "controllers": list(dict.fromkeys(file.controller for file in new.files)),
+        "reasons": [*new.hold, *new.reservations],
+        "summary": clean(new.judgement),
+        "at": now,
+    }
+    table_id = inserted(connection, database.tables, table)
+    for file, digest in zip(new.files, put_blobs(connection, [file.content for file in new.files]), strict=True):
+        row = {"table_id": table_id, "controller": file.controller, "name": file.name, "sha256": digest}
+        connection.execute(sa.insert(database.table_files).values(**row))
+    attempt = {"outcome": "done", "message": "", "settings_sha256": new.settings_sha256, "seconds": new.seconds}
+    _add_attempt(store, connection, machine, claim, attempt)
+    return table_id
+
+
+def _insert_errors(
+    connection: sa.Connection, machine: MachineRecord, claim: Claim, new: NewResult, now: datetime
+) -> int:
     parts = [new.machine_text, new.errors_text, new.covariance, new.fitted_text]
     digests = iter(put_blobs(connection, [part for part in parts if part is not None]))
     machine_sha, errors_sha, covariance_sha, fitted_sha = (
@@ -344,7 +405,7 @@ def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, cla
     same = sa.select(files.c.id).where(files.c.machine_id == machine.id, files.c.sha256 == machine_sha)
     machine_version_id = connection.execute(same).scalar()
     if machine_version_id is None:
-        machine_version_id = _added(connection, files, {"machine_id": machine.id, "sha256": machine_sha, "at": now})
+        machine_version_id = inserted(connection, files, {"machine_id": machine.id, "sha256": machine_sha, "at": now})
     identification = {
         "machine_id": machine.id,
         "measurement_id": claim.measurement_id,
@@ -358,26 +419,7 @@ def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, cla
         "at": now,
         "revision": new.revision,
     }
-    identification_id = _added(connection, database.identifications, identification)
-    versions = sa.select(sa.func.max(database.tables.c.version)).where(database.tables.c.machine_id == machine.id)
-    last = connection.execute(versions).scalar()
-    table = {
-        "machine_id": machine.id,
-        "version": (last or 0) + 1,
-        "identification_id": identification_id,
-        "accepted": new.accepted,
-        "controllers": list(dict.fromkeys(file.controller for file in new.files)),
-        "reasons": [*new.hold, *new.reservations],
-        "summary": clean(new.judgement),
-        "at": now,
-    }
-    table_id = _added(connection, database.tables, table)
-    for file, digest in zip(new.files, put_blobs(connection, [file.content for file in new.files]), strict=True):
-        row = {"table_id": table_id, "controller": file.controller, "name": file.name, "sha256": digest}
-        connection.execute(sa.insert(database.table_files).values(**row))
-    attempt = {"outcome": "done", "message": "", "settings_sha256": new.settings_sha256, "seconds": new.seconds}
-    _add_attempt(store, connection, machine, claim, attempt)
-    return table_id
+    return inserted(connection, database.identifications, identification)
 
 
 def keep_failure(
@@ -399,12 +441,6 @@ def _add_attempt(
 ) -> None:
     about = {"machine_id": machine.id, "measurement_id": claim.measurement_id, "owner": claim.owner}
     connection.execute(sa.insert(database.attempts).values(**about, **attempt, at=store.now(connection)))
-
-
-def _added(connection: sa.Connection, table: sa.Table, values: Mapping[str, Any]) -> int:
-    key = connection.execute(sa.insert(table).values(**values)).inserted_primary_key
-    assert key is not None
-    return int(key[0])
 
 
 def clean(value: Any) -> Any:

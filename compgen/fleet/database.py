@@ -11,7 +11,7 @@ import os
 import secrets
 import time
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -433,6 +433,13 @@ def _revision(connection: sa.Connection) -> str | None:
             f"the store has schema {found}, which only unreleased versions of compgen wrote; begin a new one"
         )
     return None if found is None else str(found)
+
+
+def inserted(connection: sa.Connection, table: sa.Table, values: Mapping[str, Any]) -> int:
+    """Add a row to a table that numbers its rows, and return its number."""
+    key = connection.execute(sa.insert(table).values(**values)).inserted_primary_key
+    assert key is not None
+    return int(key[0])
 
 
 def put_blobs(connection: sa.Connection, contents: Iterable[bytes]) -> list[str]:

@@ -185,6 +185,17 @@ class _Seen:
     ledger_text: str | None
     versions: tuple[str, ...]
 
+    @property
+    def ledger(self) -> dict[str, Any] | None:
+        """What the ledger says; None where it is missing, damaged, or of an older program."""
+        try:
+            found = json.loads(self.ledger_text or "")
+        except ValueError:
+            return None
+        kinds = {"machine": str, "decisions": int, "sha256": str}
+        whole = isinstance(found, dict) and all(isinstance(found.get(key), kind) for key, kind in kinds.items())
+        return found if whole else None
+
 
 def lineage(store: Store, machine: MachineRecord) -> list[str]:
     """Return the hash of the machine's history after each decision: what was decided about which contents.
@@ -243,13 +254,8 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
     unknown = [name for name in seen.versions if name not in known]
     if unknown:
         raise InputError(f"holds {', '.join(unknown)}, which this store never made active; {then}", file=folder)
-    try:
-        ledger = json.loads(seen.ledger_text or "")
-    except ValueError:
-        ledger = None
-    kinds = {"machine": str, "decisions": int, "sha256": str}
-    if not isinstance(ledger, dict) or not all(isinstance(ledger.get(key), kind) for key, kind in kinds.items()):
-        # missing, damaged or of an older program: by the contents
+    ledger = seen.ledger
+    if ledger is None:  # then by the contents
         for name in seen.versions:
             if _is_of_others(folder / name, _about(store, machine, known[name])):
                 raise InputError(

@@ -16,14 +16,12 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import sqlalchemy as sa
-
 from compgen.data.files import FOLDERS, read_bytes, working_folder
 from compgen.data.machine import load_machine
 from compgen.data.messages import visible
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import claims, inbox, logs
-from compgen.fleet.claims import ChangedMeanwhileError, Claim, ClaimLostError, keep_failure, keep_result
+from compgen.fleet.claims import Claim, ClaimLostError, keep_failure, keep_result
 from compgen.fleet.database import StoreError, plain, sqlite_path
 from compgen.fleet.job import Job, MachineJob
 from compgen.fleet.process import FOLDER, process, without_folder, write_files
@@ -72,9 +70,6 @@ def passes(error: BaseException) -> bool:
         cause = cause.__cause__
     return False
 
-
-#: How often a measurement is judged again because other tables became active meanwhile.
-JUDGED_AT_MOST = 5
 
 StopCheck = Callable[[], bool]
 Mapper = Callable[[Callable[[MachineJob], "MachineOutcome"], Iterable[MachineJob]], Iterable["MachineOutcome"]]
@@ -283,40 +278,16 @@ class _Pass:
                 self.messages.append("stopped; the rest is processed by the next run")
                 break
             seen.add(measurement.id)
-            with one_thread():  # the same bytes however many processors there are
-                if not self._process(measurement, settings):
-                    break
+            try:
+                with one_thread():  # the same bytes however many processors there are
+                    claims.work_on(self.store, measurement, partial(self._keep, measurement, settings))
+            except ClaimLostError as error:
+                self.messages.append(f"{measurement.name}: {error}; it is left to the next run")
+                self.again = True
+                break
             waiting = waiting[1:] or self._waiting(settings, seen)
 
-    def _process(self, measurement: MeasurementRecord, settings: str) -> bool:
-        """Process one measurement; return whether the next one may follow."""
-        for _ in range(JUDGED_AT_MOST):
-            claim = claims.take(self.store, measurement, claims.owner_name())
-            if claim is None:
-                return self._leave(measurement, "another runner has it")
-            try:
-                self._keep(measurement, claim, settings)
-                return True
-            except ChangedMeanwhileError:
-                claims.give_back(self.store, claim)
-            except (ClaimLostError, sa.exc.IntegrityError):
-                claims.forget(self.store, claim)
-                return self._leave(measurement, "another runner took it over")
-            except BaseException:
-                try:
-                    claims.give_back(self.store, claim)
-                except (CompgenError, sa.exc.SQLAlchemyError) as error:  # must not hide the error on its way
-                    logs.error("claim not given back", problem=str(error))
-                raise
-        return self._leave(measurement, "other tables became active again and again; it is judged by the next run")
-
-    def _leave(self, measurement: MeasurementRecord, why: str) -> bool:
-        """Say why a measurement is not processed now."""
-        self.messages.append(f"{measurement.name}: {why}")
-        self.again = True
-        return False
-
-    def _keep(self, measurement: MeasurementRecord, claim: Claim, settings: str) -> None:
+    def _keep(self, measurement: MeasurementRecord, settings: str, claim: Claim) -> None:
         started = time.monotonic()
         try:
             with claims.renewal(self.store, claim), limited(60.0 * self.job.max_minutes):

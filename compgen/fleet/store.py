@@ -27,7 +27,7 @@ from compgen.data.files import decoded, sha256_of, working_folder
 from compgen.data.machine import Machine, parse_machine
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import database
-from compgen.fleet.database import StoreError, engine_of, first_line, put_blobs, retried, shown, upgrade
+from compgen.fleet.database import StoreError, engine_of, first_line, inserted, put_blobs, retried, shown, upgrade
 from compgen.fleet.records import (
     AttemptRecord,
     DecisionRecord,
@@ -531,10 +531,10 @@ def _insert_measurement(connection: sa.Connection, machine_id: int, new: NewMeas
         "active_table": new.active_table,
         "temperatures_c": {name: dict(figures) for name, figures in new.temperatures_c.items()},
     }
-    key = connection.execute(sa.insert(database.measurements).values(**values)).inserted_primary_key
+    number = inserted(connection, database.measurements, values)
     digests = put_blobs(connection, new.contents.values())
     rows = [
-        {"measurement_id": key[0] if key else None, "name": name, "sha256": digest}
+        {"measurement_id": number, "name": name, "sha256": digest}
         for name, digest in zip(new.contents, digests, strict=True)
     ]
     connection.execute(sa.insert(database.measurement_files), rows)
