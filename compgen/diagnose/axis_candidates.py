@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,12 @@ BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
 
 def candidates_of(session: AxisSession, only: Sequence[str] = ()) -> list[Candidate]:
     """Return everything that is compared; ``only`` limits the names."""
-    warm = catalogue()["warmup_drift"]
+    known = catalogue()
+    warm = known["warmup_drift"]
     slow = [_candidate(session, warm.at(tau), WARMUP_SCANS) for tau in warm.positions(session.readings)]
-    slow.append(_candidate(session, catalogue()["linear_drift"], LINEAR_SCANS))
+    slow.append(_candidate(session, known["linear_drift"], LINEAR_SCANS))
     drifts = [item for item in slow if item is not None]
-    found = [*drifts, *_disturbed(session), *_steps(session), *_logged(session)]
+    found = [*drifts, *_disturbed(session, known), *_steps(session, known), *_logged(session, known)]
     found = [c for c in found if not only or c.name in only]
     return [*found, *_generic(session)]
 
@@ -45,7 +47,7 @@ def invisible_of(session: AxisSession) -> tuple[str, ...]:
     """Names that these runs cannot show: what is equal in every run is part of the curve of the axis."""
     letter = session.letter
     hidden = [f"periodic_{letter}"]
-    seen = {candidate.name for candidate in _logged(session)}
+    seen = {candidate.name for candidate in _logged(session, catalogue())}
     hidden += [name for name in _logged_names(letter) if name not in seen]
     if not len(session.both):
         hidden += [f"backlash_{letter}", f"lost_motion_{letter}"]
@@ -61,23 +63,14 @@ def _candidate(session: AxisSession, effect: Effect, scans: float, text: str = "
     if columns is None or not np.isfinite(columns).all():
         return None
     first, last = (int(effect.settings.get(key, -1)) for key in ("first", "last"))
-    return Candidate(
-        effect.card.name,
-        "named",
-        columns,
-        scans,
-        text or effect.card.title,
-        effect.card.covariates,
-        effect,
-        first,
-        last,
-    )
+    card = effect.card
+    return Candidate(card.name, "named", columns, scans, text or card.title, card.covariates, effect, first, last)
 
 
-def _steps(session: AxisSession) -> list[Candidate]:
+def _steps(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]:
     if not session.in_runs:
         return []
-    step = catalogue()["step_between_runs"]
+    step = known["step_between_runs"]
     at = (np.flatnonzero(np.diff(session.leg)) + 1).tolist()
     found = []
     for k in at:
@@ -91,9 +84,9 @@ def _runs(session: AxisSession) -> float:
     return float(session.leg.max()) + 1.0
 
 
-def _disturbed(session: AxisSession) -> list[Candidate]:
+def _disturbed(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]:
     """One run (or one way of it) that is off, and shorter bursts."""
-    bad, burst = catalogue()["bad_run"], catalogue()["disturbed_readings"]
+    bad, burst = known["bad_run"], known["disturbed_readings"]
     runs = set() if not session.in_runs else {_ends(session.leg == k) for k in range(int(session.leg.max()) + 1)}
     runs |= {_ends(session.cycle == k) for k in range(int(session.cycle.max()) + 1)} if runs else set()
     runs = runs if len(runs) > 1 else set()
@@ -103,9 +96,7 @@ def _disturbed(session: AxisSession) -> list[Candidate]:
         item = _candidate(session, chosen, _runs(session), session.window(first, last))
         assert item is not None
         found.append(item)
-        columns = np.zeros((len(session), last - first + 1))
-        columns[np.arange(first, last + 1), np.arange(last - first + 1)] = 1.0
-        found.append(_free(item, columns))
+        found.append(_free(item, len(session)))
     n, longest = len(session), max(int(np.bincount(session.leg).max()), len(session) // 10) - 1
     windows = [(k, k + size - 1) for size in BURSTS if size <= longest for k in range(n - size + 1)]
     windows = windows[:: max(1, len(windows) // MOST_WINDOWS)] if len(windows) > MOST_WINDOWS else windows
@@ -118,17 +109,13 @@ def _disturbed(session: AxisSession) -> list[Candidate]:
         assert item is not None
         found.append(item)
         if 1 < last - first + 1 <= LONGEST_FREE:
-            columns = np.zeros((n, last - first + 1))
-            columns[np.arange(first, last + 1), np.arange(last - first + 1)] = 1.0
-            found.append(_free(item, columns))
+            found.append(_free(item, n))
     return found
 
 
-def _free(item: Candidate, columns: FloatArray) -> Candidate:
-    """The same readings with a value of their own each."""
-    return Candidate(
-        item.name, "named", columns, item.scans, item.text, item.covariates, item.effect, item.first, item.last, True
-    )
+def _free(item: Candidate, count: int) -> Candidate:
+    """The same readings of a session with ``count``, each with a value of its own."""
+    return replace(item, columns=np.eye(count, item.last - item.first + 1, -item.first), free=True)
 
 
 def _ends(chosen: NDArray[np.bool_]) -> tuple[int, int]:
@@ -136,9 +123,9 @@ def _ends(chosen: NDArray[np.bool_]) -> tuple[int, int]:
     return int(rows[0]), int(rows[-1])
 
 
-def _logged(session: AxisSession) -> list[Candidate]:
+def _logged(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]:
     """Effects that need a temperature or a dwell that was logged and changed between repeats."""
-    known, found = catalogue(), []
+    found = []
     for name in _logged_names(session.letter):
         effect = known[name]
         positions = effect.positions(session.readings)

@@ -224,34 +224,14 @@ def _findings(
     grid = NoiseGrid(session)
     repeated = session.repeated and grid.freedom >= LEAST_REPEATS
     search = Search(session, grid, candidates_of(session, names) if repeated else [])
-    members = search.run(most) if repeated else []
-    members = _added(search, members, add)
+    members = _added(search, search.run(most) if repeated else [], add)
     changes = _Changes(search, members)
     source = "repeats" if repeated else "stated" if u_um is not None else "assumed"
     reversal = _Reversal(changes, None if repeated else u_um)
-    generic = [k for k in members if search.candidates[k].tier == "generic"]
-    unknown = [_unknown_of(changes, k) for k in generic]
-    if len(members) >= most > 0 and search.criteria(members)[1].max() >= LEAST_GAIN:
-        unknown.append(AxisUnknown(f"more than {most} changes: the session does not repeat", ("time", "run"), np.nan))
-    effects = [_change(changes, k, generic) for k in members if k not in generic]
-    doubled = _doubled(effects)
-    if doubled:
-        effects = [_doubted(item, "the runs do not repeat") for item in effects]
-        text = "the runs do not repeat: more than one of them is off, or steps between more than two of them"
-        unknown.append(AxisUnknown(text, ("run", *_one_way(session, effects)), np.nan, doubled))
+    effects, unknown = _changes_found(changes, most)
     if repeated and not unknown:
-        unknown += _restless(changes)
-    static, irregular = reversal.found(names, add, source)
-    # a reversal is doubtful where it changes with time, and a small one where anything else has no name
-    if any({"time", "approach"} <= set(other.covariates) for other in unknown):
-        static = [_doubted(item, "the reversal changes with time") for item in static]
-    elif unknown:
-        least = LEAST_BESIDE_RUNS if any("run" in other.covariates for other in unknown) else LEAST_BESIDE
-        static = [_doubted(i, "small beside what has no name") if i.gain < least else i for i in static]
-    unknown += irregular
-    effects = [*sorted(effects, key=lambda item: -item.gain), *static]
-    if unknown:
-        effects = [replace(e, grade="beside_unknown") if e.grade == "confirmed" else e for e in effects]
+        unknown = _restless(changes)
+    effects, unknown = _beside_each_other(effects, unknown, reversal.found(names, add, source))
     if not unknown and effects and all(e.grade == "tentative" for e in effects) and repeated:
         first = effects[0]
         unknown = [AxisUnknown(f"resembles {first.name} but {first.reasons[0]}", (), np.nan, first.name)]
@@ -263,22 +243,51 @@ def _findings(
         session, tuple(effects), tuple(unknown), invisible_of(session),
         changes.sigma_mm if repeated else reversal.sigma_mm, changes.phi if repeated else 0.0, source,
         removed, left_out, taken, figures, before, after, _held_out(session, effects, left_out),
-        _suspects(search) if repeated else (), tuple(notes),
+        search.suspects() if repeated else (), tuple(notes),
         None if against is None else _compared(changes, against),
     )  # fmt: skip
 
 
-def _doubled(effects: Sequence[AxisEffect]) -> str:
-    """Name of which there is more than one, a run that is off or a step; empty if none.
+def _changes_found(changes: _Changes, most: int) -> tuple[list[AxisEffect], list[AxisUnknown]]:
+    """The changes with time: those with a name, the most telling first, and those without one.
 
-    The last run off and a step before it are the same readings: they count as the one of which there is none yet.
+    Of what goes by whole runs (a run that is off, a step) one of each kind is a name; where there are more, the runs do not
+    repeat. The last run off and a step before it are the same readings: they count as the one of which there is none yet.
     """
+    search, members = changes.search, changes.members
+    generic = [k for k in members if search.candidates[k].tier == "generic"]
+    unknown = [_unknown_of(changes, k) for k in generic]
+    if len(members) >= most > 0 and search.criteria(members)[1].max() >= LEAST_GAIN:
+        unknown.append(AxisUnknown(f"more than {most} changes: the session does not repeat", ("time", "run"), np.nan))
+    effects = [_change(changes, k, generic) for k in members if k not in generic]
     of_runs = [item for item in effects if item.name in OF_RUNS]
-    if len({item.name for item in of_runs}) == len(of_runs):
-        return ""
     may_be = [{name for name, weight in item.alias if weight > AS_WELL} for item in of_runs]
-    either = any(set(OF_RUNS) <= names for names in may_be)
-    return "" if either and len(of_runs) == 2 else of_runs[0].name
+    one_of_each = len(of_runs) == 2 and any(set(OF_RUNS) <= names for names in may_be)
+    if len({item.name for item in of_runs}) < len(of_runs) and not one_of_each:
+        effects = [_doubted(item, "the runs do not repeat") for item in effects]
+        text = "the runs do not repeat: more than one of them is off, or steps between more than two of them"
+        covariates = ("run", *_one_way(changes.session, effects))
+        unknown.append(AxisUnknown(text, covariates, np.nan, of_runs[0].name))
+    return sorted(effects, key=lambda item: -item.gain), unknown
+
+
+def _beside_each_other(
+    effects: Sequence[AxisEffect], unknown: Sequence[AxisUnknown], reversal: tuple[list[AxisEffect], list[AxisUnknown]]
+) -> tuple[list[AxisEffect], list[AxisUnknown]]:
+    """Changes with time and the reversal, each graded by what has no name.
+
+    A reversal is doubtful where it changes with time, and a small one where anything else has no name.
+    """
+    static, irregular = reversal
+    if any({"time", "approach"} <= set(other.covariates) for other in unknown):
+        static = [_doubted(item, "the reversal changes with time") for item in static]
+    elif unknown:
+        least = LEAST_BESIDE_RUNS if any("run" in other.covariates for other in unknown) else LEAST_BESIDE
+        static = [_doubted(i, "small beside what has no name") if i.gain < least else i for i in static]
+    graded, nameless = [*effects, *static], [*unknown, *irregular]
+    if nameless:
+        graded = [replace(e, grade="beside_unknown") if e.grade == "confirmed" else e for e in graded]
+    return graded, nameless
 
 
 def _one_way(session: AxisSession, effects: Sequence[AxisEffect]) -> tuple[str, ...]:
@@ -328,10 +337,8 @@ def _levels_off(means: FloatArray, drift: FloatArray, u_mm: float) -> bool:
     sense, half = np.sign(drift[:, -1].sum() - drift[:, 0].sum()), (runs - 1) // 2
     up, left = sense * means, (sense * (means - drift)).mean(axis=0)
     first, second = up[:, half] - up[:, 0], up[:, -1] - up[:, -1 - half]
-    step, turn = (
-        2.0 * 2.0**0.5 * u_mm,
-        2.0 * 6.0**0.5 * u_mm,
-    )  # of a difference, and of a difference of two with one in common
+    # of a difference, and of a difference of two with one in common
+    step, turn = 2.0 * 2.0**0.5 * u_mm, 2.0 * 6.0**0.5 * u_mm
     return bool(
         np.diff(up).min() > -step
         and (up[:, -1] - up[:, 0]).min() > step
@@ -615,9 +622,7 @@ class _Reversal:
         self.s = session.s[[int(np.flatnonzero(session.target == k)[0]) for k in self.targets]]
         if self.known:
             base = np.eye(len(session.targets_mm))[session.target]
-            one_way = [k for k in range(base.shape[1]) if k not in self.targets]
-            extra = np.eye(len(session.targets_mm))[session.target][:, self.targets] * session.direction[:, None]
-            assert not one_way or base.shape[1]
+            extra = base[:, self.targets] * session.direction[:, None]
             self.half, self.covariance = changes.estimate(np.hstack([base, changes.columns]), extra)
             self.freedom = changes.freedom
             return
@@ -842,16 +847,6 @@ def _held_out(session: AxisSession, effects: Sequence[AxisEffect], left_out: Int
     return float(np.sqrt(total[0])), float(np.sqrt(total[1]))
 
 
-def _suspects(search: Search) -> tuple[tuple[str, float], ...]:
-    """Names by what each explains by itself."""
-    gains = search.criteria([])[0]
-    best: dict[str, float] = {}
-    for candidate, gain in zip(search.candidates, gains, strict=True):
-        if candidate.tier == "named" and not candidate.free:
-            best[candidate.name] = max(best.get(candidate.name, 0.0), float(gain))
-    return tuple(sorted(best.items(), key=lambda item: -item[1]))
-
-
 def _compared(changes: _Changes, errors: ErrorTable) -> dict[str, Any]:
     """The mean curve against predicted errors: RMS of the difference without its mean, and whether it is more than noise."""
     session = changes.session
@@ -955,7 +950,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
         }
 
     def _advice(self) -> list[str]:
-        found = []
+        known, found = catalogue(), []
         for part in self.axes:
             for item in part.effects:
                 others = [name for name, _ in item.alias if name != item.name]
@@ -970,7 +965,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
                 )
             shown: dict[str, list[str]] = {}
             for name in part.invisible:
-                shown.setdefault(catalogue()[name].card.breaker, []).append(name)
+                shown.setdefault(known[name].card.breaker, []).append(name)
             found += [f"{how}: would show {', '.join(names)}, which these runs cannot" for how, names in shown.items()]
         return list(dict.fromkeys(found))
 
@@ -999,9 +994,9 @@ class AxisDiagnosis(DisplayedDiagnosis):
     def extended(self) -> str:
         """The machine file with what of the effects belongs to the machine; empty without such an effect or a file."""
         sections = [text for part in self.axes for text in _sections(part)]
-        if not sections or self.machine.source is None:
+        if not sections or self.machine.file is None:
             return ""
-        text = read_text(self.machine.source).rstrip("\n")
+        text = read_text(self.machine.file).rstrip("\n")
         return "\n".join([text, "", "", "# found by volcomp diagnose in axis runs", *sections])
 
     def removed_csv(self) -> str:
@@ -1053,12 +1048,12 @@ def _sections(part: AxisFindings) -> list[str]:
     for item in part.effects:
         if item.grade == "tentative":
             continue
-        if item.static:
-            taken = item.values[1:] if item.name.startswith("lost_motion") else item.values[:1]
-            reversal[1 : 1 + len(taken)] += taken if item.name.startswith("lost_motion") else 0.0
-            reversal[0] += 0.0 if item.name.startswith("lost_motion") else float(taken[0])
-            if item.name.startswith("lost_motion") and not any(e.name.startswith("backlash") for e in part.effects):
+        if item.static and item.name.startswith("lost_motion"):
+            reversal[1 : len(item.values)] += item.values[1:]
+            if not any(e.name.startswith("backlash") for e in part.effects):
                 reversal[0] += float(item.values[0])
+        elif item.static:
+            reversal[0] += float(item.values[0])
         elif item.name.rpartition("_")[0] in MACHINE_EFFECTS:
             found.append(section_text(item.effect, session.readings, item.values))
     if not reversal.any():

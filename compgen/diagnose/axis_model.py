@@ -253,6 +253,14 @@ class Search:
         """Return y'Py (points,) beside some members, never below the resolution."""
         return np.maximum(self._state(members).square, self.grid.freedom * LEAST_MM**2)
 
+    def suspects(self) -> tuple[tuple[str, float], ...]:
+        """Names with what each explains by itself, rise of twice the log likelihood, the most telling first."""
+        best: dict[str, float] = {}
+        for candidate, gain in zip(self.candidates, self.criteria([])[0].tolist(), strict=True):
+            if candidate.tier == "named" and not candidate.free:
+                best[candidate.name] = max(best.get(candidate.name, 0.0), gain)
+        return tuple(sorted(best.items(), key=lambda item: -item[1]))
+
     def _pull(self, member: int) -> FloatArray:
         if member not in self._pulled:
             columns = self.candidates[member].columns

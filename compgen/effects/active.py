@@ -76,6 +76,8 @@ def active_effects(machine: Machine) -> tuple[ActiveEffect, ...]:
     InputError
         with file, line and key for an effect, a parameter or a setting that is not known, or that is missing.
     """
+    if not machine.effects:
+        return ()
     dead_path = machine.effects.get("dead_path")
     of_dead_path = [] if dead_path is None else dead_path_stations(dead_path.data)
     of_names = [match.group(1) for name in machine.effects if (match := STATION_NAME.fullmatch(name))]
