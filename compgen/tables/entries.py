@@ -247,6 +247,11 @@ class EntryCheck:
     depends: Mapping[str, BoolArray]
     reversal_known: bool
 
+    def of(self, tables: ReadTables) -> EntryCheck:
+        """Return the check of other tables of the same control and settings; what the errors give stays the same."""
+        changed = {} if self.made is None else _changed_by_list(tables.tables, self.made.tables)
+        return replace(self, given=tables, changed_in=changed)
+
     def reasons(self) -> list[str]:
         """Name for each axis the place where the tables hold most that the errors do not ask for; empty if nowhere."""
         within = zip(self._all_nodes(), self.machine.lower_mm, self.machine.upper_mm, strict=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -188,30 +188,45 @@ class Judge:
             ),
         ]
 
+    @cached_property
+    def best_components(self) -> dict[str, tuple[FloatArray, float]]:
+        """Components of the best correction, each with what another correction may miss it by (rms, mm)."""
+        return {
+            name: (part, max(COMPONENT_SHARE * rms(part), COMPONENT_FLOOR_MM) + self.slack_mm[AXES.index(name[0])])
+            for name, part in components(self.grid, self.best_mm).items()
+        }
+
+    @cached_property
+    def rms_before_mm(self) -> float:
+        """Exact residual without any correction, rigid motion taken out, mm rms."""
+        return self._rms_left_mm(np.zeros_like(self.best_mm))
+
+    def _rms_left_mm(self, correction_mm: FloatArray) -> float:
+        position_mm = self.grid.position_mm
+        error = exact_error(self.machine, self.errors, position_mm + correction_mm) + correction_mm
+        nominal = position_mm + tool_of(self.machine, None)
+        return residuals_twice(nominal, error)[1].rms_um * MM_PER_UM
+
     def component_reasons(self, correction_mm: FloatArray) -> list[str]:
         """Name every component of the correction (n, 3) that misses the best possible one by more than its share."""
-        fields = (correction_mm - self.best_mm, self.best_mm, correction_mm)
-        miss, best, own = (components(self.grid, part) for part in fields)
+        miss = components(self.grid, correction_mm - self.best_mm)
+        too_far = [name for name, (_, limit) in self.best_components.items() if rms(miss[name]) > limit]
+        own = components(self.grid, correction_mm) if too_far else {}
         reasons = []
-        for name in miss:
-            limit = max(COMPONENT_SHARE * rms(best[name]), COMPONENT_FLOOR_MM) + self.slack_mm[AXES.index(name[0])]
-            if rms(miss[name]) > limit:
-                ratio = np.sum(own[name] * best[name]) / max(float(np.sum(best[name] ** 2)), 1e-30)
-                hint = "; its sign is reversed" if abs(ratio + 1) < 0.1 else ""
-                reasons.append(
-                    f"correction {name}: {rms(own[name]) / MM_PER_UM:.2f} um rms in the table, "
-                    f"{rms(best[name]) / MM_PER_UM:.2f} um rms needed, they differ by "
-                    f"{rms(miss[name]) / MM_PER_UM:.2f} um{hint}"
-                )
+        for name in too_far:
+            best, _ = self.best_components[name]
+            ratio = np.sum(own[name] * best) / max(float(np.sum(best**2)), 1e-30)
+            hint = "; its sign is reversed" if abs(ratio + 1) < 0.1 else ""
+            reasons.append(
+                f"correction {name}: {rms(own[name]) / MM_PER_UM:.2f} um rms in the table, "
+                f"{rms(best) / MM_PER_UM:.2f} um rms needed, they differ by "
+                f"{rms(miss[name]) / MM_PER_UM:.2f} um{hint}"
+            )
         return reasons
 
     def shrink_reasons(self, correction_mm: FloatArray) -> list[str]:
         """Say so if the exact residual grows with the correction (n, 3), rigid motion taken out."""
-        position_mm = self.grid.position_mm
-        nominal = position_mm + tool_of(self.machine, None)
-        before = exact_error(self.machine, self.errors, position_mm)
-        after = exact_error(self.machine, self.errors, position_mm + correction_mm) + correction_mm
-        rms_before, rms_after = (residuals_twice(nominal, error)[1].rms_um * MM_PER_UM for error in (before, after))
+        rms_before, rms_after = self.rms_before_mm, self._rms_left_mm(correction_mm)
         if rms_after <= rms_before + 1e-9 or rms_after <= self.resolution_mm:
             return []
         return [

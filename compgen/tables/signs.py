@@ -209,8 +209,8 @@ class _Court:
 
 def _entry_trials(machine: Machine, judge: Judge, right: ReadTables, most: int) -> Iterator[Trial]:
     """Change one number at a time, by a little more than the goal; what cannot move the tip by so much is left out."""
-    depends = entry_check(machine, judge, right).depends
-    places = [(place, int(k)) for place, part in depends.items() for k in np.flatnonzero(part)]
+    check = entry_check(machine, judge, right)
+    places = [(place, int(k)) for place, part in check.depends.items() for k in np.flatnonzero(part)]
     picked = np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int))
     position_mm = np.vstack([judge.grid.position_mm, judge.line_mm])
     corners_mm = np.array(machine.tool_corners_mm)[np.arange(len(judge.line_mm)) % len(machine.tool_corners_mm)]
@@ -235,7 +235,7 @@ def _entry_trials(machine: Machine, judge: Judge, right: ReadTables, most: int) 
             continue
         moved_by = abs(float(numbers_of(tables.tables)[place][k] - numbers[place][k])) / moved
         tables, moved = changed(place, k, math.copysign((1.0 + BEYOND_GOAL) * judge.goal_mm * moved_by, sign))
-        reasons = reasons_against(machine, tables, judge)[1]
+        reasons = reasons_against(machine, tables, judge, check=check)[1]
         outcome = REJECTED if reasons else SAME if moved <= judge.goal_mm else ACCEPTED
         name = f"{place.lstrip('.')}, number {k + 1}"
         yield Trial("entry", name, outcome, moved / MM_PER_UM, reasons[0] if reasons else "")

@@ -28,7 +28,7 @@ from compgen.identify.identification import Identification
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import observable_errors, tool_of
 from compgen.kinematics.many_points import volumetric_error
-from compgen.tables.entries import entry_check
+from compgen.tables.entries import EntryCheck, entry_check
 from compgen.tables.judge import (
     Judge,
     Safety,
@@ -745,8 +745,12 @@ def reasons_against(
     judge: Judge,
     limits: SafetyLimits | None = None,
     reversal: ReversalCurves | None = None,
+    check: EntryCheck | None = None,
 ) -> tuple[Safety, tuple[str, ...]]:
-    """Return what parsed tables would make the axes do, and every reason not to accept them, each once."""
+    """Return what parsed tables would make the axes do, and every reason not to accept them, each once.
+
+    ``check`` is that of other tables of the same control, errors and reversal, if there is one.
+    """
     control = tables.controller
     on_grid, on_lines = (tables.mean_correction(machine, part) for part in (judge.grid.position_mm, judge.line_mm))
     safety = safety_of(machine, control, tables.tables, lambda part: judge.solver.field(judge.values, part), limits)
@@ -755,9 +759,13 @@ def reasons_against(
         in_tables = control.reversal_in_tables(reversal)
         rounding_mm = 2.0 * control.resolution_mm()  # of both directions
         turned = reversal_reasons(machine, lambda points: tables.correction(machine, points), in_tables, rounding_mm)
+    beside_best = judge.reasons(on_grid, on_lines)
+    if not beside_best:
+        check = entry_check(machine, judge, tables, reversal) if check is None else check.of(tables)
+        beside_best = check.reasons()
     reasons = [
         *control.violations(tables.tables),
-        *(judge.reasons(on_grid, on_lines) or entry_check(machine, judge, tables, reversal).reasons()),
+        *beside_best,
         *turned,
         *tables.contradictions,
         *safety.reasons,
