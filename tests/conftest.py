@@ -1,5 +1,7 @@
 """Fixtures that several files share: a small machine with settings for every control, and the shipped example."""
 
+import os
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +13,16 @@ from compgen.data.names import error_named
 from compgen.kinematics import modelled_errors
 
 ROOT = Path(__file__).resolve().parents[1]
+
+#: Folder in memory, and what has to be free there for the temporary files of all tests, several times over.
+MEMORY, ENOUGH_BYTES = Path("/dev/shm"), 4_000_000_000
+
+
+def pytest_configure(config):
+    """Put temporary folders into memory: a store or a published table waits for the disk with every file it writes."""
+    if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > ENOUGH_BYTES:
+        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
 
 #: Ranges, node counts and reference point differ between the axes; the reference lies inside the travel.
 SMALL_MACHINE = """\

@@ -29,20 +29,19 @@ HOUR = timedelta(hours=1)
 BARE_UM, RIGHT_UM = 10.0, 1.5
 
 
-@pytest.fixture
-def site(tmp_path, small_machine, small_machine_file, small_errors):
+def site_in(folder, small_machine, small_machine_file, small_errors):
     """A machine under ``approval = "auto"`` that is measured with its tables on; its store has a clock that is set."""
-    shutil.copy(small_machine_file, tmp_path / "mill.toml")
-    inbox = tmp_path / "inbox"
-    inbox.mkdir()
-    made = SimpleNamespace(now=NOW - 10 * timedelta(days=1), folder=tmp_path, out=tmp_path / "out", inbox=inbox)
+    shutil.copy(small_machine_file, folder / "mill.toml")
+    inbox = folder / "inbox"
+    inbox.mkdir(exist_ok=True)
+    made = SimpleNamespace(now=NOW - 10 * timedelta(days=1), folder=folder, out=folder / "out", inbox=inbox)
 
     def write(policy="", name="mill", approval="auto", measured_with="active"):
-        (tmp_path / "recal.toml").write_text(
+        (folder / "recal.toml").write_text(
             f'[machines.{name}]\nmachine = "mill.toml"\ninbox = "inbox"\ncontrollers = ["{CONTROL}"]\nout = "out"\n'
             f'measured_with = "{measured_with}"\napproval = "{approval}"\n[machines.{name}.policy]\n{policy}\n'
         )
-        made.job = read_job(tmp_path / "recal.toml")
+        made.job = read_job(folder / "recal.toml")
 
     def measure(file, errors=small_errors, *, on=None, seed=1, at=None, **notes):
         """``on``: the correction that acts (None: the machine is bare); ``at``: what the file says, None: now."""
@@ -75,13 +74,28 @@ def site(tmp_path, small_machine, small_machine_file, small_errors):
 
 
 @pytest.fixture
-def running(site):
-    """The same with version 1 active for nine days."""
-    site.measure("first", active_table="none")
-    assert site.run().active == 1
-    site.now += timedelta(days=9)
-    assert site.left_um() < RIGHT_UM
-    return site
+def site(tmp_path, small_machine, small_machine_file, small_errors):
+    """The machine of :func:`site_in`, which has not been measured yet."""
+    return site_in(tmp_path, small_machine, small_machine_file, small_errors)
+
+
+@pytest.fixture(scope="session")
+def site_with_tables(tmp_path_factory, small_machine, small_machine_file, small_errors):
+    """Folder of the machine with version 1 active."""
+    made = site_in(tmp_path_factory.mktemp("running"), small_machine, small_machine_file, small_errors)
+    made.measure("first", active_table="none")
+    assert made.run().active == 1
+    return made.folder
+
+
+@pytest.fixture
+def running(site_with_tables, tmp_path, small_machine, small_machine_file, small_errors):
+    """The machine with version 1 active for nine days."""
+    shutil.copytree(site_with_tables, tmp_path, symlinks=True, dirs_exist_ok=True)
+    made = site_in(tmp_path, small_machine, small_machine_file, small_errors)
+    made.now += timedelta(days=9)
+    assert made.left_um() < RIGHT_UM
+    return made
 
 
 def held(site, version=2):

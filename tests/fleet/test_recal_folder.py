@@ -9,7 +9,7 @@ import shutil
 from datetime import timedelta
 
 import pytest
-from test_recal_active import drifted, running, site  # noqa: F401  (fixtures)
+from test_recal_active import drifted, site, site_in, site_with_tables  # noqa: F401  (fixtures)
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
@@ -23,14 +23,26 @@ from compgen.fleet.runner import run_jobs
 from compgen.fleet.store import backup, open_store, restore
 
 
+@pytest.fixture(scope="session")
+def site_with_version_2(site_with_tables, tmp_path_factory, small_machine, small_machine_file, small_errors):  # noqa: F811
+    """Folder of the machine with version 2 active; a backup of the store of before is next to it."""
+    folder = tmp_path_factory.mktemp("second") / "site"
+    shutil.copytree(site_with_tables, folder, symlinks=True)
+    made = site_in(folder, small_machine, small_machine_file, small_errors)
+    made.now += timedelta(days=9)
+    backup(made.job.store, folder / "old.sqlite")
+    made.measure("drift", drifted(small_errors, 40.0), on=made.on(), seed=2)
+    assert made.run().active == 2
+    return folder
+
+
 @pytest.fixture
-def second(running, small_errors):  # noqa: F811
-    """Version 2 is active since yesterday; a backup of the store of before stands beside it."""
-    backup(running.job.store, running.folder / "old.sqlite")
-    running.measure("drift", drifted(small_errors, 40.0), on=running.on(), seed=2)
-    assert running.run().active == 2
-    running.now += timedelta(days=1)
-    return running
+def second(site_with_version_2, tmp_path, small_machine, small_machine_file, small_errors):
+    """Version 2 is active since yesterday; a backup of the store of before is next to it."""
+    shutil.copytree(site_with_version_2, tmp_path, symlinks=True, dirs_exist_ok=True)
+    made = site_in(tmp_path, small_machine, small_machine_file, small_errors)
+    made.now += timedelta(days=10)
+    return made
 
 
 def lose(made):
