@@ -18,7 +18,7 @@ from compgen.data.messages import nearest
 from compgen.data.names import MM_PER_UM
 from compgen.data.toml_files import option
 from compgen.diagnose.analysis import Analysis, analyse
-from compgen.diagnose.axis_diagnosis import AxisDiagnosis, findings_of
+from compgen.diagnose.axis_diagnosis import LEAST_FREEDOM, AxisDiagnosis, findings_of
 from compgen.diagnose.axis_session import Order
 from compgen.diagnose.base_fit import BaseFit
 from compgen.diagnose.diagnosis import Classed, Diagnosis, gap_of, refit
@@ -126,6 +126,7 @@ def diagnose(
         fit = _base(observed)
         classed: list[Classed] = []
         before = fit
+        _refuse_too_few(fit)  # before the search, which takes its time
         if isinstance(observed, ObservedLengths) and looks_gross(observed, fit.rms_mm):
             show("residuals are gross: trying other axes, signs and labels")
             corrected = correction_of(machine, observed.lengths, fit.rms_mm)
@@ -134,12 +135,7 @@ def diagnose(
                 measurement = corrected.lengths
                 observed = observed_of(machine, measurement)
                 fit = _base(observed)
-        freedom = len(observed) - fit.jacobian.shape[1]
-        if freedom < 20:
-            raise InputError(
-                f"{len(observed)} readings with {fit.jacobian.shape[1]} unknowns leave {freedom} degrees of freedom; "
-                "a diagnosis needs at least 20: measure more lines"
-            )
+        _refuse_too_few(fit)
         analysis = _analysed(observed, fit, chosen, show)
         before = analysis.fit if before is fit else before
         gross = gross_readings(analysis)
@@ -157,6 +153,15 @@ def diagnose(
             observed = observed.part(np.setdiff1d(np.arange(len(observed)), loud))
             analysis = _analysed(observed, _base(observed), chosen, show)
         return _completed(machine, analysis, chosen, show, before, classed, len(gross))
+
+
+def _refuse_too_few(fit: BaseFit) -> None:
+    freedom = len(fit.observed) - fit.jacobian.shape[1]
+    if freedom < LEAST_FREEDOM:
+        raise InputError(
+            f"{len(fit.observed)} readings with {fit.jacobian.shape[1]} unknowns leave {freedom} degrees of freedom; "
+            f"a diagnosis needs at least {LEAST_FREEDOM}: measure more lines"
+        )
 
 
 def _base(observed: Observed) -> BaseFit:

@@ -81,10 +81,19 @@ class Projector:
 
     def project_all(self, wanted_mm: FloatArray) -> FloatArray:
         """Return table values (k, parameters) for k wanted fields (k, n, 3) at once."""
+        return np.asarray((self.transform @ self._solved(wanted_mm)[: self.transform.shape[1]]).T)
+
+    def left_of(self, wanted_mm: FloatArray) -> FloatArray:
+        """Return what the closest tables leave of k wanted fields (k, n, 3) at the sample points, (k, n, 3)."""
+        solution = self._solved(wanted_mm)
+        solution[self.transform.shape[1] :] = 0.0  # a constant per axis is left to whoever asks
+        return wanted_mm - np.asarray(self.design @ solution).T.reshape(wanted_mm.shape)
+
+    def _solved(self, wanted_mm: FloatArray) -> FloatArray:
+        """Free values and offsets (free + offsets, k) for k wanted fields (k, n, 3)."""
         weighted = wanted_mm * self.weight[:, None]
         right = self.design.T @ weighted.reshape(len(wanted_mm), -1).T
-        solution = self.scale[:, None] * np.asarray(cho_solve(self.factor, right * self.scale[:, None]))
-        return np.asarray((self.transform @ solution[: self.transform.shape[1]]).T)
+        return np.asarray(self.scale[:, None] * np.asarray(cho_solve(self.factor, right * self.scale[:, None])))
 
     def field(self, values: FloatArray, position_mm: FloatArray | None = None) -> FloatArray:
         """Return the correction field of table values at the sample points or at others, see :func:`basis_field`."""

@@ -810,7 +810,7 @@ def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dic
     names = errors.names
     wanted = np.stack([-volumetric_error(machine, errors.only(name), solver.position_mm) for name in names])
     found = {}
-    for name, rest in zip(names, wanted - solver.field(solver.project_all(wanted)), strict=True):
+    for name, rest in zip(names, solver.left_of(wanted), strict=True):
         if solver.offsets:
             rest = rest - np.average(rest, axis=0, weights=solver.weight)
         largest = float(np.max(np.linalg.norm(rest, axis=1)))
