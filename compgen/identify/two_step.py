@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.data.comparison import best_rotation, small_motion
+from compgen.data.comparison import best_rotation, rigid_fields, small_motion
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths
@@ -18,7 +18,6 @@ from compgen.identify.adjust.problem import LEVER_MM, LinesOfSight, PointEquatio
 from compgen.identify.adjust.robust import MOST_ROUNDS, Rejected, accepted_readings, check_rejected
 from compgen.identify.adjust.solver import LeastSquaresSolution, determined_factor, factorise, solve
 from compgen.identify.adjust.unknowns import DistinctPoses, ErrorParameters, IntArray, State, distinct_poses
-from compgen.kinematics.exact_chain import cross_matrices
 from compgen.kinematics.first_order import tool_of
 
 # Tracers and points as a network of distances: its normal equations with the points eliminated one by one.
@@ -643,12 +642,12 @@ def _joint(
     forward, jacobian = frame_rotation(state.stations_mm[1])
     turn = np.eye(len(everything))
     turn[:split, :split] = np.kron(np.eye(count), forward @ placement.rotation)
-    arms = cross_matrices(joint.stations_mm - problem.centre_mm - shift)
+    moved = rigid_fields(joint.stations_mm - problem.centre_mm - shift)
     size, errors = problem.size, problem.parameters.size
     change = np.eye(size)
     change[errors:, errors:] = 0.0
-    change[errors : errors + split, errors : errors + 3] = np.tile(np.eye(3), (count, 1))
-    change[errors : errors + split, errors + 3 : errors + 6] = (-arms @ jacobian).reshape(-1, 3) / LEVER_MM
+    change[errors : errors + split, errors : errors + 3] = moved[:, :3]
+    change[errors : errors + split, errors + 3 : errors + 6] = moved[:, 3:] @ jacobian / LEVER_MM
     change[errors:, errors + 6 :] = turn[:, calibration.free]
     back = np.linalg.inv(change)
     matrix = back.T @ problem.normal_matrix(state) @ back * sigma_mm**2
