@@ -27,7 +27,7 @@ from compgen.errors import InputError
 from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import c_matrix, tool_of
-from compgen.kinematics.many_points import volumetric_error
+from compgen.kinematics.many_points import full_grid, volumetric_error
 
 # One figure of accuracy with its uncertainty, and how two of them compare.
 
@@ -464,6 +464,6 @@ def error_source(
 
 def grid_points(machine: Machine, levels_mm: tuple[FloatArray, ...]) -> FloatArray:
     """Points (n, 3) of a full grid, with the points that the alignment to the axes needs added where they are missing."""
-    grid = np.stack(np.meshgrid(*levels_mm, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = full_grid(levels_mm).reshape(-1, 3)
     extra = [p for p in axis_lines(machine) if np.max(np.abs(grid - p), axis=1).min() > 1e-6]
     return np.concatenate([grid, np.array(extra)]) if extra else grid

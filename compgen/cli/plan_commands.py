@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import click
-import numpy as np
 
 from compgen.cli.common import NUMBER, PATH, json_option, options_of, out_option, print_json
 from compgen.cli.shared_options import machine_argument
@@ -24,6 +23,7 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_errors
 from compgen.identify import IdentifyOptions, predict_uncertainty, read_covariance
 from compgen.kinematics import predict
+from compgen.kinematics.many_points import full_grid
 from compgen.plan import (
     Plan,
     PlanVisibility,
@@ -162,8 +162,7 @@ def _points(machine: Machine, points: Path | None, *, grid: bool) -> Points:
         raise InputError("give either --points FILE or --grid")
     if points is not None:
         return read_points(points)
-    nodes = np.meshgrid(*[axis.nodes_mm for axis in machine.axes], indexing="ij")
-    return Points(np.stack(nodes, axis=-1).reshape(-1, 3))
+    return Points(full_grid([axis.nodes_mm for axis in machine.axes]).reshape(-1, 3))
 
 
 def _write(

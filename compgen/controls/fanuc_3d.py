@@ -47,6 +47,7 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import axis_setting, file_setting, multiple_of, setting, whole, word_for
 from compgen.errors import InputError
 from compgen.kinematics.first_order import tool_of
+from compgen.kinematics.many_points import full_grid
 
 # Records of three-dimensional compensation data as a file punched from the user's own control shows them.
 #
@@ -340,7 +341,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         vertex: half a count. No other whole numbers stay within half a count at every vertex.
         """
         nodes = [next(term.nodes_mm for term in basis if term.axis == axis) for axis in range(3)]
-        position = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
+        position = full_grid(nodes).reshape(-1, 3)
         tool = tool_of(self.machine, None)
         field = np.zeros_like(position)
         for term in basis:

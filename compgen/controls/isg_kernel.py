@@ -36,6 +36,7 @@ from compgen.data.toml_files import (
 )
 from compgen.errors import CompgenWarning, InputError
 from compgen.kinematics.first_order import coefficients, factor
+from compgen.kinematics.many_points import full_grid
 
 # Error parameters of the ISG kernel's volumetric compensation: names, grids and strict numbers of both file formats.
 #
@@ -554,7 +555,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         listing = tables.listing or self._list_of(self.parameter_file, self.file_format)
         # the grid point of 3 x 3 x 3 with the largest correction of each axis
         lines = [(axis.range_mm[0], 0.5 * sum(axis.range_mm), axis.range_mm[1]) for axis in self.machine.axes]
-        position = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+        position = full_grid(lines).reshape(-1, 3)
         added = self.emulate(tables, Points(position))
         worst = np.argmax(np.abs(added), axis=0)
         reference = "the reference direction is X, as in the machine file"

@@ -32,6 +32,7 @@ from compgen.data.names import AXES, ERROR_INDEX, error_named
 from compgen.data.toml_files import choice, setting, whole
 from compgen.errors import InputError
 from compgen.kinematics.first_order import tool_of
+from compgen.kinematics.many_points import full_grid
 
 # The table of the LinuxCNC kinematics ``volkins``: E = C P or a grid, evaluated in the arithmetic of the C sources.
 #
@@ -729,7 +730,7 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         lines = [
             np.array([low, 0.5 * (low + high), high]) for low, high in (axis.range_mm for axis in self.machine.axes)
         ]
-        points = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3)
+        points = full_grid(lines).reshape(-1, 3)
         return points, table.error(points, tool_of(self.machine, None))
 
     def _sign_statement(self, table: VolTable) -> str:

@@ -20,7 +20,7 @@ from compgen.data.messages import doubled, nearest, one_line
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.data.toml_files import setting, whole
 from compgen.errors import InputError
-from compgen.kinematics.many_points import volumetric_error
+from compgen.kinematics.many_points import full_grid, volumetric_error
 
 # The neutral formats as data: the correction field on a grid, and the 21 error curves that it comes from.
 
@@ -274,7 +274,7 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
         """Return the curves, and the field that they give with the machine's tool, rounded as written."""
         curves = curves_from(basis, values)
         x, y, z = (self._nodes_mm(curves, axis) for axis in range(3))
-        position_mm = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
+        position_mm = full_grid((x, y, z))
         added = self._curve_correction(curves, position_mm.reshape(-1, 3), None) / MM_PER_UM
         flat = np.array([float(fixed(value, FIELD_DIGITS)) for value in added.ravel().tolist()])
         return NeutralTables(FieldGrid((x, y, z), flat.reshape(position_mm.shape)), curves)
@@ -286,7 +286,7 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
             lines = tables.field.nodes_mm
             field = {
                 "nodes": [line.tolist() for line in lines],
-                "positions": np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3).tolist(),
+                "positions": full_grid(lines).reshape(-1, 3).tolist(),
                 "corrections": tables.field.correction_um.reshape(-1, 3).tolist(),
                 "rows": math.prod(map(len, lines)),
             }
@@ -339,7 +339,7 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
                 found += coverage_violations(self.machine, error_named(name).axis, first, last, name)
         if tables.field is not None and tables.curves is not None:
             lines = tables.field.nodes_mm
-            vertices = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+            vertices = full_grid(lines).reshape(-1, 3)
             due = self._curve_correction(tables.curves, vertices, None)
             miss = np.abs(due - tables.field.correction_um.reshape(-1, 3) * MM_PER_UM)
             if np.max(miss) > AGREEMENT_MM:

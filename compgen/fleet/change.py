@@ -27,7 +27,7 @@ from compgen.identify.covariance import (
     values_at_nodes,
 )
 from compgen.kinematics.gauge import curve_weights, gauge_changes, gauge_directions, gauge_part
-from compgen.kinematics.many_points import volumetric_error
+from compgen.kinematics.many_points import full_grid, volumetric_error
 
 # Whether a machine has changed between two measurements, against the uncertainty of both.
 #
@@ -207,7 +207,7 @@ def _compared(machine: Machine, new: Known, old: Known, position_mm: FloatArray)
 def volume_points(machine: Machine) -> FloatArray:
     """Return the points at which changes are looked at, (n, 3), mm."""
     levels = [np.linspace(*axis.range_mm, POINTS) for axis in machine.axes]
-    return np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    return full_grid(levels).reshape(-1, 3)
 
 
 # The calibrations of one machine on common figures: gauge-aligned, each with its joint covariance.

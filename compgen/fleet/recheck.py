@@ -31,6 +31,7 @@ from compgen.fleet.records import RequestedChange
 from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.covariance import Covariance, error_values
 from compgen.identify.options import IdentifyOptions
+from compgen.kinematics.many_points import full_grid
 from compgen.plan import PlannedStations, planned, planned_noise
 
 #: Levels of the lattice of candidate points on each axis.
@@ -104,7 +105,7 @@ def shortest_recheck(
     """
     _check(request)
     levels = [np.linspace(*axis.range_mm, LEVELS) for axis in machine.axes]
-    candidates = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    candidates = full_grid(levels).reshape(-1, 3)
     each = [planned(machine, stations, Points(place[None]), planned_noise(options)) for place in candidates]
     matrices = np.array([item.normal_matrix(stations.position_mm) for item in each])  # of each candidate alone
     layout = each[0].problem.parameters

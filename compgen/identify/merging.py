@@ -25,6 +25,7 @@ from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.covariance import error_design, error_values, joint_covariance, values_at_nodes
 from compgen.identify.identification import Identification, table_of_values, worst_uncertainty
 from compgen.kinematics.first_order import c_matrix, tool_of
+from compgen.kinematics.many_points import full_grid
 
 #: Probability with which two true measurements are said to disagree somewhere.
 FALSE_ALARM = 0.05
@@ -115,7 +116,7 @@ def _points(machine: Machine) -> FloatArray:
     parts = []
     for k, axis in enumerate(machine.axes):
         lists = [axis.nodes_mm if j == k else levels[j] for j in range(3)]
-        parts.append(np.stack(np.meshgrid(*lists, indexing="ij"), axis=-1).reshape(-1, 3))
+        parts.append(full_grid(lists).reshape(-1, 3))
     return np.vstack(parts)
 
 

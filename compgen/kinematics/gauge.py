@@ -20,6 +20,7 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, error_named
 from compgen.kinematics.first_order import c_matrix, tool_of
+from compgen.kinematics.many_points import full_grid
 
 #: 1 um counts as much as 1 urad: an angle counts at this lever.
 LEVER_MM = 1000.0
@@ -62,7 +63,7 @@ def gauge_directions(
 def _sample(machine: Machine, tools_mm: FloatArray | None) -> tuple[FloatArray, FloatArray]:
     """Positions and tool offsets (n, 3) at which two fields of low degree are the same only if they are everywhere."""
     levels = [np.linspace(*axis.range_mm, 4) for axis in machine.axes]
-    position = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    position = full_grid(levels).reshape(-1, 3)
     tools = np.atleast_2d(tool_of(machine, None) if tools_mm is None else tools_mm)
     return np.tile(position, (len(tools), 1)), np.repeat(tools, len(position), axis=0)
 

@@ -49,6 +49,11 @@ def levels_between(nodes_mm: FloatArray, low_mm: float, high_mm: float) -> Float
     return np.sort(np.concatenate([ends, 0.5 * (ends[1:] + ends[:-1])]))
 
 
+def full_grid(levels_mm: Sequence[FloatArray | Sequence[float]]) -> FloatArray:
+    """Return the points of a full grid, (n1, n2, n3, 3), from its levels along the three axes; the last runs fastest."""
+    return np.stack(np.meshgrid(*levels_mm, indexing="ij"), axis=-1)
+
+
 @dataclass(frozen=True)
 class VolumeGrid:
     """A full grid over the working volume; ``levels_mm`` per axis, points in C order (z runs fastest)."""
@@ -64,7 +69,7 @@ class VolumeGrid:
     @property
     def position_mm(self) -> FloatArray:
         """All points, shape (n, 3)."""
-        return np.stack(np.meshgrid(*self.levels_mm, indexing="ij"), axis=-1).reshape(-1, 3)
+        return full_grid(self.levels_mm).reshape(-1, 3)
 
 
 def volume_grid(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int = MOST_POINTS) -> VolumeGrid:

@@ -29,6 +29,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenError
 from compgen.kinematics.first_order import tool_of
+from compgen.kinematics.many_points import full_grid
 from compgen.tables.export import table_values
 from compgen.tables.judge import POINT_SHARE, POINT_UNCERTAINTIES, Judge, displacement_uncertainty, node_positions
 from compgen.tables.synthesis import basis_field
@@ -272,7 +273,7 @@ class EntryCheck:
         ends = _ends(self.machine)
         for axis in range(3):
             levels = [nodes[k] if k == axis else ends[k] for k in range(3)]
-            position_mm = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1)
+            position_mm = full_grid(levels)
             own_tool = self._sample(position_mm, None, None)
             for tool in self.machine.tool_corners_mm:
                 sample = self._sample(position_mm, np.array(tool), None)
@@ -315,7 +316,7 @@ class EntryCheck:
 
     def _at_nodes(self, nodes: Sequence[FloatArray]) -> Iterator[_Sample]:
         for levels in _grids(self.machine, nodes, sum(part.size for part in numbers_of(self.given.tables).values())):
-            position_mm = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1)
+            position_mm = full_grid(levels)
             for side in self._sides:
                 yield self._sample(position_mm, None, side)
 
@@ -421,7 +422,7 @@ class EntryCheck:
             if not len(beyond):
                 continue
             levels = [beyond if k == axis else ends[k] for k in range(3)]
-            position_mm = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1)
+            position_mm = full_grid(levels)
             for side in self._sides:
                 flat = position_mm.reshape(-1, 3)
                 own, best = (self._added(part, flat, None, side) for part in (self.given, self.made))

@@ -21,7 +21,7 @@ from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import c_matrix, tool_of
-from compgen.kinematics.many_points import VolumeGrid, volume_grid
+from compgen.kinematics.many_points import VolumeGrid, full_grid, volume_grid
 from compgen.tables.synthesis import Projector, best_values, projector
 
 # A field on a full grid split into what belongs to one axis, to a pair of axes, and to all three.
@@ -84,7 +84,7 @@ def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> FloatArray
         nodes = nodes_mm[axis][(nodes_mm[axis] >= low[axis]) & (nodes_mm[axis] <= high[axis])]
         levels = [np.array([low[k], 0.5 * (low[k] + high[k]), high[k]]) for k in range(3)]
         levels[axis] = np.unique(np.concatenate([np.linspace(low[axis], high[axis], SCAN_POSITIONS), nodes]))
-        lines.append(np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3))
+        lines.append(full_grid(levels).reshape(-1, 3))
     return np.vstack(lines)
 
 

@@ -23,7 +23,7 @@ from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.many_points import volume_grid, volumetric_error
+from compgen.kinematics.many_points import full_grid, volume_grid, volumetric_error
 from compgen.tables import Export, export
 from compgen.tables.judge import LargestStep, in_both_directions, left_by_reversal, safety_of
 from compgen.tables.synthesis import Projector, basis_field, placed_terms, projector, wanted_correction
@@ -93,7 +93,7 @@ class Level:
             return [dict.fromkeys(errors.names, 0.0) for _ in tools_mm]
         if self.solver is None:
             levels = [curve_nodes_mm(machine, errors, axis, most=25) for axis in range(3)]
-            position_mm, weight = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1).reshape(-1, 3), None
+            position_mm, weight = full_grid(levels).reshape(-1, 3), None
         else:
             position_mm, weight = self.solver.position_mm, self.solver.weight
         found: list[dict[str, float]] = [{} for _ in tools_mm]

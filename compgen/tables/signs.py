@@ -20,6 +20,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import CompgenError
 from compgen.kinematics.exact_chain import exact_error
+from compgen.kinematics.many_points import full_grid
 from compgen.tables import Export, export
 from compgen.tables.entries import entry_check, numbers_of, with_number
 from compgen.tables.judge import COMPONENT_FLOOR_MM, Judge, judge_of
@@ -369,7 +370,7 @@ def _candidates(machine: Machine, way_mm: FloatArray) -> FloatArray:
     low, high = machine.lower_mm + MARGIN * way_mm, machine.upper_mm - MARGIN * way_mm
     lines = [np.linspace(low[k], high[k], LEVELS) for k in range(3)]
     first = np.clip(machine.reference_point_mm, low, high)
-    grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = full_grid(lines).reshape(-1, 3)
     return np.round(np.vstack([first, grid]), 3)
 
 

@@ -26,6 +26,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.messages import um_text
 from compgen.data.names import AXES, COVERAGE, CURVE_NAMES, error_named
+from compgen.kinematics.many_points import full_grid
 from compgen.report.html.folder import ReadingResiduals, TableCurve, Volume
 
 # Pictures of the 21 errors: identified with their uncertainty, smoothed, and as the tables contain them.
@@ -246,7 +247,7 @@ def draw_space(grid: VolumeOnGrid, number: int) -> Picture:
         places = [
             np.linspace(level[0], level[-1], ALONG if k == axis else LINES) for k, level in enumerate(grid.levels_mm)
         ]
-        at = np.stack(np.meshgrid(*places, indexing="ij"), axis=-1)
+        at = full_grid(places)
         for found, field_mm in ((straight, None), (before, grid.before_mm), (after, grid.after_mm)):
             lines = at if field_mm is None else resampled(grid, field_mm, places)
             found.append(np.moveaxis(lines, axis, 2).reshape(-1, ALONG, 3))
