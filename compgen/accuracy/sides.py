@@ -34,6 +34,7 @@ from compgen.accuracy.field import Alignment, ErrorField, ErrorSource, aligned, 
 from compgen.accuracy.positioning import RunStatistics, axis_statistics
 from compgen.controls.isg_kernel import is_exchange_text, read_error_file
 from compgen.data.axis_runs import AxisRuns, read_diagonals
+from compgen.data.circles import Circles
 from compgen.data.csv_files import FloatArray, names_in_header, read_csv
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import ERROR_COLUMNS, ErrorTable
@@ -76,6 +77,7 @@ class Side:
     lengths: Lengths | None = None
     runs: dict[str, RunStatistics] | None = None
     diagonals: dict[str, DiagonalRun] | None = None
+    circles: Circles | None = None
     predicted: ErrorField | None = None
     reversal: KnownReversal = NOT_KNOWN
     u_um: float | None = None
@@ -84,7 +86,7 @@ class Side:
         """Return the side with a source of errors: identified if it is a measurement, with its warnings."""
         if self.source is not None:
             return self
-        measurement = self.lengths or self.deviations
+        measurement = self.lengths or self.deviations or self.circles
         if measurement is None:
             raise InputError(f"contains {self.kind}, which do not determine the errors of the machine", file=self.path)
         chosen = IdentifyOptions(u_deviation_um=self.u_um if self.lengths is None else None)
@@ -135,6 +137,8 @@ def read_side(
         return Side(machine, source, "errors", source=error_source(machine, measurement))
     if isinstance(measurement, AxisRuns):
         return Side(machine, source, "axis runs", runs=axis_statistics(measurement))
+    if isinstance(measurement, Circles):
+        return Side(machine, source, "circles", circles=measurement)
     if isinstance(measurement, Deviations):
         return Side(machine, source, "measured positions", deviations=measurement, u_um=u_um)
     if isinstance(measurement, Lengths):

@@ -13,6 +13,7 @@ from typing import Any
 import click
 from rich.console import Console, RenderableType
 
+from compgen.accuracy.circles import accuracy_of_circles
 from compgen.accuracy.compare import CompareOptions
 from compgen.accuracy.diagonals import accuracy_of_diagonals
 from compgen.accuracy.evaluate import accuracy_of_errors
@@ -98,10 +99,10 @@ def accuracy_command(
 ) -> int:
     """Evaluate one measurement or error file by the standards, each figure with its uncertainty.
 
-    FILE: *.axis.csv gives ISO 230-2 and VDI/DGQ 3441, *.diagonals.csv ISO 230-6; errors (reversal from NAME.reversal.csv
-    beside them, or a folder that identify or run wrote), tracer lengths, measured positions and six-DOF readings
-    (identified first) give ISO 230-1 volumetric ranges, ISO 230-6 diagonals, straightness, squareness. Values in um and
-    urad. Writes accuracy.json and accuracy.txt to DIR.
+    FILE: *.axis.csv gives ISO 230-2 and VDI/DGQ 3441, *.diagonals.csv ISO 230-6, *.circle.csv ISO 230-4; errors (reversal
+    from NAME.reversal.csv beside them, or a folder that identify or run wrote), tracer lengths, measured positions and
+    six-DOF readings (identified first) give ISO 230-1 volumetric ranges, ISO 230-6 diagonals, straightness, squareness.
+    Values in um and urad. Writes accuracy.json and accuracy.txt to DIR.
 
     \b
     Example:
@@ -116,6 +117,8 @@ def accuracy_command(
             found = accuracy_of_runs(side.runs, options.edition, options.budgets)
         elif side.diagonals is not None:
             found = accuracy_of_diagonals(machine, side.diagonals, options.edition, options.budgets)
+        elif side.circles is not None:
+            found = accuracy_of_circles(side.circles)
         else:
             known = side.errors()
             assert known.source is not None

@@ -299,6 +299,7 @@ _SIGNATURES = (
     _Signature("part", _any_of(MEASURED_COLUMNS), frozenset(POSITION_COLUMNS[:2])),
     _Signature("lengths", _any_of(("length_mm",)), _PLACE | {"station", "point"}),
     _Signature("axis", (frozenset({"axis", "position_mm", "deviation_um"}),), frozenset({"direction", "run"})),
+    _Signature("circle", (frozenset({"angle_deg", "deviation_um"}),), frozenset({"plane", "radius_mm", "direction"})),
     _Signature("diagonals", (frozenset({"diagonal", "deviation_um"}),), _PLACE),
     _Signature("errors", (frozenset({"error", "position_mm", "value"}),)),
     _Signature("sixdof", (frozenset({"axis", "position_mm", "displacement_mm"}),)),
@@ -323,7 +324,7 @@ def format_of_columns(names: set[str], *, complete: bool = False) -> str | None:
 def detect_format(source: str | Path) -> str | None:
     """Return what a measurement file is meant to be by its columns.
 
-    ``lengths``, ``deviations``, ``part``, ``axis``, ``diagonals``, ``sixdof``, ``errors``, or None.
+    ``lengths``, ``deviations``, ``part``, ``axis``, ``circle``, ``diagonals``, ``sixdof``, ``errors``, or None.
     """
     if str(source).lower().endswith(ARCHIVE):
         return "lengths"

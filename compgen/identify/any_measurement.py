@@ -27,6 +27,7 @@ from compgen.identify.tracer_lengths import identify
 
 if TYPE_CHECKING:
     from compgen.data.axis_runs import AxisRuns
+    from compgen.data.circles import Circles
     from compgen.data.deviations import Deviations
     from compgen.data.length_archive import LengthArchive
     from compgen.identify.six_dof import SixDofMeasurement
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 SMALLEST_UM = 0.1
 
 
-OneKind: TypeAlias = "Lengths | LengthArchive | Deviations | AxisRuns | SixDofMeasurement"
+OneKind: TypeAlias = "Lengths | LengthArchive | Deviations | AxisRuns | Circles | SixDofMeasurement"
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
     for path in paths:
         found = detect_format(path)  # of a file that is no measurement, the reader of lengths says best what is missing
         kinds.setdefault(
-            found if found in ("part", "axis", "deviations", "sixdof", "diagonals") else "lengths", []
+            found if found in ("part", "axis", "circle", "deviations", "sixdof", "diagonals") else "lengths", []
         ).append(path)
     if "diagonals" in kinds:
         text = "contains measured diagonals, from which no errors can be identified; use accuracy or compare"
@@ -109,9 +110,11 @@ def _read_kind(kind: str, files: Sequence[str | Path], instrument: str | Path | 
 
         return SixDofMeasurement(read_sixdof(files), read_instrument(str(instrument)))
     from compgen.data.axis_runs import read_axis_runs
+    from compgen.data.circles import read_circles
     from compgen.data.deviations import read_deviations, read_parts
 
-    readers: Mapping[str, Callable[[Sequence[str | Path]], Deviations | AxisRuns]] = {
+    readers: Mapping[str, Callable[[Sequence[str | Path]], Deviations | AxisRuns | Circles]] = {
+        "circle": read_circles,
         "part": read_parts,
         "axis": read_axis_runs,
         "deviations": read_deviations,
@@ -128,6 +131,7 @@ def describe(measurement: Measurement | ErrorTable) -> str:
     if isinstance(measurement, MixedMeasurement):
         return ", ".join(describe(part) for _, part in measurement.parts)
     from compgen.data.axis_runs import AxisRuns
+    from compgen.data.circles import Circles
     from compgen.data.deviations import PART, Deviations
     from compgen.data.length_archive import LengthArchive
 
@@ -136,6 +140,8 @@ def describe(measurement: Measurement | ErrorTable) -> str:
     if isinstance(measurement, Deviations):
         what = "features of parts" if measurement.metadata.get("measured") == PART else "measured positions"
         return f"{len(measurement)} {what}"
+    if isinstance(measurement, Circles):
+        return f"{len(measurement)} readings along circles in {', '.join(measurement.planes)}"
     if isinstance(measurement, AxisRuns):
         return f"{len(measurement)} readings along {', '.join(AXES[axis] for axis in measurement.axes)}"
     return f"{len(measurement)} six-DOF readings in {len(measurement.readings.runs())} runs"
@@ -163,6 +169,7 @@ def identify_measurement(
 
         return identify_archive(machine, measurement, chosen)
     from compgen.data.axis_runs import AxisRuns
+    from compgen.data.circles import Circles
     from compgen.data.deviations import Deviations
     from compgen.identify.positions import identify_deviations
     from compgen.identify.single_axes import identify_axis_runs
@@ -193,13 +200,18 @@ def identify_measurement(
                 "deviations, which take --u-deviation-um"
             )
         return identify_deviations(machine, measurement, chosen)
-    if isinstance(measurement, AxisRuns):
+    if isinstance(measurement, AxisRuns | Circles):
         if other or chosen.u_deviation_um is not None:
+            what = "axis runs" if isinstance(measurement, AxisRuns) else "circles"
             raise InputError(
-                "--method, --stations, --u-... apply to other kinds of measurement; the files contain axis runs, whose "
+                f"--method, --stations, --u-... apply to other kinds of measurement; the files contain {what}, whose "
                 "uncertainty is that of their scatter"
             )
-        return identify_axis_runs(machine, measurement)
+        if isinstance(measurement, AxisRuns):
+            return identify_axis_runs(machine, measurement)
+        from compgen.identify.circles import identify_circles
+
+        return identify_circles(machine, measurement)
     if other or chosen.u_deviation_um is not None:
         raise InputError(
             "--method, --stations, --u-... apply to tracer lengths and deviations; the files contain six-DOF readings, "

@@ -73,9 +73,9 @@ class Identification(Drawable):
     systematic : what systematic inputs contribute, and is part of the standard uncertainties then; None if none is.
     method : "joint", "two-step", "sixdof" for readings of the six-DOF instrument (the residuals are translations about
         the mean of their position), "merged" for those and others, "axis-runs" for
-        runs along single axes, "together" for a mixture of these, "given" for errors of another program (no
-        residuals), or "deviations" where measured positions were given instead of lengths; then the residuals are those
-        of the components dx, dy, dz, and ``u_length_um`` is their standard uncertainty.
+        runs along single axes, "circles" for circular tests, "together" for a mixture of these, "given" for errors of
+        another program (no residuals), or "deviations" where measured positions were given instead of lengths; then the
+        residuals are those of the components dx, dy, dz, and ``u_length_um`` is their standard uncertainty.
     steps : figures of the single steps of the two-step method.
     positions : the positions that it measured in the machine frame, against the commanded ones.
     values_factor : where there is no adjustment: F (k, r) with F F^T the covariance of the error values in the order of
@@ -174,7 +174,7 @@ class Identification(Drawable):
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``identify.json``."""
-        of_lengths = self.method not in ("deviations", "sixdof", "axis-runs", "given", "together")
+        of_lengths = self.method not in ("deviations", "sixdof", "axis-runs", "circles", "given", "together")
         return {
             "method": self.method,
             "residual_rms_um": self.rms_um,

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from compgen.data.axis_runs import AxisRuns
+from compgen.data.circles import Circles
 from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
@@ -65,7 +66,7 @@ def identify_together(machine: Machine, parts: Sequence[Source], options: Identi
     """
     known = [part.alone for part in parts if part.alone is not None]
     listed = list(chain.from_iterable(result.errors.names for result in known))
-    direct = all(part.measurement is None or isinstance(part.measurement, AxisRuns) for part in parts)
+    direct = all(part.measurement is None or isinstance(part.measurement, AxisRuns | Circles) for part in parts)
     if direct and len(listed) == len(set(listed)):
         return _joined(machine, parts, known)
     return _adjusted(machine, parts, options)
@@ -160,7 +161,7 @@ def _observed(
     if part.alone.method == "sixdof":
         names, positions, values, factor, _ = projected(machine, layout, part.alone)
         return _of_values(layout, names, positions, values, factor @ factor.T)
-    if part.alone.has_covariance and part.alone.method not in ("deviations", "axis-runs", "given"):
+    if part.alone.has_covariance and part.alone.method not in ("deviations", "axis-runs", "circles", "given"):
         known = joint_covariance(part.alone)
         return _of_values(layout, known.error, known.position_mm, part.alone.errors.values(), known.errors_covariance)
     return _of_curves(layout, part.alone.errors)

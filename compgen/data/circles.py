@@ -1,0 +1,156 @@
+"""Circular tests (ballbar, or any radial gauge; ISO 230-4): ``*.circle.csv``, record, reader and writer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import CsvTable, FloatArray
+from compgen.data.display import Displayed, Overview
+from compgen.data.records import DIRECTION, RUN_DEVIATION, Field, Schema, uncertainties, within
+from compgen.errors import InputError
+
+#: First and second axis of each plane; angles count from the first to the second.
+PLANES = {"XY": (0, 1), "YZ": (1, 2), "ZX": (2, 0)}
+#: Largest radius of a circular test, mm; a larger one is taken for a slip of unit.
+LARGEST_RADIUS_MM = 1e4
+
+
+@dataclass(frozen=True, repr=False)
+class Circles(Displayed):
+    """Radial deviations along circles in planes of two axes, n readings.
+
+    Parameters
+    ----------
+    plane : number of the plane in the order of :data:`PLANES`, (n,).
+    angle_rad : angle from the first axis of the plane to the second, (n,).
+    radius_mm : nominal radius, (n,).
+    deviation_mm : actual minus nominal radius, (n,).
+    direction : +1 counter-clockwise (from the first axis to the second), -1 clockwise, (n,).
+    run : number of the run, (n,).
+    setup : number of the set-up; readings of one share the centre and the zero of the gauge, (n,).
+    centre_mm : commanded centre, (n, 3); nan where the file does not say it.
+    u_mm : standard uncertainty of each reading (n,), nan where it is not known.
+    covariates : further numbers by column name (feed_mm_min, time_s, temp_..._c), each of shape (n,).
+    metadata : comments ``key = value`` of the file.
+    origin : (file, line) of each row, for messages.
+    """
+
+    plane: NDArray[np.int64]
+    angle_rad: FloatArray
+    radius_mm: FloatArray
+    deviation_mm: FloatArray
+    direction: NDArray[np.int64]
+    run: NDArray[np.int64]
+    setup: NDArray[np.int64]
+    centre_mm: FloatArray
+    u_mm: FloatArray
+    covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    origin: Sequence[tuple[str, int]] = ()
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.angle_rad)
+
+    @property
+    def planes(self) -> tuple[str, ...]:
+        """Planes that were measured."""
+        return tuple(name for k, name in enumerate(PLANES) if (self.plane == k).any())
+
+    def radial(self) -> FloatArray:
+        """Unit vectors from the centre outwards, (n, 3)."""
+        unit = np.zeros((len(self), 3))
+        axes = np.array(list(PLANES.values()))[self.plane]
+        rows = np.arange(len(self))
+        unit[rows, axes[:, 0]] = np.cos(self.angle_rad)
+        unit[rows, axes[:, 1]] = np.sin(self.angle_rad)
+        return unit
+
+    def travel(self) -> FloatArray:
+        """Direction of travel of each axis, +1, -1 or 0, (n, 3)."""
+        way = np.zeros((len(self), 3))
+        axes = np.array(list(PLANES.values()))[self.plane]
+        rows = np.arange(len(self))
+        way[rows, axes[:, 0]] = -self.direction * np.sign(np.round(np.sin(self.angle_rad), 12))
+        way[rows, axes[:, 1]] = self.direction * np.sign(np.round(np.cos(self.angle_rad), 12))
+        return way
+
+    def overview(self) -> Overview:
+        """Number of readings by plane, radius and direction."""
+        rows = []
+        for k, name in enumerate(PLANES):
+            for radius in np.unique(self.radius_mm[self.plane == k]).tolist():
+                own = (self.plane == k) & (self.radius_mm == radius)
+                ways = "both directions" if len(np.unique(self.direction[own])) == 2 else "one direction"
+                rows.append((name, f"{radius:g}", str(int(own.sum())), ways))
+        return Overview(
+            f"{len(self)} readings along circles in {', '.join(self.planes)}",
+            ("plane", "radius (mm)", "readings", "directions"),
+            tuple(rows),
+        )
+
+
+def _planes(table: CsvTable, column: str) -> NDArray[np.int64]:
+    """Read names of planes; the axes in the other order are refused, because the sense of the angle would turn."""
+    names = [name.upper() for name in table.text(column)]
+    for row, name in enumerate(names):
+        if name not in PLANES:
+            turned = f"; angles count from {name[1]} to {name[0]} in {name[::-1]}" if name[::-1] in PLANES else ""
+            raise table.fail(row, column, f"{name!r} is not a plane; expected {', '.join(PLANES)}{turned}")
+    return np.array([list(PLANES).index(name) for name in names], dtype=np.int64)
+
+
+def _radii(table: CsvTable, column: str) -> FloatArray:
+    values = within(LARGEST_RADIUS_MM, "mm", "more than 10 m; is the unit mm?")(table, column)
+    for row in np.flatnonzero(np.asarray(values) <= 0)[:1].tolist():
+        raise table.fail(row, column, f"{values[row]:g} is not a radius; it must be above zero")
+    return np.asarray(values)
+
+
+_CIRCLES = Schema(
+    (
+        Field("plane", ("plane",), _planes, encode=lambda planes: [list(PLANES)[k] for k in planes]),
+        Field("angle_rad", ("angle_deg",), unit=float(np.pi / 180.0), digits=6),
+        Field("radius_mm", ("radius_mm",), _radii, digits=6),
+        RUN_DEVIATION,
+        DIRECTION,
+        Field("run", ("run",), CsvTable.labels, presence="filled", fill=0, digits=0),
+        Field("setup", ("setup",), CsvTable.labels, presence="filled", fill=0, digits=0),
+        Field("centre_mm", ("centre_x_mm", "centre_y_mm", "centre_z_mm"), presence="filled"),
+        Field("u_mm", ("u_deviation_um",), uncertainties, 1e-3, presence="filled", digits=4),
+        Field("covariates", ("feed_mm_min", "time_s"), presence="covariates"),
+    )
+)
+
+
+def read_circles(files: str | Path | Sequence[str | Path]) -> Circles:
+    """Read one or more ``*.circle.csv`` files into one :class:`Circles`, um to mm; each file has set-ups of its own.
+
+    Raises
+    ------
+    InputError
+        for a plane that is not XY, YZ or ZX, a direction that is not 1 or -1, a centre of which a coordinate is missing.
+    """
+    parts, first = [], 0
+    for table in _CIRCLES.read_tables(files):
+        values = _CIRCLES.values(table)
+        found = Circles(**values)
+        partly = np.isnan(found.centre_mm).any(axis=1) & ~np.isnan(found.centre_mm).all(axis=1)
+        if partly.any():
+            given = [name for name in ("centre_x_mm", "centre_y_mm", "centre_z_mm") if name in table.columns]
+            text = f"has {' and '.join(given)}; give centre_x_mm, centre_y_mm and centre_z_mm, or none of them"
+            raise InputError(text, file=table.path)
+        _, setup = np.unique(found.setup, return_inverse=True)
+        parts.append(replace(found, setup=setup.ravel().astype(np.int64) + first, run=found.run.astype(np.int64)))
+        first = int(parts[-1].setup.max()) + 1
+    return _CIRCLES.joined(parts)
+
+
+def format_circles(circles: Circles) -> str:
+    """Return the text of a ``*.circle.csv`` file: angles in degrees with 6 decimals, deviations in um with 4."""
+    return _CIRCLES.format(circles, circles.metadata)

@@ -1,0 +1,223 @@
+"""Squareness, reversal and the scales of two axes from circular tests (ballbar; ISO 230-4).
+
+The gauge reads the distance of the tool from a pivot, whose place in the machine and whose zero are unknown. At the angle t on a
+circle of radius R in the plane of the axes 1 and 2 the deviation of the radius is
+
+    d(t) = n . (E(p) - c) + r,    n = (cos t, sin t)
+
+with the offset c of the centre, the constant r of the gauge, and of the errors E what such a circle shows:
+
+    squareness            n . C S         one row of C for each squareness error S of the plane
+    scales                R/2 cos 2t (s1 - s2)
+    reversal of an axis   n_i sign(v_i) B_i / 2     its actual position from the positive side minus from the negative
+    servo mismatch        direction R/2 sin 2t m    only with both directions told from squareness
+    straightness          cos 3t, sin 3t            bows of the two axes
+
+Higher harmonics (cyclic errors, spikes at reversal) stay in the residuals. They are not white, so uncertainties are widened
+by their correlation along the path.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from compgen.data.circles import PLANES, Circles
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.identify.adjust.unknowns import check_travel, error_parameters
+from compgen.identify.identification import Identification, metadata_of, not_among, worst_uncertainty
+from compgen.identify.reversal_errors import SIGNIFICANT
+from compgen.kinematics.first_order import c_matrix
+
+#: A combination of columns counts as not determined below this share of their size.
+RCOND = 1e-7
+#: An arc shorter than this, degrees, tells the offset of the centre from nothing.
+LEAST_ARC_DEG = 90.0
+
+
+@dataclass(frozen=True)
+class _Column:
+    """One unknown: what it is, its set-up or axis, and the derivative of the readings by it, (n,)."""
+
+    kind: str
+    key: Any
+    values: FloatArray
+
+
+def identify_circles(machine: Machine, circles: Circles) -> Identification:
+    """Identify the squareness errors and reversals that circular tests show.
+
+    Parameters
+    ----------
+    machine : chain, travel, reference of squareness. Where a file does not say where its circles were, they are taken to have
+        been in the middle of the travel.
+    circles : readings in one or more planes, with one or both directions, whole circles or arcs.
+
+    Raises
+    ------
+    InputError
+        for circles that leave the travel.
+    UndeterminedError
+        where arcs are too short to tell squareness from the centre and the scales.
+    """
+    position_mm = _positions(machine, circles)
+    columns = _columns(machine, circles, position_mm)
+    design = np.column_stack([column.values for column in columns])
+    scale = np.linalg.norm(design, axis=0)
+    left, size, right = np.linalg.svd(design / scale, full_matrices=False)
+    shown = size > RCOND * size[0]
+    inverse = (right[shown].T / size[shown]) @ left[:, shown].T / scale[:, None]
+    share = np.einsum("ij,ij->j", right[shown], right[shown])
+    names = [column.key for k, column in enumerate(columns) if column.kind == "squareness" and share[k] > 1 - 1e-6]
+    if not names:
+        raise UndeterminedError("the arcs are too short to tell squareness from the centre and the scales", [])
+    found = inverse @ circles.deviation_mm
+    residual = design @ found - circles.deviation_mm
+    freedom = len(circles) - int(np.count_nonzero(shown))
+    if freedom < 1:
+        raise UndeterminedError(f"{len(circles)} readings for {np.count_nonzero(shown)} unknowns", [])
+    for k, name in enumerate(PLANES):
+        if len(np.unique(circles.direction[circles.plane == k])) == 1:
+            text = f"{name} was measured in one direction only: a servo mismatch counts as squareness; measure both directions"
+            warnings.warn(text, CompgenWarning, stacklevel=2)
+    spread = float(np.sqrt(residual @ residual / freedom * _correlated(circles, residual)))
+    factor = spread * inverse
+    u = np.linalg.norm(factor, axis=1)
+    rows = [k for k, column in enumerate(columns) if column.kind == "squareness" and column.key in names]
+    order = sorted(rows, key=lambda k: SQUARENESS_NAMES.index(columns[k].key))
+    squareness = {columns[k].key: (float(found[k]), float(u[k])) for k in order}
+    errors = ErrorTable({}, squareness, metadata_of(machine, circles.metadata))
+    for name in set(_of_planes(circles)) - set(names):
+        warnings.warn(
+            f"the arcs do not tell {name} from the centre, the scales or the servo mismatch",
+            CompgenWarning,
+            stacklevel=2,
+        )
+    curves = {
+        (column.key, column.key): Curve(np.zeros(1), found[k : k + 1], u[k : k + 1])
+        for k, column in enumerate(columns)
+        if column.kind == "reversal" and abs(found[k]) > SIGNIFICANT * u[k] and share[k] > 1 - 1e-6
+    }
+    reversal = {key: curve for key, curve in curves.items() if abs(curve.value[0]) >= MM_PER_UM / 2}
+    return Identification(
+        errors=errors,
+        residual_mm=residual,
+        accepted=np.ones(len(circles), dtype=bool),
+        rms_um=float(np.sqrt(np.mean(residual**2))) / MM_PER_UM,
+        degrees_of_freedom=freedom,
+        reduced_chi_square=1.0,
+        u_source="scatter",
+        u_length_um=spread / MM_PER_UM,
+        unobservable=not_among(errors, "circles do not show it"),
+        rank=int(np.count_nonzero(shown)),
+        unknowns=len(columns),
+        condition=float(size[0] / size[shown][-1]),
+        worst_u=worst_uncertainty(errors),
+        layout=error_parameters(machine, errors.names),
+        values_factor=factor[order],
+        reversal_curves=ReversalCurves(reversal, {"machine": machine.name}) if reversal else None,
+        method="circles",
+        details={
+            "unknowns": [_described(column, found[k], u[k]) for k, column in enumerate(columns) if share[k] > 1 - 1e-6]
+        },
+    )
+
+
+def _positions(machine: Machine, circles: Circles) -> FloatArray:
+    """Commanded positions (n, 3); InputError where one is outside the travel."""
+    middle = np.array([np.mean(axis.range_mm) for axis in machine.axes])
+    unknown = np.isnan(circles.centre_mm).any(axis=1)
+    if unknown.any():
+        text = ", ".join(f"{AXES[k]} {middle[k]:g}" for k in range(3))
+        warnings.warn(
+            f"the files do not say where the circles were; taken in the middle of the travel ({text} mm)",
+            CompgenWarning,
+            stacklevel=3,
+        )
+    centre = np.where(np.isnan(circles.centre_mm), middle, circles.centre_mm)
+    position = centre + circles.radius_mm[:, None] * circles.radial()
+    try:
+        check_travel(machine, position, circles.origin)
+    except InputError as error:
+        text = "the circle leaves the travel; check centre and radius" if not unknown.all() else (
+            "a circle of this radius in the middle of the travel leaves it; give centre_x_mm, centre_y_mm, centre_z_mm"
+        )  # fmt: skip
+        raise InputError(
+            f"{error.message}: {text}", file=error.file, line=error.line, field="column radius_mm"
+        ) from None
+    return position
+
+
+def _of_planes(circles: Circles) -> list[str]:
+    """Squareness errors of the measured planes."""
+    between = {frozenset(PLANES["XY"]): "EC0Y", frozenset(PLANES["ZX"]): "EB0Z", frozenset(PLANES["YZ"]): "EA0Z"}
+    return [between[frozenset(PLANES[name])] for name in circles.planes]
+
+
+def _columns(machine: Machine, circles: Circles, position_mm: FloatArray) -> list[_Column]:
+    """All unknowns of the readings."""
+    radial, angle = circles.radial(), circles.angle_rad
+    both = c_matrix(machine, position_mm)
+    columns = [
+        _Column("squareness", name, np.einsum("ij,ij->i", radial, both[:, :, ERROR_INDEX[name]]))
+        for name in _of_planes(circles)
+    ]
+    travel = circles.travel()
+    for axis in range(3):
+        values = 0.5 * radial[:, axis] * travel[:, axis]
+        if (values != 0).any():
+            columns.append(_Column("reversal", axis, values))
+    feed = circles.covariates.get("feed_mm_min", np.zeros(len(circles)))
+    keys = np.column_stack([circles.plane, circles.setup, circles.radius_mm, np.nan_to_num(circles.centre_mm)])
+    for plane, setup, radius, *_ in (row.tolist() for row in np.unique(keys, axis=0)):
+        own = ((keys[:, 0] == plane) & (keys[:, 1] == setup) & (keys[:, 2] == radius)).astype(np.float64)
+        name = f"{list(PLANES)[int(plane)]}, radius {radius:g} mm" + (f", set-up {int(setup)}" if setup else "")
+        columns += [
+            _Column("centre", f"{name}, first axis", own * np.cos(angle)),
+            _Column("centre", f"{name}, second axis", own * np.sin(angle)),
+            _Column("scales", name, own * 0.5 * radius * np.cos(2 * angle)),
+            _Column("straightness", f"{name}, cos 3t", own * np.cos(3 * angle)),
+            _Column("straightness", f"{name}, sin 3t", own * np.sin(3 * angle)),
+        ]
+        for speed in np.unique(feed[own > 0]).tolist():
+            at = own * (feed == speed)
+            told = name + (f", {speed:g} mm/min" if speed else "")
+            columns.append(_Column("radius", told, at))
+            if len(np.unique(circles.direction[at > 0])) == 2:
+                columns.append(
+                    _Column("servo mismatch", told, at * 0.5 * radius * circles.direction * np.sin(2 * angle))
+                )
+    return columns
+
+
+def _correlated(circles: Circles, residual: FloatArray) -> float:
+    """How many readings in a row count as one: 1 plus twice the sum of the correlations along the path, while above 0."""
+    total, weight = 0.0, 0
+    for key in np.unique(np.column_stack([circles.plane, circles.setup, circles.run, circles.direction]), axis=0):
+        own = np.all(np.column_stack([circles.plane, circles.setup, circles.run, circles.direction]) == key, axis=1)
+        path = residual[own][np.argsort(circles.angle_rad[own])]
+        power = float(path @ path)
+        if len(path) < 8 or not power:
+            continue
+        lags = np.array([path[:-lag] @ path[lag:] for lag in range(1, len(path) // 4)]) / power
+        first = int(np.argmax(lags < 0)) if (lags < 0).any() else len(lags)
+        total += len(path) * (1.0 + 2.0 * float(lags[:first].sum()))
+        weight += len(path)
+    return max(1.0, total / weight) if weight else 1.0
+
+
+def _described(column: _Column, value: float, u: float) -> dict[str, Any]:
+    """The entry of an unknown in ``identify.json``: um, urad, um/m."""
+    unit = "um" if column.kind in ("centre", "radius", "reversal", "straightness") else "um/m"
+    if column.kind == "squareness":
+        unit = error_named(column.key).unit
+    by = 1e3 if unit == "um" else 1e6
+    name = AXES[column.key] if column.kind == "reversal" else str(column.key)
+    return {"what": column.kind, "of": name, "value": by * float(value), "u": by * float(u), "unit": unit}

@@ -1,0 +1,186 @@
+"""Circular tests against machines with known errors; the readings are distances of the exact model from a pivot."""
+
+import json
+
+import numpy as np
+import pytest
+
+import compgen
+from compgen.cli import cli
+from compgen.cli.common import run_command
+from compgen.data.circles import PLANES, Circles, format_circles, read_circles
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.identify.circles import identify_circles
+from compgen.kinematics.exact_chain import tip_position
+
+RADIUS_MM, NOISE_MM = 100.0, 2e-4
+SQUARENESS = {"EC0Y": 80e-6, "EB0Z": -60e-6, "EA0Z": 45e-6}
+REVERSAL_MM = (-6e-3, 4e-3, -3e-3)
+
+
+@pytest.fixture(scope="module", params=["WFYXZT", "WXYFZT", "WYFXZT", "WZYXFT"])
+def machine(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("m") / "mill.toml"
+    axes = "".join(f"[axes.{a}]\nrange_mm = [-250.0, 250.0]\nnodes = 6\n" for a in "XYZ")
+    path.write_text(f'name = "mill"\nchain = "{request.param}"\n{axes}')
+    return compgen.load_machine(path)
+
+
+def errors_of(machine):
+    at = np.linspace(-250.0, 250.0, 26)
+    zero = np.zeros(26)
+    curves = {
+        "EXX": Curve(at, 20e-6 * at, zero),
+        "EYY": Curve(at, -15e-6 * at, zero),
+        "EZZ": Curve(at, 5e-6 * at, zero),
+        "EYX": Curve(at, 2e-8 * (at**2 - 250.0**2), zero),
+        "EXZ": Curve(at, -1e-8 * (at**2 - 250.0**2), zero),
+    }
+    return ErrorTable(curves, {name: (value, 0.0) for name, value in SQUARENESS.items()})
+
+
+def readings(machine, errors, plane, *, seed=1, mismatch=0.0, arc=(0.0, 360.0), directions=(1, -1), known_centre=True):
+    """Length of a bar from a pivot that is not quite in the centre, as an independent formula has it."""
+    rng = np.random.default_rng(seed)
+    centre = np.array([20.0, -10.0, 30.0])
+    first, second = PLANES[plane]
+    parts = []
+    for direction in directions:
+        angle = np.radians(np.linspace(*arc, 361)[:-1])
+        unit = np.zeros((len(angle), 3))
+        unit[:, first], unit[:, second] = np.cos(angle), np.sin(angle)
+        command = centre + RADIUS_MM * unit
+        tip = tip_position(machine, errors.at(command), command, np.zeros(3))
+        velocity = np.zeros((len(angle), 3))
+        velocity[:, first], velocity[:, second] = -direction * np.sin(angle), direction * np.cos(angle)
+        tip = tip + 0.5 * np.array(REVERSAL_MM) * np.sign(np.round(velocity, 9))
+        length = np.linalg.norm(tip - (centre + [0.02, -0.03, 0.01]), axis=1)
+        length += 0.5 * RADIUS_MM * mismatch * direction * np.sin(2 * angle) + 0.004
+        parts.append(
+            (angle, length - RADIUS_MM + rng.normal(0.0, NOISE_MM, len(angle)), np.full(len(angle), direction))
+        )
+    angle, deviation, direction = (np.concatenate(item) for item in zip(*parts, strict=True))
+    count = len(angle)
+    ones = np.ones(count, dtype=np.int64)
+    place = np.tile(centre if known_centre else np.full(3, np.nan), (count, 1))
+    number = list(PLANES).index(plane)
+    return Circles(
+        number * ones,
+        angle,
+        RADIUS_MM * np.ones(count),
+        deviation,
+        direction,
+        ones,
+        0 * ones,
+        place,
+        np.full(count, np.nan),
+    )
+
+
+def file_of(folder, circles, name):
+    path = folder / f"{name}.circle.csv"
+    path.write_text(format_circles(circles))
+    return path
+
+
+def unknowns(found, what):
+    return {item["of"]: (item["value"], item["u"]) for item in found.details["unknowns"] if item["what"] == what}
+
+
+def test_three_planes_give_squareness_and_reversal_with_their_uncertainty(tmp_path, machine):
+    errors = errors_of(machine)
+    paths = [file_of(tmp_path, readings(machine, errors, plane, mismatch=30e-6), plane) for plane in PLANES]
+    circles = read_circles(paths)
+    assert circles.planes == ("XY", "YZ", "ZX")
+    found = identify_circles(machine, circles)
+    assert found.errors.names == ("EC0Y", "EB0Z", "EA0Z")
+    for name, (value, u) in found.errors.squareness.items():
+        assert 0 < u < 2e-6
+        assert abs(value - SQUARENESS[name]) < 4 * u + 1e-6  # bows lean the axes a little at the circle
+    for axis, value in enumerate(REVERSAL_MM):
+        curve = found.reversal_curves.curves[axis, axis]
+        assert curve.value[0] == pytest.approx(value, abs=4 * curve.u[0] + 1e-5)
+    scales = unknowns(found, "scales")
+    assert next(value for name, (value, _) in scales.items() if name.startswith("XY")) == pytest.approx(35.0, abs=1.0)
+    assert all(value == pytest.approx(30.0, abs=1.0) for value, _ in unknowns(found, "servo mismatch").values())
+
+
+def test_the_uncertainty_covers_the_truth_as_often_as_it_says(machine):
+    errors = errors_of(machine)
+    # the circle sees the axes where it is: there, at x = 20, the bow of X leans it towards Y
+    local = SQUARENESS["EC0Y"] - 2 * 2e-8 * 20.0
+    standard = []
+    for seed in range(30):
+        found = identify_circles(machine, readings(machine, errors, "XY", seed=seed))
+        value, u = found.errors.squareness["EC0Y"]
+        standard.append((value - local) / u)
+    assert 0.4 < np.sqrt(np.mean(np.square(standard))) < 1.6
+
+
+def test_one_direction_is_said_to_hold_the_servo_mismatch(machine):
+    errors = errors_of(machine)
+    with pytest.warns(CompgenWarning, match="XY was measured in one direction only"):
+        found = identify_circles(machine, readings(machine, errors, "XY", mismatch=30e-6, directions=(1,)))
+    sign = -1.0 if machine.squareness_reference == "X" else 1.0
+    assert found.errors.squareness["EC0Y"][0] == pytest.approx(SQUARENESS["EC0Y"] + sign * 30e-6, abs=2e-6)
+
+
+@pytest.mark.parametrize("arc", [(10.0, 240.0), (0.0, 180.0)])
+def test_arcs_tell_squareness_with_a_larger_uncertainty(machine, arc):
+    errors = errors_of(machine)
+    whole = identify_circles(machine, readings(machine, errors, "XY"))
+    part = identify_circles(machine, readings(machine, errors, "XY", arc=arc))
+    value, u = part.errors.squareness["EC0Y"]
+    assert abs(value - SQUARENESS["EC0Y"]) < 4 * u + 1e-6
+    assert u > whole.errors.squareness["EC0Y"][1]
+
+
+def test_a_laser_and_circles_make_tables_in_one_command(tmp_path, machine, capsys):
+    errors = errors_of(machine)
+    paths = [file_of(tmp_path, readings(machine, errors, plane), plane) for plane in PLANES]
+    runs = tmp_path / "x.axis.csv"
+    rows = [
+        f"X,{x},{way},{run},{20e-3 * x + 7.0:.4f}" for run in (1, 2, 3) for way in (1, -1) for x in range(-250, 251, 50)
+    ]
+    runs.write_text("axis,position_mm,direction,run,deviation_um\n" + "\n".join(rows) + "\n")
+    out = tmp_path / "out"
+    words = [
+        "run",
+        str(machine.source),
+        str(runs),
+        *map(str, paths),
+        "--controller",
+        "isg-csv",
+        "--out",
+        str(out),
+        "--no-report",
+    ]
+    assert run_command(cli, words) == 0
+    result = json.loads((out / "result.json").read_text())
+    assert result["measured"]["errors"] == ["EXX", "EC0Y", "EB0Z", "EA0Z"]
+    assert result["state"] == "partial" if "state" in result else True
+    text = (out / "identified.reversal.csv").read_text()
+    assert "Y,Y,,4.0" in text or "Y,Y,,3.9" in text
+
+
+def test_files_say_what_is_wrong_with_them(tmp_path, machine):
+    good = format_circles(readings(machine, errors_of(machine), "XY"))
+    for text, message in (
+        (good.replace("XY,", "YX,", 1), "'YX' is not a plane; expected XY, YZ, ZX; angles count from X to Y in XY"),
+        (good.replace(",100.000000,", ",0.000000,", 1), "0 is not a radius"),
+        (good.replace("centre_z_mm", "temp_z_c"), "give centre_x_mm, centre_y_mm and centre_z_mm"),
+    ):
+        path = tmp_path / "bad.circle.csv"
+        path.write_text(text)
+        with pytest.raises(InputError) as found:
+            read_circles(path)
+        assert message in str(found.value)
+    far = readings(machine, errors_of(machine), "XY")
+    far.centre_mm[:, 0] = 200.0
+    with pytest.raises(InputError, match="the circle leaves the travel; check centre and radius"):
+        identify_circles(machine, far)
+    with pytest.warns(CompgenWarning, match="middle of the travel"):
+        identify_circles(machine, readings(machine, errors_of(machine), "XY", known_centre=False))
+    with pytest.raises(UndeterminedError, match="too short"):
+        identify_circles(machine, readings(machine, errors_of(machine), "XY", arc=(0.0, 3.0), directions=(1,)))
