@@ -113,7 +113,7 @@ def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None =
         without a name or a reason, or if the folder cannot be written.
     """
     if not actor.strip() or not reason.strip():
-        raise InputError("giving a folder to this store needs a name and a reason", field="--reason")
+        raise InputError("give a name and a reason for handing the folder to this store", field="--reason")
     machine_job = job.machine(name)
     with closing(open_store(job.store, clock=clock)) as store:
         machine = store.add_machine(name)
@@ -206,7 +206,9 @@ def _chosen(store: Store, machine: MachineRecord, requested: str | None) -> Meas
     """Return the measurement with this number, or SHA-256 that begins like this; without either the newest."""
     known = store.measurements(machine)
     if not known:
-        raise InputError(f"the store holds no measurement of {machine.name}; `volcomp recal run` takes them in")
+        raise InputError(
+            f"the store holds no measurement of {machine.name}; `volcomp recal run` reads them from the inbox"
+        )
     if requested is None:
         return known[-1]
     text = requested.strip().lower()
@@ -215,8 +217,10 @@ def _chosen(store: Store, machine: MachineRecord, requested: str | None) -> Meas
         found += [item for item in known if item.sha256.startswith(text)]
     if len(found) != 1:
         listed = ", ".join(f"{item.id} ({item.name}, {item.sha256[:12]})" for item in known[-5:])
-        what = "several begin like that" if found else f"the newest are {listed}"
-        raise InputError(f"{machine.name} has no single measurement {requested!r}; {what}", field="--measurement")
+        what = "several begin with it" if found else f"the newest are {listed}"
+        raise InputError(
+            f"{requested!r} does not name one measurement of {machine.name}; {what}", field="--measurement"
+        )
     return found[0]
 
 

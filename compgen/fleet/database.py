@@ -285,7 +285,9 @@ def engine_of(url: str) -> sa.Engine:
         raise InputError(f"{shown(url)} is not a store; give sqlite:///FILE or postgresql://HOST/NAME")
     folder = Path(parsed.database).absolute().parent
     if not folder.is_dir():  # not made here: on a drive that is not mounted a new, empty store would begin
-        raise StoreError(f"the store {shown(url)} cannot be used: there is no folder {folder}; mount or make it first")
+        raise StoreError(
+            f"the store {shown(url)} cannot be used: there is no folder {folder}; mount or create it first"
+        )
     path = folder / Path(parsed.database).name
     _refuse_empty(path, url)
     return _sqlite(parsed.set(database=str(path)), os.getpid())
@@ -430,7 +432,7 @@ def _revision(connection: sa.Connection) -> str | None:
         raise InputError(f"the store was written by a newer compgen (schema {found}, this one knows {HEAD}); update")
     if found is not None and str(found) < INITIAL:
         raise InputError(
-            f"the store has schema {found}, which only unreleased versions of compgen wrote; begin a new one"
+            f"the store has schema {found}, which only unreleased versions of compgen wrote; start a new one"
         )
     return None if found is None else str(found)
 

@@ -98,7 +98,7 @@ def approve(
             )
         if state == "held" and not reason.strip():
             raise DecisionError(
-                _place(machine, version) + " is held back by the policy; say the reason why it is right"
+                _place(machine, version) + " is held back by the policy; give the reason why it is right nevertheless"
             )
         files_of(connection, table_id)  # nobody decides for files that nobody can write any more
         return add_decision(store, connection, machine, "approve", table_id, actor, reason)
@@ -173,7 +173,7 @@ def check_person(actor: str) -> None:
         shown = actor.encode("unicode_escape").decode("ascii")
         raise DecisionError(f"the name of who decides contains control characters or invisible ones: {shown}")
     if plain.strip().casefold() == AUTOMATIC:
-        raise DecisionError(f"{AUTOMATIC!r} signs decisions that no person made; give your own name")
+        raise DecisionError(f"{AUTOMATIC!r} is the signature of automatic decisions; give your own name")
 
 
 def _check_seen(
@@ -272,7 +272,7 @@ def exclude(
     """
     check_person(actor)
     if ": " in actor or not reason.strip():
-        raise InputError("an exclusion needs who says it (a name without ': ') and a reason")
+        raise InputError("an exclusion needs a name (without ': ') and a reason")
     job.machine(name)
     with closing(open_store(job.store, clock=clock)) as store:
         machine = store.machine(name)

@@ -611,6 +611,11 @@ class FigureDrift:
         steps = () if self.trend is None else self.trend.steps
         return min([self.adjusted, *(step.p_value for step in steps)])
 
+    @property
+    def limits(self) -> tuple[float, ...]:
+        """Lower and upper limit of the tolerance about what the active tables take out, mm or rad; none without one."""
+        return () if self.tolerance is None else (self.reference - self.tolerance, self.reference + self.tolerance)
+
     def line(self) -> tuple[FloatArray, FloatArray]:
         """Days and values of the line with its steps, each in the middle of its gap, at the mean temperature."""
         assert self.trend is not None

@@ -97,9 +97,7 @@ def _figure(item: FigureDrift, warm: Collection[str]) -> Picture:
             ahead = np.array([0.0, reach]), (state + trend.slope[0] * np.array([0.0, reach])) * scale
             shown.append(ahead[1])
             end += reach
-    limits = (
-        [] if item.tolerance is None else [(item.reference + sign * item.tolerance) * scale for sign in (-1.0, 1.0)]
-    )
+    limits = [limit * scale for limit in item.limits]
     shown += [level * scale, np.array(limits), value if following is None else following]
     plot = _over_days(limits_of(days, end, margin=0.03), limits_of(*shown), unit)
     if ahead is not None and item.forecast is not None:

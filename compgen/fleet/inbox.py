@@ -126,7 +126,7 @@ def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes
         with os.fdopen(handle, "rb") as stream:
             before = os.fstat(handle)
             if not stat.S_ISREG(before.st_mode):
-                raise InputError("cannot be read: another thing took its place meanwhile", file=path)
+                raise InputError("cannot be read: it was replaced while it was opened", file=path)
             if before.st_size > most:
                 size, allowed = before.st_size / 1e6, most / 1e6
                 message = f"is too large: {size:.3g} MB where {allowed:.3g} MB are left for this measurement"
@@ -136,7 +136,7 @@ def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", file=path) from error
     if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns) or len(content) != after.st_size:
-        raise InputError("is being written at this moment; it is taken by the next run", file=path)
+        raise InputError("is being written; the next run reads it", file=path)
     return content, after
 
 

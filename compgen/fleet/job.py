@@ -101,14 +101,14 @@ def _field(word: str, number: int) -> tuple[int, ...]:
     for part in word.split(","):
         match = re.fullmatch(r"(\*|\w+)(?:-(\w+))?(?:/(\d+))?", part)
         if match is None or (match[1] == "*" and match[2]):
-            raise ValueError(f"{part!r} is not a {name}; numbers, a-b, lists and /step are expected")
+            raise ValueError(f"{part!r} is not a valid {name}; numbers, a-b, lists and /step are expected")
         first = low if match[1] == "*" else _number(match[1], number)
         last = high if match[1] == "*" or (match[3] and not match[2]) else _number(match[2] or match[1], number)
         step = int(match[3] or 1)
         if names is DAYS and match[1] == "*":
             last = 6
         if first > last or step == 0:
-            raise ValueError(f"{part!r} does not contain a {name}; give the lower number first and a step above 0")
+            raise ValueError(f"{part!r} selects no {name}; give the lower number first and a step above 0")
         found.update(range(first, last + 1, step))
     return tuple(sorted(found))
 
@@ -118,7 +118,7 @@ def _number(word: str, number: int) -> int:
     if word in names:
         return names.index(word) + (low if names is MONTHS else 0)
     if not word.isascii() or not word.isdigit() or not low <= int(word) <= high:
-        raise ValueError(f"{word!r} is not a {name}; {low} to {high} is expected")
+        raise ValueError(f"{word!r} is not a valid {name}; {low} to {high} is expected")
     return int(word)
 
 

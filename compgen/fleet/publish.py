@@ -259,7 +259,7 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
         for name in seen.versions:
             if _is_of_others(folder / name, _about(store, machine, known[name])):
                 raise InputError(
-                    f"{name} was published from another measurement than this store says; {then}", file=folder
+                    f"{name} was published from another measurement than the one in this store; {then}", file=folder
                 )
         return
     if ledger["machine"] != machine.name:

@@ -171,7 +171,7 @@ def _prior(layout: ErrorParameters, covariance: Covariance) -> FloatArray:
         found = np.flatnonzero(names == name)
         if len(found) != len(position_mm):
             where = "" if name in SQUARENESS_NAMES else f" on the nodes of {AXES[error_named(name).axis]}"
-            raise InputError(f"the last calibration does not hold {name}{where} of the machine file; measure anew")
+            raise InputError(f"the last calibration does not hold {name}{where} of the machine file; measure again")
         rows.append(found)
         spread = np.zeros((len(found), layout.size))
         spread[:, columns] = matrix
@@ -218,7 +218,7 @@ def _greedy(
             seen = f"{power_of(request.size, best**-0.5, request.confidence):.2f}" if best > 0.0 else "none"
             raise InputError(
                 f"{len(chosen)} points do not show this change of {request.error} with power {request.power:g} (they reach "
-                f"{seen}); ask for a larger change, use more stations, or measure anew"
+                f"{seen}); ask for a larger change, use more stations, or measure again"
             )
         rest = [k for k in range(count) if k not in chosen]
         chosen.append(max(rest, key=lambda k: information([*chosen, k])))

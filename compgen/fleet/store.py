@@ -223,7 +223,7 @@ class Store:
             self.write(lambda c: _insert_measurement(c, machine.id, new, self.now(c)))
         found = self.find_measurement(machine, new.sha256)
         if found is None:
-            raise StoreError(f"measurement {new.name} cannot be kept in {shown(self.url)}")
+            raise StoreError(f"measurement {new.name} cannot be stored in {shown(self.url)}")
         return found
 
     def find_measurement(self, machine: MachineRecord, sha256: str) -> MeasurementRecord | None:

@@ -389,7 +389,7 @@ def test_no_store_begins_in_a_folder_that_is_not_there(site, capsys):
     site.measure()
     for words in (["run"], ["status"], ["history"]):
         assert command(site, *words) == 2
-        assert "mount or make it first" in capsys.readouterr().err
+        assert "mount or create it first" in capsys.readouterr().err
     assert not (site.folder / "unmounted").exists()
 
 

@@ -144,7 +144,7 @@ def test_a_user_who_becomes_a_reader_decides_nothing_any_more(tmp_path):
         assert users.may_decide("meyer")
     assert not users.may_decide("nobody")
     users.path.write_text(json.dumps({"users": {"meyer": "x"}, "readers": {"meyer": 1}}))
-    with pytest.raises(InputError, match="who only reads"):
+    with pytest.raises(InputError, match="malformed list of readers"):
         users.may_decide("meyer")
 
 

@@ -362,10 +362,9 @@ def drift_charts(drift: Drift) -> Sequence[Chart]:
         days, line = item.line()
         label = "trend with steps" if item.trend is not None and item.trend.steps else "trend"
         series.append(ChartSeries(label, (seconds[0] + 86400.0 * days).tolist(), (line * scale).tolist(), marked=False))
-        if item.tolerance is not None:
-            ends = np.array([item.reference - item.tolerance, item.reference + item.tolerance]) * scale
-            span = (seconds[0], seconds[-1])
-            series += [ChartSeries("limit of the tolerance", span, (end, end), marked=False) for end in ends.tolist()]
+        for limit in item.limits:
+            ends = (seconds[0], seconds[-1]), (limit * scale, limit * scale)
+            series.append(ChartSeries("limit of the tolerance", *ends, marked=False))
         found.append(chart(f"{item.figure.name}, {LABEL[item.figure.unit]}", series, marks))
     return [item for item in found if item is not None]
 
@@ -423,7 +422,7 @@ def requested_change(
     except ValueError:
         size = 0.0
     if not 0.0 < size <= LARGEST:
-        raise InputError(f"the change is a number above 0, at most {LARGEST:g} {LABEL[error_named(name).unit]}")
+        raise InputError(f"give the change as a number above 0, at most {LARGEST:g} {LABEL[error_named(name).unit]}")
     return RequestedChange(name, size * scale), text
 
 

@@ -81,7 +81,7 @@ def check_settings(settings: DashboardSettings) -> DashboardSettings:
     if settings.login and not is_local(settings.host) and not settings.tls:
         raise InputError(
             f"passwords would go to {settings.host} in the clear; keep --host 127.0.0.1 and put a proxy with HTTPS in "
-            "front, then say --behind-tls",
+            "front, then add --behind-tls",
             field="--host",
         )
     if settings.login and settings.users is None:

@@ -106,7 +106,7 @@ class Users:
         readers = data.get("readers", [])
         if not isinstance(readers, list) or not all(isinstance(item, str) for item in readers):
             raise InputError(
-                "has a malformed list of who only reads; make it again with `volcomp serve add-user`", file=self.path
+                "has a malformed list of readers; make it again with `volcomp serve add-user`", file=self.path
             )
         return users, frozenset(readers)
 
@@ -141,7 +141,7 @@ def check_name(name: str) -> None:
     if not NAME.fullmatch(name):
         raise InputError(f"{name!r} is not a name: letters, digits and . _ @ -, at most 64, are allowed")
     if name.lower() == AUTOMATIC:
-        raise InputError(f"{name!r} signs decisions that no person made; choose another name")
+        raise InputError(f"{name!r} is the signature of automatic decisions; choose another name")
 
 
 def check_password(name: str, password: str) -> None:
