@@ -81,6 +81,7 @@ def test_completion_of_an_option_knows_the_options_and_loads_that_command_alone(
         (["controllers", "--json"], "listing_commands", TABLES),
         (["recal", "--help"], "fleet_commands", {"rich"}),
         (["recal", "run", "--help"], "fleet_commands", {"rich"}),
+        (["recal", "add", "--help"], "fleet_commands", {"rich"}),
         (["serve", "--help"], "fleet_commands", {"rich"}),
         (["identify", "zha-gantry", "L", "--out", "o"], "identify_commands", {"numpy", "rich"}),
         (["fit", "zha-gantry", "E", "--out", "o"], "fit_commands", TABLES | {"scipy.optimize", "scipy.spatial"}),
@@ -103,6 +104,36 @@ def test_a_command_loads_its_own_module_and_no_library_that_it_does_not_need(tmp
     libraries, commands, _ = loaded(tmp_path, PROGRAM.format([files.get(word, word) for word in words]))
     assert commands == {module}
     assert libraries <= allowed
+
+
+EXTRAS = ("alembic", "apscheduler", "argon2", "flask", "sqlalchemy", "structlog", "waitress")
+WITHOUT = f"import sys\nsys.modules.update(dict.fromkeys({EXTRAS}))\n"
+
+
+@pytest.mark.parametrize("words", [["recal", "--help"], ["recal", "recheck", "--help"], ["serve", "--help"]])
+def test_the_help_needs_none_of_the_extras(tmp_path, words):
+    assert "Options:" in loaded(tmp_path, WITHOUT + PROGRAM.format(words))[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["recal", "status"],
+            "volcomp recal needs SQLAlchemy, alembic, APScheduler, structlog; install compgen[recal]",
+        ),
+        (["serve", "--store", "s"], "is not installed; the dashboard needs: pip install 'compgen[serve]'"),
+        (
+            ["serve", "users", "--store", "s"],
+            "argon2 is not installed; the dashboard needs: pip install 'compgen[serve]'",
+        ),
+    ],
+)
+def test_without_the_extras_a_command_says_what_to_install(tmp_path, words, said):
+    code = WITHOUT + PROGRAM.format(words)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert said in " ".join(done.stderr.split())
 
 
 def test_a_run_loads_the_control_in_use_and_no_room_that_it_does_not_need(tmp_path):

@@ -402,6 +402,11 @@ def test_add_appends_a_machine_and_refuses_what_the_job_file_would_not_take(site
     before = site.job.read_text()
     assert site.call("add", "saw", *words, "--out", "o2", "--schedule", "30 6 * * mon") == 0
     assert site.job.read_text().startswith(before)
+    # the keys that were given, as they were given; the others may come from the defaults
+    assert site.job.read_text().removeprefix(before).strip() == (
+        '[machines.saw]\nmachine = "mill.toml"\ninbox = "in2"\ncontrollers = ["neutral"]\nout = "o2"\n'
+        'measured_with = "active"\nschedule = "30 6 * * mon"'
+    )
     assert read_job(site.job).machines["saw"].schedule.weekdays == (1,)
     after = site.job.read_text()
     for wrong in (
@@ -409,12 +414,31 @@ def test_add_appends_a_machine_and_refuses_what_the_job_file_would_not_take(site
         ["a/b", *words, "--out", "o3"],
         ["lathe", *words, "--out", "o2"],
         ["lathe", *words, "--out", "o3", "--schedule", "x"],
+        ["lathe", *words, "--out", "o3", "--every-minutes", "0"],
+        ["lathe", *words, "--out", "o3", "--approval", "never"],
+        ["lathe", *words, "--out", ""],
+        ["lathe", *words],
         ["lathe", *words[2:], "--machine", "none.toml", "--out", "o3"],
     ):
         assert site.call("add", *wrong) == 2
     assert site.job.read_text() == after
     assert site.call("add", "first", *words, "--out", 'o"\\', "--job", "new.toml") == 0
     assert read_job(site.folder / "new.toml").machines["first"].out.name == 'o"\\'
+    given = [
+        "--every-minutes",
+        "20",
+        "--approval",
+        "auto",
+        "--controller",
+        "isg-csv",
+        "--out",
+        "o4",
+        "--job",
+        "new.toml",
+    ]
+    assert site.call("add", "second", *words, *given) == 0
+    second = read_job(site.folder / "new.toml").machines["second"]
+    assert (second.schedule, second.approval, second.controllers) == (Every(20), "auto", ("neutral", "isg-csv"))
 
 
 # --- watching ------------------------------------------------------------------------------------------------------
