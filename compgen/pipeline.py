@@ -32,6 +32,7 @@ from compgen.identify.any_measurement import (
     describe,
     evidence_files,
     identify_measurement,
+    identify_mixed,
 )
 from compgen.identify.reversal_errors import SIGNIFICANT
 
@@ -276,26 +277,8 @@ def identify_bare(
     measurement: Measurement | ErrorTable,
     options: IdentifyOptions | None = None,
     active: ActiveTables | None = None,
-    reversal: ReversalCurves | None = None,
 ) -> Identification:
     """Identify the machine without the tables that were active while it was measured, if there were any.
-
-    ``reversal`` is known otherwise, and takes the place of a measured one of the same axis.
-    """
-    result = _identify_bare(machine, measurement, options, active)
-    if reversal is None:
-        return result
-    measured = {} if result.reversal_curves is None else result.reversal_curves.curves
-    return replace(result, reversal_curves=ReversalCurves({**measured, **reversal.curves}, {"machine": machine.name}))
-
-
-def _identify_bare(
-    machine: Machine,
-    measurement: Measurement | ErrorTable,
-    options: IdentifyOptions | None,
-    active: ActiveTables | None,
-) -> Identification:
-    """Identify without the tables that were active.
 
     Errors that another program identified are used as given. ``corrections["active_tables"]`` of the result says what
     was taken out.
@@ -311,7 +294,7 @@ def _identify_bare(
     if active is None and isinstance(measurement, MixedMeasurement):
         tables_of = {name: part for name, part in measurement.parts if isinstance(part, ErrorTable)}
         known = {name: given_errors(machine, table, whole=False) for name, table in tables_of.items()}
-        return identify_measurement(machine, measurement, options, known)
+        return identify_mixed(machine, measurement, options or IdentifyOptions(), known)
     if active is None or not isinstance(measurement, Lengths | Deviations):
         raise InputError(
             "tables that were active (--active) can be taken out of lengths and deviations only; measure anything else with "
@@ -320,6 +303,15 @@ def _identify_bare(
     wider, moved, report = without_active(machine, measurement, active)
     result = identify_measurement(wider, moved, options)
     return replace(result, corrections={**result.corrections, "active_tables": report})
+
+
+def with_reversal(result: Identification, stated: ReversalCurves | None) -> Identification:
+    """Return the identification with reversals that are known otherwise; each takes the place of a measured one of its axis."""
+    if stated is None:
+        return result
+    measured = {} if result.reversal_curves is None else result.reversal_curves.curves
+    metadata = {"machine": result.layout.machine.name}
+    return replace(result, reversal_curves=ReversalCurves({**measured, **stated.curves}, metadata))
 
 
 def _write_results(
@@ -439,7 +431,9 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     provenance = provenance_of(machine.file, *measurements, instrument)
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):
-        identification = identify_bare(machine, measurement, identify_options, active, numbers.reversal())
+        identification = with_reversal(
+            identify_bare(machine, measurement, identify_options, active), numbers.reversal()
+        )
     progress("fitting smooth curves")
     known = None if not identification.has_covariance else covariance.joint_covariance(identification)
     fitted = fit(machine, identification.errors, fit_options or FitOptions(), covariance=known)

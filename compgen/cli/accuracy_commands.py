@@ -13,7 +13,7 @@ from typing import Any
 import click
 from rich.console import Console, RenderableType
 
-from compgen.accuracy.circles import accuracy_of_circles
+from compgen.accuracy.circularity import accuracy_of_circles
 from compgen.accuracy.compare import CompareOptions
 from compgen.accuracy.diagonals import accuracy_of_diagonals
 from compgen.accuracy.evaluate import accuracy_of_errors

@@ -32,6 +32,7 @@ from compgen.pipeline import (
     identification_files,
     identify_bare,
     provenance_of,
+    with_reversal,
 )
 from compgen.report.terminal import identification_table
 
@@ -96,7 +97,7 @@ def identify_command(
         measurement = open_measurement(measurements, instrument, stated=stated.errors(machine))
         show(f"identifying: {describe(measurement)}")
         with failure_reported(out):
-            result = identify_bare(machine, measurement, options, active, stated.reversal())
+            result = with_reversal(identify_bare(machine, measurement, options, active), stated.reversal())
         checked = None
         if replicates is not None:
             if active is not None or not isinstance(measurement, Lengths):

@@ -105,18 +105,11 @@ def _planes(table: CsvTable, column: str) -> NDArray[np.int64]:
     return np.array([list(PLANES).index(name) for name in names], dtype=np.int64)
 
 
-def _radii(table: CsvTable, column: str) -> FloatArray:
-    values = within(LARGEST_RADIUS_MM, "mm", "more than 10 m; is the unit mm?")(table, column)
-    for row in np.flatnonzero(np.asarray(values) <= 0)[:1].tolist():
-        raise table.fail(row, column, f"{values[row]:g} is not a radius; it must be above zero")
-    return np.asarray(values)
-
-
 _CIRCLES = Schema(
     (
         Field("plane", ("plane",), _planes, encode=lambda planes: [list(PLANES)[k] for k in planes]),
         Field("angle_rad", ("angle_deg",), unit=float(np.pi / 180.0), digits=6),
-        Field("radius_mm", ("radius_mm",), _radii, digits=6),
+        Field("radius_mm", ("radius_mm",), within(LARGEST_RADIUS_MM, "mm", "more than 10 m; is the unit mm?")),
         RUN_DEVIATION,
         DIRECTION,
         Field("run", ("run",), CsvTable.labels, presence="filled", fill=0, digits=0),
@@ -140,6 +133,9 @@ def read_circles(files: str | Path | Sequence[str | Path]) -> Circles:
     for table in _CIRCLES.read_tables(files):
         values = _CIRCLES.values(table)
         found = Circles(**values)
+        for row in np.flatnonzero(found.radius_mm <= 0)[:1].tolist():
+            text = f"{found.radius_mm[row]:g} is not a radius; it must be above zero"
+            raise table.fail(row, "radius_mm", text)
         partly = np.isnan(found.centre_mm).any(axis=1) & ~np.isnan(found.centre_mm).all(axis=1)
         if partly.any():
             given = [name for name in ("centre_x_mm", "centre_y_mm", "centre_z_mm") if name in table.columns]

@@ -87,7 +87,15 @@ class StatedNumbers:
         squareness = {}
         for name, text in self.squareness.items():
             if name not in SQUARENESS_NAMES:
-                raise InputError(_wrong_name(name), field="--squareness")
+                axes = re.search(r"([XYZ])\W?([XYZ])$", name.upper())
+                key = "".join(axes.groups()) if axes else name.upper().removeprefix("E")[:1]
+                meant = [_ABOUT[key]] if key in _ABOUT else list(SQUARENESS)
+                shown = [
+                    f"{item}, squareness of {SQUARENESS[item][0]}, positive where {SQUARENESS[item][1]}"
+                    for item in meant
+                ]
+                what = f"{name!r} is not a squareness error; {'this may be' if key in _ABOUT else 'these are'} {'; '.join(shown)}"
+                raise InputError(what, field="--squareness")
             squareness[name] = _value(text, ANGLES, "--squareness", name)
         curves = {}
         for letter, text in self.scale.items():
@@ -138,14 +146,3 @@ def _value(text: str, units: Mapping[str, float], option_name: str, name: str) -
             f"{text!r} for {name} is too large to be an error of a machine; check the unit", field=option_name
         )
     return value, float(u)
-
-
-def _wrong_name(name: str) -> str:
-    axes = re.search(r"([XYZ])\W?([XYZ])$", name.upper())
-    key = "".join(axes.groups()) if axes else name.upper().removeprefix("E")[:1]
-    key = key if key in _ABOUT else ""
-    meant = [_ABOUT[key]] if key else list(SQUARENESS)
-    listed = "; ".join(
-        f"{item}, squareness of {SQUARENESS[item][0]}, positive where {SQUARENESS[item][1]}" for item in meant
-    )
-    return f"{name!r} is not a squareness error; {'this may be' if key else 'these are'} {listed}"

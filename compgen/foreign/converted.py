@@ -155,7 +155,12 @@ def given_errors(machine: Machine, table: ErrorTable, *, whole: bool = True) -> 
         for errors that the machine's travel or chain does not fit.
     """
     if not whole and not table.squareness:
-        table = table.replace(curves={name: _levelled(name, curve) for name, curve in table.curves.items()})
+        curves = dict(table.curves)
+        for name, curve in table.curves.items():
+            if error_named(name).is_straightness:
+                ends = np.interp(curve.position_mm, curve.position_mm[[0, -1]], curve.value[[0, -1]])
+                curves[name] = Curve(curve.position_mm, curve.value - ends, curve.u)
+        table = table.replace(curves=curves)
     zeroed = fit(machine, table, FitOptions(smoothness=0.0))
     if not whole and not table.squareness:
         zeroed = replace(zeroed, errors=zeroed.errors.replace(squareness={}))
@@ -176,12 +181,3 @@ def given_errors(machine: Machine, table: ErrorTable, *, whole: bool = True) -> 
             "frame_change": zeroed.to_dict()["frame_change"],
         },
     )
-
-
-def _levelled(name: str, curve: Curve) -> Curve:
-    """A straightness curve without the line through its ends; any other curve as it is."""
-    if not error_named(name).is_straightness:
-        return curve
-    at = curve.position_mm
-    ends = np.interp(at, at[[0, -1]], curve.value[[0, -1]])
-    return Curve(at, curve.value - ends, curve.u)

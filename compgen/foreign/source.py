@@ -383,7 +383,7 @@ def header_date(text: str, chosen: Order | None = None) -> tuple[str | None, str
 # :func:`open_measurement` and :func:`open_errors` take any file; a foreign one that leaves something open is refused with
 # what ``volcomp import`` needs. What converts a foreign file is imported when there is one.
 
-_NATIVE_SUFFIXES = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv", ".part.csv")
+_NATIVE_SUFFIXES = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv", ".part.csv", ".circle.csv")
 
 
 def native_format(path: Path) -> str | None:
@@ -430,7 +430,8 @@ def open_measurement(
         )
     parts: list[tuple[str, OneKind | ErrorTable]] = []
     measured = [k for k, kind in enumerate(kinds) if kind != "errors"]
-    foreign = any(kinds[k] is None and not _native_name(paths[k]) for k in measured)
+    # of a file that has the name of a native one, the native reader says best what is missing
+    foreign = any(kinds[k] is None and not Path(paths[k]).name.lower().endswith(_NATIVE_SUFFIXES) for k in measured)
     posed = [k for k in measured if kinds[k] == "sixdof"] if foreign else []
     plain = [paths[k] for k in measured if k not in posed]
     if foreign:
@@ -449,11 +450,6 @@ def open_measurement(
     if stated is not None:
         parts.append(("command line", stated))
     return parts[0][1] if len(parts) == 1 else MixedMeasurement(tuple(parts))
-
-
-def _native_name(path: str | Path) -> bool:
-    """Whether the name says that a file is native: its reader says best what is missing."""
-    return Path(path).name.lower().endswith(_NATIVE_SUFFIXES)
 
 
 def open_errors(path: str | Path) -> ErrorTable:

@@ -148,15 +148,9 @@ def describe(measurement: Measurement | ErrorTable) -> str:
 
 
 def identify_measurement(
-    machine: Machine,
-    measurement: Measurement,
-    options: IdentifyOptions | None = None,
-    known: Mapping[str, Identification] | None = None,
+    machine: Machine, measurement: Measurement, options: IdentifyOptions | None = None
 ) -> Identification:
-    """Identify from any kind or mixture; InputError for options that belong to another kind.
-
-    ``known`` are the errors of a mixture that are known otherwise, by the name of their part.
-    """
+    """Identify from any kind or mixture; InputError for options that belong to another kind."""
     chosen = options or IdentifyOptions()
     if isinstance(measurement, Lengths):
         if chosen.u_deviation_um is not None:
@@ -176,7 +170,7 @@ def identify_measurement(
     from compgen.identify.six_dof import identify_sixdof
 
     if isinstance(measurement, MixedMeasurement):
-        return _identify_mixed(machine, measurement, chosen, known or {})
+        return identify_mixed(machine, measurement, chosen, {})
     if isinstance(measurement, Deviations | AxisRuns) and not chosen.small_deviations:
         # deviations that are all zero, or so small that their unit must be another one
         measured = measurement.deviation_mm[np.isfinite(measurement.deviation_mm)]
@@ -220,10 +214,13 @@ def identify_measurement(
     return identify_sixdof(machine, measurement)
 
 
-def _identify_mixed(
+def identify_mixed(
     machine: Machine, measurement: MixedMeasurement, options: IdentifyOptions, known: Mapping[str, Identification]
 ) -> Identification:
-    """Identify every part alone as far as it goes, and all of them together."""
+    """Identify every part of a mixture alone as far as it goes, and all of them together.
+
+    ``known`` are the errors that are known otherwise, by the name of their part.
+    """
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import Deviations
     from compgen.identify.merging import merge

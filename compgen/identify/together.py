@@ -9,7 +9,7 @@ they are, at the targets that were measured.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -37,8 +37,6 @@ from compgen.kinematics.first_order import modelled_errors
 
 #: No value is known better than this, um and urad.
 FINEST = 1e-3
-#: So many positions of each error are compared between two measurements.
-MOST_COMPARED = 50
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,14 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
     u_scale = uncertainty_scale(reduced, "stated")
     errors, factor = values_with_factor(solution.layout, solution.unknowns, u_scale * solution.factor)
     known = [part.alone for part in parts if part.alone is not None]
-    texts = _contradictions(agreement)
+    texts = []
+    for name, numbers in agreement.items():
+        beyond = ", ".join(f"{error} ({value:.1f})" for error, value in numbers.items() if value > 1.0)
+        if beyond:
+            texts.append(
+                f"{name} disagrees with the other measurements beyond the uncertainty of both in {beyond} (En, 1 is the "
+                "limit); look at calibration, set-up, signs and the time between the measurements"
+            )
     for text in texts:
         warnings.warn(text, CompgenWarning, stacklevel=4)
     common = _common(parts, known)
@@ -239,7 +244,7 @@ def _agreement(
         except UndeterminedError:
             continue
         differences = {}
-        for name, position_mm in _positions_read(layout, found[k]).items():
+        for name, position_mm in found[k].positions(layout).items():
             rows = layout.value_rows([name] * len(position_mm), position_mm)
             both = determined_values(layout, found[k], rows) & determined_values(layout, others, rows)
             (value, u), (against, u_against) = (side.curve(name, position_mm[both]) for side in (one, other))
@@ -251,33 +256,6 @@ def _agreement(
             name: float(normalized_error(value, factor * u).max()) for name, (value, u) in differences.items()
         }
     return result
-
-
-def _positions_read(layout: ErrorParameters, read: Observations) -> dict[str, FloatArray]:
-    """Where a part says something about each error: at most ``MOST_COMPARED`` of its positions, else the nodes."""
-    positions = {name: np.array([np.nan]) for name in layout.squareness}
-    for number, curve in enumerate(layout.curves):
-        along = np.unique(read.at_mm[read.shows[:, number], curve.error.axis])
-        along = along[np.isfinite(along)]
-        some = (
-            along[np.unique(np.linspace(0, max(len(along) - 1, 0), MOST_COMPARED).astype(int))] if len(along) else along
-        )
-        positions[curve.error.name] = some if len(some) else curve.nodes_mm
-    return positions
-
-
-def _contradictions(agreement: Mapping[str, Mapping[str, float]]) -> tuple[str, ...]:
-    """What has to be said of parts that disagree beyond their uncertainty; empty if everything agrees."""
-    texts = []
-    for name, numbers in agreement.items():
-        beyond = {error: value for error, value in numbers.items() if value > 1.0}
-        if beyond:
-            listed = ", ".join(f"{error} ({value:.1f})" for error, value in beyond.items())
-            texts.append(
-                f"{name} disagrees with the other measurements beyond the uncertainty of both in {listed} (En, 1 is the "
-                "limit); look at calibration, set-up, signs and the time between the measurements"
-            )
-    return tuple(texts)
 
 
 def _common(parts: Sequence[Source], known: Sequence[Identification]) -> Identification:

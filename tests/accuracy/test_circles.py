@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from compgen.accuracy.circles import accuracy_of_circles
+from compgen.accuracy.circularity import accuracy_of_circles
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.circles import Circles, format_circles

@@ -17,7 +17,7 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_measurement
 from compgen.identify import joint_covariance
 from compgen.kinematics.exact_chain import tip_position
-from compgen.pipeline import identify_bare
+from compgen.pipeline import identify_bare, with_reversal
 
 NOISE_MM = 3e-4
 
@@ -68,7 +68,7 @@ def test_pitch_of_a_laser_and_a_granite_square_are_joined_as_they_are(tmp_path, 
     paths = written(tmp_path, x_axis_csv=format_axis_runs(runs))
     numbers = StatedNumbers(squareness={"EC0Y": "25±3"}, backlash={"Z": "6±1"}, scale={"Y": "-12±2"})
     measurement = open_measurement(paths, stated=numbers.errors(small_machine))
-    found = identify_bare(small_machine, measurement, reversal=numbers.reversal())
+    found = with_reversal(identify_bare(small_machine, measurement), numbers.reversal())
     assert found.errors.names == ("EXX", "EYY", "EC0Y")
     assert found.errors.squareness["EC0Y"] == pytest.approx((25e-6, 3e-6))
     assert len(found.errors.curves["EXX"].value) == 13  # at the targets, not at the nodes of the machine

@@ -30,6 +30,8 @@ WEAK = 0.25
 SEEN = 1e-6
 #: A part of an error is not determined if the readings show less than this share of one of its unknowns.
 WHOLLY = 1.0 - 1e-4
+#: So many positions of each error stand for all at which it was read.
+MOST_SHOWN = 50
 #: A value is determined if less than this share of it lies beside the determined directions.
 BESIDE = 1e-4
 #: Curvature of a curve between neighbouring nodes where too few of them are seen to measure it, um and urad.
@@ -61,6 +63,16 @@ class Observations:
     def __len__(self) -> int:
         """Return the number of readings."""
         return len(self.value)
+
+    def positions(self, layout: ErrorParameters) -> dict[str, FloatArray]:
+        """Where readings say something about each error: at most ``MOST_SHOWN`` of their positions, else the nodes."""
+        positions = {name: np.array([np.nan]) for name in layout.squareness}
+        for number, curve in enumerate(layout.curves):
+            along = np.unique(self.at_mm[self.shows[:, number], curve.error.axis])
+            along = along[np.isfinite(along)]
+            some = np.unique(np.linspace(0, max(len(along) - 1, 0), MOST_SHOWN).astype(int))
+            positions[curve.error.name] = along[some] if len(along) else curve.nodes_mm
+        return positions
 
 
 def stacked(parts: Sequence[Observations]) -> Observations:

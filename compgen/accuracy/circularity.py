@@ -50,7 +50,10 @@ def _figures(circles: Circles, own: np.ndarray, *, calibrated: bool) -> dict[str
             continue
         paths = [_at_angles(angle[rows & (run == k)], radial[rows & (run == k)]) for k in np.unique(run[rows])]
         mean = np.nanmean(paths, axis=0)
-        u = _scatter(np.array(paths), circles.u_mm[own][rows])
+        if len(paths) > 1:  # the uncertainty of the mean path at one angle: by the scatter between runs, else as stated
+            u = float(np.sqrt(np.nanmean(np.nanvar(paths, axis=0, ddof=1)) / len(paths)))
+        else:
+            u = float(np.sqrt(np.mean(circles.u_mm[own][rows] ** 2)))
         ways[sign] = (mean, u)
         path = radial[rows] if len(paths) == 1 else mean[np.isfinite(mean)]
         weight = range_weight(path)
@@ -84,10 +87,3 @@ def _at_angles(angle: FloatArray, radial: FloatArray) -> FloatArray:
     near = np.minimum(at - around[next_one - 1], around[np.minimum(next_one, len(around) - 1)] - at)
     step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
     return np.where(near <= max(1.01 * step, np.radians(1.01)), found, np.nan)
-
-
-def _scatter(paths: FloatArray, stated: FloatArray) -> float:
-    """Standard uncertainty of the mean path at one angle, mm: from the scatter between runs, else as stated."""
-    if len(paths) > 1:
-        return float(np.sqrt(np.nanmean(np.nanvar(paths, axis=0, ddof=1)) / len(paths)))
-    return float(np.sqrt(np.mean(stated**2)))
