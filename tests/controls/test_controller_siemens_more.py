@@ -442,21 +442,34 @@ def test_a_set_that_is_nearly_as_good_is_judged_by_what_it_holds_and_a_bad_one_b
     assert any("correction Y" in reason for reason in verify(machine, tables, errors(6e-3, 12e-3)).reasons)
 
 
-def test_what_has_no_room_is_named_with_its_rms_the_largest_first():
+@pytest.mark.parametrize(
+    ("shape", "steps"),
+    [
+        ([0.0, *[1.0, -1.0, 0.0] * 2], None),
+        ([0.0, *[1.0, 0.0, -1.0, 0.0] * 2], {"X": 100.0, "Y": 62.5, "Z": 56.25}),  # not the nodes of the machine
+    ],
+)
+def test_what_has_no_room_is_named_with_its_rms_the_largest_first(shape, steps):
     """A zigzag of size a and mean zero has a root mean square of a / sqrt(3): 5.77, 2.89 and 0.009 um."""
-    machine = machine_with("WFYXZT", {"siemens-cec": {"sign": "error", "mult_mode": "S1", "tables_available": 1}})
-    shape, unknown = np.array([0.0, 1.0, -1.0, 0.0, 1.0, -1.0, 0.0]), np.full(7, np.nan)
+    own = {"sign": "error", "mult_mode": "S1", "tables_available": 1, **({"step_mm": steps} if steps else {})}
+    machine = machine_with("WFYXZT", {"siemens-cec": own})
+    unknown = np.full(len(shape), np.nan)
     sizes = {"EXY": 12e-3, "EZY": 5e-3, "EYX": 10e-3, "EZX": 15e-6}
     curves = {
-        name: Curve(machine.axes["XYZ".index(name[2])].nodes_mm, size * shape, unknown) for name, size in sizes.items()
+        name: Curve(
+            np.linspace(*machine.axes["XYZ".index(name[2])].range_mm, len(shape)), size * np.array(shape), unknown
+        )
+        for name, size in sizes.items()
     }
     (note,) = [
         text for text in export(machine, ErrorTable(curves), "siemens-cec").warnings if "not corrected are" in text
     ]
-    assert note.endswith(
-        ", 1 may be used: not corrected are Y(x) (5.77 um rms), Z(y) (2.89 um rms); together they leave 6.45 um rms over "
-        "the volume (first order)"
-    ), note
+    found = re.findall(r"(\w\(\w\)) \(([\d.]+) um rms\)", note)
+    assert [name for name, _ in found] == ["Y(x)", "Z(y)"]
+    together = re.search(r"together they leave ([\d.]+) um rms over the volume", note).group(1)
+    due = [10.0, 5.0, np.hypot(10.0, 5.0)] / np.sqrt(3.0)
+    # the sample of the volume has as many points as there are for all axes together: half a percent
+    assert [float(text) for text in (*(text for _, text in found), together)] == pytest.approx(due, rel=0.01)
 
 
 def test_more_tables_never_leave_more():
