@@ -552,6 +552,8 @@ def test_tables_of_opposite_directions_never_add_up_in_the_largest_sum(simple):
     text += constant(1, "0.03").replace("DIRECTION[1]=0", "DIRECTION[1]=-1")
     tables = parsed(control, machine, own, text + constant(2, "-0.1") + "M17\n")
     assert largest_sums(machine, tables.tables, "S1")[0][0] == pytest.approx(-0.09, abs=ARITHMETIC)
+    turned = parsed(control, machine, own, text.replace("=0.03", "=-0.03") + constant(2, "-0.1") + "M17\n")
+    assert largest_sums(machine, turned.tables, "S1")[0][0] == pytest.approx(-0.13, abs=ARITHMETIC)
 
 
 @pytest.mark.parametrize(("sign", "moved"), [("error", "-0.050000"), ("correction", "+0.050000")])
