@@ -559,8 +559,7 @@ def _indices_in_words(tables: CecMap) -> str:
     ends = [index for index in found if index - 1 not in tables or index + 1 not in tables]
     parts: list[str] = []
     for index in ends:
-        alone, begins = index - 1 not in tables and index + 1 not in tables, index - 1 not in tables
-        if alone or begins:
+        if index - 1 not in tables:
             parts.append(str(index))
         else:
             parts[-1] += f" ... {index}"

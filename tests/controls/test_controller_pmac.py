@@ -96,6 +96,14 @@ def test_a_table_of_two_dimensions_has_its_columns_along_the_row_motor():
     assert added(tables, points)[:, 2] == pytest.approx(np.array(counts) / -500.0)
 
 
+def test_a_d_behind_a_source_is_its_desired_position():
+    """Software Reference, DEFINE COMP: with D the table goes over the commanded position, without over the actual one."""
+    text = "#4 DEFINE COMP 2,#1D,#3,4000\n0 0\n#3 DEFINE COMP 2,#1,#2,4000\n0 0\n#2 DEFINE COMP 1.1,#1D,#2,#3,4000,4000\n0 0 0\n"
+    tables = parsed(text + "#1 DEFINE COMP 1.1,#1,#2D,#3,4000,4000\n0 0 0\n").tables
+    assert [table.desired for table in tables[:2]] == [True, False]
+    assert [(table.row_desired, table.column_desired) for table in tables[2:]] == [(True, False), (False, True)]
+
+
 def test_backlash_is_taken_off_after_negative_travel_of_the_motor_only():
     text = GOLDEN.replace("I51=1", "#1 DEFINE BLCOMP 4,4000\n16 32 0 0\nI186=160\nI51=1")
     tables = parsed(text)
