@@ -28,8 +28,8 @@ from compgen.foreign.detect import import_file
 from compgen.foreign.findings import Imported, ImportOptions
 from compgen.foreign.laser_files import Capture
 from compgen.identify import Identification
+from compgen.identify.axis_tests import positioning_errors
 from compgen.identify.identification import metadata_of, without_adjustment
-from compgen.identify.single_axes import positioning_errors
 from compgen.instruments.sixdof_readings import read_sixdof
 
 Plain = Lengths | Deviations | AxisRuns

@@ -14,7 +14,7 @@ from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.messages import nearest
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.errors import InputError
-from compgen.identify.single_axes import SAME_TARGET_MM, two_way_mean, worth_a_table
+from compgen.identify.axis_tests import SAME_TARGET_MM, two_way_mean, worth_a_table
 
 IntArray = NDArray[np.int64]
 #: A reading is remarked on if it lies so far from the median, mm or rad, and so many times further than nine in ten others.
@@ -173,7 +173,7 @@ def check_error(error: str, axis: str | None, *, angular: bool) -> str:
 def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[ErrorTable, ReversalCurves | None]:
     """Return the two-way mean over the targets as one error, and the reversal of the axis.
 
-    See :func:`compgen.identify.single_axes.two_way_mean`. The reversal is None for angles, for one direction, and below
+    See :func:`compgen.identify.axis_tests.two_way_mean`. The reversal is None for angles, for one direction, and below
     0.1 um.
     """
     centre, gap, _ = two_way_mean(runs.position_mm, runs.direction, runs.value)

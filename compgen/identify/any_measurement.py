@@ -165,8 +165,8 @@ def identify_measurement(
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.circles import Circles
     from compgen.data.deviations import Deviations
+    from compgen.identify.axis_tests import identify_axis_runs
     from compgen.identify.positions import identify_deviations
-    from compgen.identify.single_axes import identify_axis_runs
     from compgen.identify.six_dof import identify_sixdof
 
     if isinstance(measurement, MixedMeasurement):
@@ -203,7 +203,7 @@ def identify_measurement(
             )
         if isinstance(measurement, AxisRuns):
             return identify_axis_runs(machine, measurement)
-        from compgen.identify.circles import identify_circles
+        from compgen.identify.axis_tests import identify_circles
 
         return identify_circles(machine, measurement)
     if other or chosen.u_deviation_um is not None:

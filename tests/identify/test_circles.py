@@ -11,7 +11,7 @@ from compgen.cli.common import run_command
 from compgen.data.circles import PLANES, Circles, format_circles, read_circles
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
-from compgen.identify.circles import identify_circles
+from compgen.identify.axis_tests import identify_circles
 from compgen.kinematics.exact_chain import tip_position
 
 RADIUS_MM, NOISE_MM = 100.0, 2e-4
