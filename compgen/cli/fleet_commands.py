@@ -27,7 +27,7 @@ from compgen.cli.common import (
 from compgen.cli.terminal import answer, complain, say, stdout
 from compgen.errors import InputError
 from compgen.fleet.dashboard.settings import DashboardSettings, default_users, read_token
-from compgen.fleet.job import Job, MachineJob, add_machine, command_words, read_job, units
+from compgen.fleet.job import WATCH_POLL_S, Job, MachineJob, add_machine, command_words, read_job, units
 from compgen.fleet.records import ReprocessRequest, RequestedChange
 
 if TYPE_CHECKING:
@@ -167,7 +167,11 @@ def _words(command: str | None) -> tuple[str, ...]:
 @recal_command.command("watch")
 @job_option
 @click.option(
-    "--poll-s", default=2.0, show_default=True, type=click.FloatRange(0.05, 3600), help="Look at the job file, s."
+    "--poll-s",
+    default=WATCH_POLL_S,
+    show_default=True,
+    type=click.FloatRange(0.05, 3600),
+    help="How often to look at the job file, s.",
 )
 @click.option(
     "--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus metrics on 127.0.0.1 at this port."

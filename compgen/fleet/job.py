@@ -158,6 +158,8 @@ def cron_expression(schedule: Schedule) -> str | None:
 PATTERNS = ("*.lengths.csv", "*.deviations.csv", "*.sixdof.csv")
 #: The store where a job file names none.
 STORE = "recal.sqlite"
+#: How often a watch looks at its job file, s.
+WATCH_POLL_S = 2.0
 MACHINE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 

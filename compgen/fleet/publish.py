@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from compgen.data.files import OutputFolder, sha256_of, write_file
 from compgen.errors import InputError
@@ -38,6 +38,8 @@ from compgen.fleet.store import Store
 # tables. A store in which that history is shorter (an older backup) or another one never writes here. What this program did
 # not write is never deleted and nothing is written through a link.
 
+
+Value = TypeVar("Value")
 
 POINTER = "active"
 PROPOSED = "proposed"
@@ -146,9 +148,8 @@ def is_published(store: Store, machine: MachineRecord, folder: Path) -> bool:
 
 def _is_complete(folder: Path, files: Sequence[tuple[str, str, str]], note: bytes) -> bool:
     """Whether the folder of a version holds its files (control, name, SHA-256) and the note ``version.json``."""
-    several = len({control for control, _, _ in files}) > 1
-    required = {f"{control}/{name}" if several else name: digest for control, name, digest in files}
-    paths = {folder / name: digest for name, digest in {**required, "version.json": sha256_of(note)}.items()}
+    required = {**_by_place(files), "version.json": sha256_of(note)}
+    paths = {folder / name: digest for name, digest in required.items()}
     return not folder.is_symlink() and all(
         path.is_file() and not path.is_symlink() and sha256_of(path.read_bytes()) == digest
         for path, digest in paths.items()
@@ -334,11 +335,15 @@ def _clear(folder: Path, contents: Mapping[str, bytes], name: str) -> None:
 
 
 def _contents(store: Store, machine: MachineRecord, table: TableRecord) -> dict[str, bytes]:
-    """Return the files of a version by name; with several controls each has its own sub-folder."""
-    several = len(table.controllers) > 1
-    files = {f"{f.controller}/{f.name}" if several else f.name: f.content for f in store.table_files(table)}
-    files["version.json"] = _note(store, machine, table)
-    return files
+    """Return the files of a version by their place in its folder."""
+    files = _by_place([(file.controller, file.name, file.content) for file in store.table_files(table)])
+    return {**files, "version.json": _note(store, machine, table)}
+
+
+def _by_place(files: Sequence[tuple[str, str, Value]]) -> dict[str, Value]:
+    """Return something about files (control, name, value) by place: with several controls each has its own sub-folder."""
+    several = len({control for control, _, _ in files}) > 1
+    return {f"{control}/{name}" if several else name: value for control, name, value in files}
 
 
 def _note(store: Store, machine: MachineRecord, table: TableRecord) -> bytes:

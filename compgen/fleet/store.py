@@ -130,6 +130,13 @@ class Store:
         except ValueError as error:  # no time, no JSON
             raise StoreError(f"the store {shown(self.url)} is damaged: {error}; restore a backup") from error
 
+    def snapshot(self) -> sa.Connection:
+        """Return a connection that only reads, and that sees the store as it is at one moment."""
+        connection = self.engine.connect().execution_options(reading=True)
+        if self.engine.dialect.name == "postgresql":
+            return connection.execution_options(isolation_level="REPEATABLE READ")
+        return connection
+
     def together(self, action: Callable[[], Result]) -> Result:
         """Do ``action``, which reads several times, on the store as it is at one moment: its reads fit together."""
         current = _together.get()
@@ -138,10 +145,7 @@ class Store:
 
         def once() -> Result:
             self._check_file()
-            options: dict[str, Any] = {"reading": True}
-            if self.engine.dialect.name == "postgresql":
-                options["isolation_level"] = "REPEATABLE READ"
-            with self.engine.connect().execution_options(**options) as connection:
+            with self.snapshot() as connection:
                 token = _together.set((self, connection, {}))
                 try:
                     return action()
@@ -639,10 +643,7 @@ def restore(path: Path, url: str) -> dict[str, int]:
 def _copy(source: Store, target: Store) -> dict[str, int]:
     """Copy all rows as they were at one moment, in one transaction."""
     try:
-        reading = source.engine.connect().execution_options(reading=True)
-        if source.engine.dialect.name == "postgresql":
-            reading = reading.execution_options(isolation_level="REPEATABLE READ")
-        with reading, target.engine.begin() as writing:
+        with source.snapshot() as reading, target.engine.begin() as writing:
             counts = dict.fromkeys((table.name for table in database.ALL), 0)
             for table in database.ALL:
                 keys = [table.c.id] if "id" in table.c else list(table.primary_key)

@@ -20,11 +20,9 @@ from apscheduler.triggers.interval import IntervalTrigger
 from compgen.data.files import read_bytes
 from compgen.errors import CompgenError
 from compgen.fleet import logs
-from compgen.fleet.job import DAYS, Cron, Every, Job, MachineJob, Schedule, job_of_text
+from compgen.fleet.job import DAYS, WATCH_POLL_S, Cron, Every, Job, MachineJob, Schedule, job_of_text
 from compgen.fleet.runner import MachineOutcome, run_machine
 
-#: How often the job file is looked at, s.
-POLL_S = 2.0
 #: A machine without a schedule is looked at this often.
 UNSCHEDULED = Every(5)
 #: After a trouble that may pass by itself a machine is looked at again after so long, then twice as long, at most, s.
@@ -62,7 +60,7 @@ class Watch:
         work: Work = run_machine,
         threads: int = 1,
         on_outcome: Callable[[MachineOutcome], None] = lambda _: None,
-        poll_s: float = POLL_S,
+        poll_s: float = WATCH_POLL_S,
         notify: tuple[str, ...] = (),
     ) -> None:
         self.path, self.work, self.on_outcome, self.poll_s = path, work, on_outcome, poll_s
