@@ -49,6 +49,11 @@ _COMMANDS = {
         "accuracy": "Evaluate one measurement or error file by the standards (ISO 230, VDI/DGQ 3441).",
         "compare": "Compare before and after: improvement factors with uncertainty.",
     },
+    "file_commands": {
+        "init": "Write a commented machine file from a few answers.",
+        "check": "List every problem of machine, job, scenario and instrument files.",
+        "schema": "Print the JSON schema of a kind of file, for editors.",
+    },
     "listing_commands": {
         "controllers": "List the controls that compgen writes, and what they can express.",
         "machines": "List the machines with their travel (mm).",

@@ -34,26 +34,40 @@ def path_option(name: str, text: str, *, metavar: str | None = "FILE", **how: An
     return click.option(name, metavar=metavar, type=PATH, help=text, **how)
 
 
-def open_machine(name: str, machines: Sequence[Path] = (), *, whole: bool = False) -> Machine:
-    """Load a machine and check the settings of every control and the effects that its file names.
+def open_machine(
+    name: str, machines: Sequence[Path] = (), *, whole: bool = False, used: Iterable[str | None] = ()
+) -> Machine:
+    """Load a machine; check the effects that its file names, and the settings of the controls that a command uses.
 
-    A shipped machine file is known to be right (a test reads all of it): unless the ``whole`` file is to be read, those
-    of its controls that the command does not use are not even imported.
+    What is wrong with other controls is a warning, unless the ``whole`` file is to be read. A name that no control has may be
+    that of a used one, misspelt, whose settings would be missing: an error where a control is used. A shipped machine file
+    is known to be right (a test reads all of it): those of its controls that the command does not use are not even imported.
     """
-    machine = load_machine(name, tuple(machines))
+    machine, in_use = load_machine(name, tuple(machines)), {control for control in used if control is not None}
     shipped = machine.source is not None and machine.source.resolve().parent == data_folder("machines")
     for controller in machine.controllers:
-        if controller not in CONTROLLERS:
-            from compgen.data.registry import why_missing
-
-            message = f"is not a controller; {nearest(controller, CONTROLLERS)}"
-            message += why_missing(CONTROLLERS.broken, controller) or "; if it comes from a plug-in, add --plugin PATH"
-            raise InputError(message, file=machine.source, field=f"[controllers.{controller}]")
-        if whole or not shipped:
-            CONTROLLERS[controller].read_settings(machine)
+        try:
+            if whole or not shipped or controller not in CONTROLLERS:
+                check_settings(machine, controller)
+        except InputError as error:
+            if whole or controller in in_use or (in_use and controller not in CONTROLLERS):
+                raise
+            warnings.warn(f"{error}. This command does not use these settings", CompgenWarning, stacklevel=2)
     if machine.effects:
         effects.active_effects(machine)
     return machine
+
+
+def check_settings(machine: Machine, controller: str) -> None:
+    """Raise InputError for a section ``[controllers.NAME]`` of a control that does not exist, or with wrong settings."""
+    if controller in CONTROLLERS:
+        CONTROLLERS[controller].read_settings(machine)
+        return
+    from compgen.data.registry import why_missing
+
+    message = f"is not a controller; {nearest(controller, CONTROLLERS)}"
+    message += why_missing(CONTROLLERS.broken, controller) or "; if it comes from a plug-in, add --plugin PATH"
+    raise machine.controller_settings(controller).fail("", message, kind="unknown")
 
 
 def machine_argument(command: Command) -> Command:
@@ -61,7 +75,8 @@ def machine_argument(command: Command) -> Command:
 
     @functools.wraps(command)
     def wrapper(*args: Any, machine: str, machines: tuple[Path, ...], **options: Any) -> Any:
-        return command(*args, machine=open_machine(machine, machines), **options)
+        used = (*_names(options.get("controller")), options.get("active_controller"))
+        return command(*args, machine=open_machine(machine, machines, used=used), **options)
 
     help_text = "Additional folder with machine files (may be given several times)."
     option = click.option("--machines", multiple=True, type=click.Path(path_type=Path), help=help_text)

@@ -55,7 +55,7 @@ SECTIONS = 100
 @toml_files.accepts(toml_files.array_schema({"enum": list(ACROSS)}, 1))
 def _pairs(value: Any) -> tuple[tuple[int, int], ...]:
     """A list of at most three tables such as ``"Y(x)"``, each moving axis once."""
-    if not isinstance(value, list) or not value or any(item not in ACROSS for item in value):
+    if not isinstance(value, list) or not value or any(item not in [*ACROSS] for item in value):
         raise ValueError(f"a list of {', '.join(map(repr, ACROSS))} is expected")
     found = tuple(ACROSS[item] for item in value)
     if len({moving for _, moving in found}) < len(found):

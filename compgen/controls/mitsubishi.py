@@ -266,7 +266,7 @@ def _across(value: Any) -> tuple[tuple[int, int], ...]:
     """True for all tables of one axis as a function of another, false for none, or a list of names."""
     if isinstance(value, bool):
         return tuple(ACROSS.values()) if value else ()
-    if not isinstance(value, list) or any(item not in ACROSS for item in value) or len(set(value)) < len(value):
+    if not isinstance(value, list) or any(item not in [*ACROSS] for item in value) or len(set(value)) < len(value):
         raise ValueError(f"true, false or a list of {', '.join(map(repr, ACROSS))} is expected")
     return tuple(ACROSS[item] for item in value)
 

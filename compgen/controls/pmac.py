@@ -550,7 +550,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         """Read the settings; ``counts_per_mm`` is mandatory."""
         section = machine.controller_settings(cls.name)
         if "counts_per_mm" not in section:
-            raise section.fail("counts_per_mm", _COUNTS_MISSING)
+            raise section.fail("counts_per_mm", _COUNTS_MISSING, kind="missing", instead=1000.0)
         settings = toml_files.read_settings(PmacSettings, section)
         if max(settings.motors) > settings.motors_available:
             raise section.fail(

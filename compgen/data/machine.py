@@ -166,6 +166,8 @@ CHAINS: tuple[str, ...] = tuple(f"W{''.join(order)}T" for order in permutations(
 
 #: Longest travel and offset of a machine, mm.
 MOST_MM = 1e6
+#: A travel below this is asked about, mm.
+FEW_MM = 5.0
 _NODES = toml_files.whole(2, 10001)
 _ONE_NODES = {"oneOf": [{"required": ["nodes"]}, {"required": ["nodes_mm"]}]}
 #: A length of a machine, mm.
@@ -393,6 +395,17 @@ class Machine(Displayed):
     def upper_mm(self) -> FloatArray:
         """Upper travel ends, shape (3,)."""
         return np.array([axis.range_mm[1] for axis in self.axes])
+
+    @property
+    def doubts(self) -> list[str]:
+        """Questions about numbers that are possible, but hardly meant."""
+        short = [
+            (letter, axis.length_mm) for letter, axis in zip(AXES, self.axes, strict=True) if axis.length_mm < FEW_MM
+        ]
+        return [
+            f"[axes.{letter}] range_mm: is the travel really {length:g} mm? It is in mm, not in m"
+            for letter, length in short
+        ]
 
     def controller_settings(self, name: str) -> toml_files.Section:
         """Return a fresh section with the settings of one control (empty if the file has none)."""

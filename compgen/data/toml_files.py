@@ -64,6 +64,9 @@ Schema = Mapping[str, Any]
 #: Where a key is in a file: keys of tables, and numbers in arrays of tables.
 Place = tuple[str | int, ...]
 
+#: What is wrong with a key: the reader does not know it, it is missing, its value is wrong, or does not go with others.
+ProblemKind = Literal["unknown", "missing", "value", "others"]
+
 
 def accepts(schema: Schema) -> Callable[[C], C]:
     """Say as a JSON schema what a check takes, as far as a schema can; a check without one takes anything there."""
@@ -92,7 +95,7 @@ class SettingError(InputError):
     """
 
     place: Place = ()
-    kind: Literal["unknown", "missing", "value", "others"] = "others"
+    kind: ProblemKind = "others"
     instead: Any = None
     meant: str = ""
 
@@ -158,8 +161,8 @@ class Section:
             defaults=defaults or self.defaults,
         )
 
-    def fail(self, key: str, message: str, *, instead: Any = None) -> SettingError:
-        """Return the error that points at ``key`` of this section; ``instead``: a value that would do."""
+    def fail(self, key: str, message: str, *, kind: ProblemKind = "others", instead: Any = None) -> SettingError:
+        """Return the error that points at ``key`` of this section, "" for the section itself (:class:`SettingError`)."""
         full = f"{self.name}.{key}" if self.name else key
         # the line of the key, or of its table's header if the file does not have the key
         inside, count, own = not self.name, -1, None
@@ -178,7 +181,7 @@ class Section:
                 break
         place = f"[{self.name}] {key}" if self.name else key
         error = SettingError(message, file=self.path, line=own, field=visible_line(place))
-        error.place, error.instead = (*self.place, key), instead
+        error.place, error.kind, error.instead = (*self.place, key), kind, instead
         return error
 
     def __contains__(self, key: str) -> bool:
@@ -203,17 +206,16 @@ class Section:
                 alike = [name for name in present if f"{key}_".lower().startswith(f"{name}_".lower())]
                 alike = alike or difflib.get_close_matches(key, present, n=1, cutoff=0.6)
                 hint = f"; {visible_line(alike[0])!r} is not a key here, did you mean {key!r}?" if alike else ""
-                missing = self.fail(key, f"is missing{hint}", instead=example_of(accepted(check)))
-                missing.kind, missing.meant = "missing", alike[0] if alike else ""
+                missing = self.fail(key, f"is missing{hint}", kind="missing", instead=example_of(accepted(check)))
+                missing.meant = alike[0] if alike else ""
                 raise missing
             return default
         try:
             return check(self.data[key])
         except ValueError as error:
-            wrong = self.fail(key, f"{error}; got {visible_line(repr(self.data[key]))[:80]}")
-            wrong.kind = "value"
-            wrong.instead = example_of(accepted(check)) if default is _REQUIRED else None
-            raise wrong from None
+            instead = example_of(accepted(check)) if default is _REQUIRED else None
+            message = f"{error}; got {visible_line(repr(self.data[key]))[:80]}"
+            raise self.fail(key, message, kind="value", instead=instead) from None
 
     def section(self, key: str, *, required: bool = True) -> Section:
         """Return the sub-section ``key`` (an empty one if it is absent and not required)."""
@@ -255,9 +257,7 @@ class Section:
         """Raise InputError for the first key that was never asked for."""
         for key in self.data:
             if key not in self._known:
-                unknown = self.fail(key, f"is not a known key; {nearest(key, self._known)}")
-                unknown.kind = "unknown"
-                raise unknown
+                raise self.fail(key, f"is not a known key; {nearest(key, self._known)}", kind="unknown")
         if self.defaults is not None:
             self.defaults.finish()
 
@@ -403,7 +403,7 @@ def take_axes(section: Section, item: Field[Any]) -> tuple[Any, Any, Any]:
     found = tuple(part.take(letter, data["check"], default) for letter, default in zip(AXES, data["axes"], strict=True))
     part.finish()
     if data["differ"] and len(set(found)) < 3:
-        raise section.fail(key, data["differ"].format(", ".join(map(str, found))))
+        raise section.fail(key, data["differ"].format(", ".join(map(str, found))), kind="value")
     x, y, z = (value if value is None or data["unit"] == 1.0 else data["unit"] * value for value in found)
     return x, y, z
 
@@ -557,11 +557,14 @@ def example_of(schema: Schema) -> Any:
         if key in schema:
             return example_of(schema[key][0])
     kind, least = schema.get("type"), schema.get("minItems", 0)
-    simple = {"string": "x", "boolean": False, "object": {}}
     if kind in ("number", "integer"):
         low, above = schema.get("minimum", 0), schema.get("exclusiveMinimum")
         return above + 1 if above is not None else max(low, 0)
-    return [example_of(schema.get("items", {})) for _ in range(least)] if kind == "array" else simple.get(str(kind))
+    if kind == "array":
+        return [example_of(schema.get("items", {})) for _ in range(least)]
+    if kind == "object":
+        return {key: example_of(schema["properties"][key]) for key in schema.get("required", ())}
+    return {"string": "x", "boolean": False}.get(str(kind))
 
 
 # --- every problem of a file at once ------------------------------------------------------------------------------
@@ -569,10 +572,14 @@ def example_of(schema: Schema) -> Any:
 
 @dataclass(frozen=True)
 class Findings:
-    """What speaks against a file: what its reader refuses, in the order of the file, and what it warns of."""
+    """What speaks against a file: what its reader refuses, in the order of the file, and what it warns of.
+
+    ``unsure`` says that more may be wrong with what depends on the keys that are.
+    """
 
     problems: tuple[InputError, ...]
     warnings: tuple[str, ...] = ()
+    unsure: bool = False
 
 
 def problems_of(path: str | Path, read: Callable[[Section], object], apart: Sequence[str] = ()) -> Findings:
@@ -595,10 +602,11 @@ def problems_of(path: str | Path, read: Callable[[Section], object], apart: Sequ
             break
         except InputError as error:
             if not attempt.without(error, root.path):
+                attempt.unsure = True
                 break
-    ordered = sorted(attempt.found, key=lambda error: error.line or 0)
+    ordered = sorted(attempt.found, key=lambda error: (error.file != root.path, error.line or 0))
     said = [str(item.message) for item in heard if issubclass(item.category, CompgenWarning)]
-    return Findings(tuple(ordered), tuple(dict.fromkeys(said)))
+    return Findings(tuple(ordered), tuple(dict.fromkeys(said)), attempt.unsure)
 
 
 class _Attempt:
@@ -607,6 +615,7 @@ class _Attempt:
     def __init__(self, data: dict[str, Any], apart: tuple[str, ...]) -> None:
         self.data, self.apart = data, apart
         self.found: list[InputError] = []
+        self.unsure = False
         self.left_out: set[Place] = set()
         self.replaced: set[Place] = set()
 
@@ -620,7 +629,9 @@ class _Attempt:
         # what keys do wrong together is known only where none of them was changed
         depends = key_error is not None and key_error.kind == "others"
         touched = any(self._entry(known) in ((), self._entry(place)) for known in altered)
-        if not follows and not (depends and touched):
+        if not follows and depends and touched:
+            self.unsure = True
+        elif not follows:
             self.found.append(error)
         return (key_error is not None and self._mended(key_error)) or self._smaller(place)
 

@@ -102,7 +102,7 @@ def _read(machine: Machine, known: dict[str, Effect], name: str, raw: toml_files
             if effect is None
             else f"{name} has no parameters, so it cannot be switched on; it is found in residuals"
         )
-        raise section.fail("", message)
+        raise section.fail("", message, kind="unknown")
     effect, values = read_values(effect, section)
     if isinstance(effect, Periodic) and effect.pitch_mm(machine) is None:
         raise section.fail("pitch_mm", "is missing, and the machine file has no screw_pitch_mm for this axis")
@@ -163,14 +163,16 @@ def read_values(effect: Effect, section: toml_files.Section) -> tuple[Effect, Fl
         if value is not None:
             settings[setting.name] = float(value)
         elif setting.needed:
-            raise section.fail(setting.name, f"is missing: {setting.meaning}")
+            raise section.fail(setting.name, f"is missing: {setting.meaning}", kind="missing", instead=1.0)
     effect = effect.with_settings(settings)
     names = [parameter.name for parameter in effect.card.parameters]
     if not any(name in section.data for name in names):
         given = [key for key in section.data if key not in {setting.name for setting in effect.card.settings}]
         if given:
-            raise section.fail(given[0], f"is not a known key; {nearest(given[0], names)}")
-        raise section.fail(names[0], f"is missing; expected at least one of {', '.join(names)}")
+            raise section.fail(given[0], f"is not a known key; {nearest(given[0], names)}", kind="unknown")
+        raise section.fail(
+            names[0], f"is missing; expected at least one of {', '.join(names)}", kind="missing", instead=1.0
+        )
     values = [section.take(p.name, toml_files.number, 0.0) * p.si_per_unit for p in effect.card.parameters]
     return effect, np.array(values)
 

@@ -492,6 +492,7 @@ def _machine(name: str, keys: Section, folder: Path) -> MachineJob:
             "measured_with",
             "is missing; say 'active' if the compensation stays on while the machine is measured, 'bare' if it is "
             "switched off. The wrong one compensates twice or not at all",
+            kind="missing",
             instead="bare",
         )
     job = take_settings(MachineJob, keys, name=name, **_mappings(keys))

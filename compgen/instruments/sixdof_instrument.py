@@ -501,7 +501,7 @@ def read_systematics(
         units = UNITS.get(name.partition("_")[0], {})
         if name not in names or unit not in units:
             allowed = [f"{n}_{'arcsec' if n.startswith('eps') else 'um'}" for n in names]
-            raise section.fail(key, f"is not a systematic parameter; {nearest(key, allowed)}")
+            raise section.fail(key, f"is not a systematic parameter; {nearest(key, allowed)}", kind="unknown")
         if name in found:
             raise section.fail(key, "is given twice, in two units")
         found[name] = section.take(key, check) * units[unit]

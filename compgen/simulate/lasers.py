@@ -113,7 +113,9 @@ def read_laser_tracer(section: toml_files.Section) -> LaserTracer:
     """Read the ``[instrument]`` section of a scenario, its ``type`` taken already, strictly."""
     stations = tuple(toml_files.read_settings(Station, entry) for entry in section.sections("stations"))
     if not stations:
-        raise section.fail("stations", "is missing; give at least one [[instrument.stations]]")
+        one = toml_files.example_of(toml_files.section_schema(Station))
+        message = "is missing; give at least one [[instrument.stations]]"
+        raise section.fail("stations", message, kind="missing", instead=[one])
     names = [station.name for station in stations]
     if len(set(names)) != len(names):
         raise section.fail("stations", f"the names {', '.join(names)} must differ")
@@ -129,7 +131,12 @@ OVERRUN = 0.02
 
 @accepts({**toml_files.array_schema({"enum": list(AXES)}, 1), "uniqueItems": True})
 def _axes(value: Any) -> tuple[int, ...]:
-    if not isinstance(value, list) or not value or not set(value) <= set(AXES) or len(set(value)) < len(value):
+    if (
+        not isinstance(value, list)
+        or not value
+        or any(item not in AXES for item in value)
+        or len(set(value)) < len(value)
+    ):
         raise ValueError("a list of different axes, e.g. ['X', 'Y'], is expected")
     return tuple(AXES.index(letter) for letter in value)
 
@@ -271,7 +278,12 @@ def read_axis_laser(section: toml_files.Section) -> AxisLaser:
 
 @accepts({**toml_files.array_schema({"enum": list(DIAGONALS)}, 1), "uniqueItems": True})
 def _names(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, list) or not value or not set(value) <= set(DIAGONALS) or len(set(value)) < len(value):
+    if (
+        not isinstance(value, list)
+        or not value
+        or any(item not in [*DIAGONALS] for item in value)
+        or len(set(value)) < len(value)
+    ):
         raise ValueError(f"a list of different diagonals is expected, of {', '.join(DIAGONALS)}")
     return tuple(value)
 

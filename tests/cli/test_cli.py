@@ -435,7 +435,9 @@ def test_a_bad_machine_exits_with_2_and_writes_nothing(
 ):
     machine = bad_machine(tmp_path, small_machine_file, old, new)
     before = listing(tmp_path)
-    code, stdout, stderr = call("run", machine, small_lengths_file, "--controller", "isg-csv", "--out", tmp_path / "o")
+    # wrong settings of a control are an error where it is used
+    control = "siemens-cec" if old.startswith(("mult_mode", "sign")) else "isg-csv"
+    code, stdout, stderr = call("run", machine, small_lengths_file, "--controller", control, "--out", tmp_path / "o")
     check_refused(code, stdout, stderr, message)
     assert f"{machine}:" in stderr
     assert listing(tmp_path) == before
@@ -522,6 +524,7 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
         "station,x_mm,y_mm,z_mm\nS1,-420,-210,-420\nS2,330,-190,-405\nS3,310,410,-415\nS4,-400,430,-90\n"
     )
     return {
+        "init": ("new", "--chain", "WFYXZT", "--travel", "X=0..500,Y=0..500,Z=0..500", "--out", out),
         "run": (small_machine_file, small_lengths_file, *files, "--out", out),
         "identify": (small_machine_file, small_lengths_file, "--out", out),
         "fit": (small_machine_file, errors_file, "--out", out),
@@ -551,6 +554,7 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
 
 
 WRITING = [
+    "init",
     "run",
     "identify",
     "fit",

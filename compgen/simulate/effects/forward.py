@@ -518,7 +518,8 @@ def read_effects(sections: list[toml_files.Section]) -> tuple[SimulatedEffect, .
         if name not in known or not known[name].card.parameters:
             names = [*EFFECTS, *(other for other, effect in listed().items() if effect.card.parameters)]
             reason = why_missing(EFFECTS.broken, name)
-            raise section.fail("name", f"unknown effect; {nearest(name, names)}; --plugin PATH adds some{reason}")
+            message = f"unknown effect; {nearest(name, names)}; --plugin PATH adds some{reason}"
+            raise section.fail("name", message, kind="value")
         effect, values = read_values(known[name], section)
         section.finish()
         by_name = {p.name: float(v) for p, v in zip(effect.card.parameters, values, strict=True)}

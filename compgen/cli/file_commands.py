@@ -1,0 +1,401 @@
+"""``volcomp init``, ``check`` and ``schema``: write a machine file, look files over, and what an editor needs to know of them."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from compgen import effects
+from compgen.cli.common import json_option, print_json
+from compgen.cli.shared_options import check_settings
+from compgen.cli.terminal import answer, complain, say
+from compgen.controls import CONTROLLERS, controller_named
+from compgen.data import toml_files
+from compgen.data.files import OutputFolder
+from compgen.data.machine import (
+    Chain,
+    Emphasis,
+    Interval,
+    Machine,
+    load_machine,
+    machine_files,
+    machine_of,
+    parse_machine,
+)
+from compgen.data.names import AXES
+from compgen.data.new_machine import chains_of, in_words, machine_text, usual_nodes
+from compgen.effects.active import effects_schema
+from compgen.errors import CompgenWarning, InputError
+from compgen.fleet.job import job_of, job_schema
+from compgen.instruments.sixdof_instrument import instrument_of, instrument_schema
+from compgen.simulate.run import Scenario, scenario_of
+from compgen.tables import load_format
+
+# The kinds of TOML files: how each is recognised, read, and described.
+
+
+def read_whole_machine(root: toml_files.Section) -> None:
+    """Read a machine file with the settings of all of its controls and effects; ask about what is hardly meant."""
+    machine = machine_of(root, root.path or Path())
+    for controller in machine.controllers:
+        check_settings(machine, controller)
+    effects.active_effects(machine)
+    for doubt in machine.doubts:
+        warnings.warn(doubt, CompgenWarning, stacklevel=1)
+
+
+def machine_schema() -> dict[str, Any]:
+    """Return the JSON schema of a machine file with the sections of all controls and effects."""
+    declared = {name: getattr(CONTROLLERS[name], "settings_class", None) for name in sorted(CONTROLLERS)}
+    sections = {
+        name: {"type": "object"} if kind is None else toml_files.section_schema(kind) for name, kind in declared.items()
+    }
+    schema = toml_files.section_schema(Machine, Emphasis)
+    schema["properties"]["controllers"] |= toml_files.table_schema(sections)
+    schema["properties"]["effects"] |= effects_schema()
+    return schema
+
+
+def read_whole_job(root: toml_files.Section) -> None:
+    """Read a job file; warn of machine files that cannot be read, which keep only their own machine from being measured."""
+    for name, item in job_of(root, (root.path or Path()).absolute()).machines.items():
+        try:
+            load_machine(item.machine)
+        except InputError as error:
+            warnings.warn(f"[machines.{name}] machine: {error}", CompgenWarning, stacklevel=1)
+
+
+@dataclass(frozen=True)
+class FileKind:
+    """A kind of TOML file: in words, the keys by which one is recognised, its reader, and its JSON schema."""
+
+    title: str
+    keys: frozenset[str]
+    read: Callable[[toml_files.Section], object]
+    schema: Callable[[], dict[str, Any]]
+
+
+#: A file is of the kind of which it has the most keys.
+KINDS: Mapping[str, FileKind] = {
+    "machine": FileKind(
+        "Machine file", frozenset({"chain", "axes", "controllers"}), read_whole_machine, machine_schema
+    ),
+    "job": FileKind(
+        "Job file of volcomp recal", frozenset({"machines", "defaults", "store"}), read_whole_job, job_schema
+    ),
+    "scenario": FileKind(
+        "Scenario of a simulated measurement",
+        frozenset({"instrument", "seed", "trajectory", "errors"}),
+        lambda root: scenario_of(root, root.path or Path()),
+        lambda: toml_files.section_schema(Scenario),
+    ),
+    "instrument": FileKind(
+        "Constants of a six-DOF laser instrument",
+        frozenset({"kind", "focal_length_mm", "beam_separation_mm", "glass_index"}),
+        instrument_of,
+        instrument_schema,
+    ),
+}
+#: Tables of these files whose entries have nothing to do with each other.
+_APART = ("controllers", "effects", "machines")
+
+
+@click.command("schema")
+@click.argument("kind", type=click.Choice(list(KINDS)))
+def schema_command(kind: str) -> int:
+    """Print the JSON schema of a machine, job, scenario or instrument file, for editors.
+
+    The schema (draft 2020-12) says what an editor shows and completes: every key with its meaning, unit (mm, um, urad),
+    default and allowed values. It is made of what the reader of the file declares. An editor takes it from a first line
+    `#:schema machine.schema.json` (Even Better TOML, taplo).
+
+    \b
+    Example:
+      volcomp schema machine
+    """
+    print_json(
+        {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": KINDS[kind].title, **KINDS[kind].schema()}
+    )
+    return 0
+
+
+@click.command("check")
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.option("--kind", type=click.Choice(list(KINDS)), help="What the files are; by default their keys say it.")
+@json_option
+def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> int:
+    """List every problem of machine, job, scenario and instrument files at once.
+
+    FILE is a TOML file, the name of a machine, or a folder, of which every *.toml file is looked at; a broken file does not
+    keep the others from being checked. A machine file is read with the settings of all of its controls. What is possible
+    but hardly meant is asked, such as a travel of 0.8 mm; that is no problem. Exit code 2 if there is one.
+
+    \b
+    Example:
+      volcomp check zha-gantry
+    """
+    listing: list[dict[str, Any]] = []
+    for path, named in _paths(files):
+        try:
+            present = set(toml_files.read_toml(path).data)
+        except InputError:  # the problem that is listed
+            present = set()
+        likeliest = max(KINDS, key=lambda name: len(KINDS[name].keys & present))
+        known = kind or (likeliest if KINDS[likeliest].keys & present else None)
+        if known is None and present and not named:
+            listing.append({"file": str(path), "kind": None, "problems": [], "warnings": [], "unsure": False})
+            continue
+        found = toml_files.problems_of(path, _of_no_kind if known is None else KINDS[known].read, _APART)
+        problems = [
+            {
+                "file": str(item.file or path),
+                "line": item.line,
+                "field": item.field,
+                "message": item.message,
+                "text": str(item),
+            }
+            for item in found.problems
+        ]
+        listing.append(
+            {
+                "file": str(path),
+                "kind": known,
+                "problems": problems,
+                "warnings": list(found.warnings),
+                "unsure": found.unsure,
+            }
+        )
+    count = sum(len(item["problems"]) for item in listing)
+    if as_json:
+        print_json({"problems": count, "files": listing})
+        return 2 if count else 0
+    for item in listing:
+        wrong, of_kind = len(item["problems"]), item["kind"] or "file"
+        if item["kind"] is None and not wrong:
+            say(f"{item['file']}: skipped, it is none of {', '.join(KINDS)}")
+            continue
+        what = f"{wrong} problem{'s' if wrong > 1 else ''}" if wrong else "no problem"
+        say(f"{item['file']}: {of_kind}, {what}", style="red" if wrong else None)
+        say(*(f"  {problem['text']}" for problem in item["problems"]))
+        if item["unsure"]:
+            say("  what depends on these keys is looked over once they are right")
+        say(*(f"  {'question' if '?' in text else 'warning'}: {text}" for text in item["warnings"]), style="yellow")
+    return 2 if count else 0
+
+
+def _of_no_kind(root: toml_files.Section) -> None:
+    raise InputError(f"is none of {', '.join(KINDS)}: no key tells its kind; say it by --kind", file=root.path)
+
+
+def _paths(files: Sequence[str]) -> list[tuple[Path, bool]]:
+    """The files to look at, each once, and whether it was named itself."""
+    found: dict[Path, bool] = {}
+    for name in files:
+        path = Path(name)
+        if path.is_dir():
+            inside = [item for item in sorted(path.rglob("*.toml")) if item.is_file()]
+            if not inside:
+                raise InputError("has no *.toml file", file=path)
+            found |= {item: found.get(item, False) for item in inside}
+        elif path.suffix == ".toml" or len(path.parts) > 1 or path.is_file():
+            found[path] = True
+        else:
+            local = Path("machines")
+            known = machine_files((local,) if local.is_dir() else ()).get(name)
+            found[known or load_machine(name).file or path] = True
+    return list(found.items())
+
+
+# ``volcomp init``: a commented machine file.
+
+
+@click.command("init")
+@click.argument("name", required=False, metavar="[NAME]")
+@click.option(
+    "--chain",
+    metavar="TEXT",
+    help='What moves what, in words, e.g. "table moves in X and Y, head in Z" (English or German), or a code such as WFYXZT.',
+)
+@click.option(
+    "--travel",
+    multiple=True,
+    metavar="AXIS=LOW..HIGH",
+    help="Travel of an axis in mm, e.g. X=-800..0; once for each of X, Y, Z.",
+)
+@click.option(
+    "--nodes",
+    multiple=True,
+    metavar="[AXIS=]N",
+    help="Nodes of the error curves of an axis, or of all; default: one every 100 mm, at least 5.",
+)
+@click.option(
+    "--control", "controls", multiple=True, metavar="NAME", help="Control whose settings are listed (may be several)."
+)
+@click.option(
+    "--out",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    default=".",
+    help="Folder of NAME.toml; default: this one.",
+)
+@click.option("--force", is_flag=True, help="Overwrite a file that exists.")
+@json_option
+def init_command(
+    name: str | None,
+    chain: str | None,
+    travel: tuple[str, ...],
+    nodes: tuple[str, ...],
+    controls: tuple[str, ...],
+    out: Path,
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Write a commented machine file, NAME.toml, from a few answers (lengths in mm).
+
+    On a terminal what no option says is asked. Every key has a comment with its meaning and unit; settings of a control that
+    only its owner can know, such as the sign of a table, are left as comments to be stated.
+
+    \b
+    Example:
+      volcomp init my-mill --chain WXYFZT --travel X=0..600 --travel Y=0..400 --travel Z=0..500
+    """
+    asks = sys.stdin.isatty() and not as_json
+    name = name or _asked("Name of the machine", "NAME", asks)
+    target = out / f"{re.sub(r'[^A-Za-z0-9._-]', '-', name)}.toml"
+    if target.exists() and not force:
+        raise InputError("exists; --force overwrites it", file=target)
+    for control in controls:
+        controller_named(control)
+    understood, assumed = _chain(chain, asks)
+    ranges = {letter: _travel(letter, travel, asks) for letter in AXES}
+    counts = _nodes(nodes, ranges)
+    if asks and not controls:
+        text = click.prompt(
+            f"Controls ({', '.join(sorted(CONTROLLERS))}; several with commas)", default="none", err=True
+        )
+        controls = () if text == "none" else tuple(controller_named(item.strip()).name for item in text.split(","))
+    # a control whose settings have to be stated is read only once they are
+    plain = machine_text(name, understood, ranges, counts)
+    machine = parse_machine(plain, target)
+    sections = [_control_section(machine, control) for control in dict.fromkeys(controls)]
+    written = machine_text(name, understood, ranges, counts, sections)
+    found = parse_machine(written, target)
+    output = OutputFolder(out)
+    output.add(target.name, written)
+    output.commit()
+    meaning, questions = in_words(understood), [*assumed, *found.doubts]
+    summary = {"file": str(target), "name": name, "chain": understood.name, "meaning": meaning, "questions": questions}
+    for question in questions:
+        complain(f"question: {question}")
+    answer(as_json, summary, f"{target}: {understood.name}: {meaning}", f"volcomp check {target} looks it over")
+    return 0
+
+
+def _asked(question: str, option: str, asks: bool) -> str:
+    if not asks:
+        raise InputError(
+            f"is missing; give it, or call `volcomp init` on a terminal, where it asks: {question}", field=option
+        )
+    return str(click.prompt(question, err=True)).strip()
+
+
+def _chain(words: str | None, asks: bool) -> tuple[Chain, list[str]]:
+    """The chain, and what was assumed of it."""
+    words = words or _asked('What moves what (e.g. "table moves in X and Y, head in Z")', "--chain", asks)
+    fits = chains_of(words)
+    if not fits:
+        raise InputError(
+            f"{words!r}: no machine is built like this; say for each axis what moves in it", field="--chain"
+        )
+    listed = [f"{item.name}: {in_words(item)}" for item in fits]
+    if len(fits) > 1 and asks:
+        for number, text in enumerate(listed, start=1):
+            click.echo(f"  {number}  {text}", err=True)
+        chosen = click.prompt("Which of them", type=click.IntRange(1, len(fits)), default=1, err=True)
+        return fits[chosen - 1], []
+    sides = {frozenset(item.tool_side) for item in fits}
+    if len(sides) > 1:
+        raise InputError(
+            f"{words!r} can mean {len(fits)} machines; give one of the codes: {'. '.join(listed)}", field="--chain"
+        )
+    others = ", or ".join(listed[1:])
+    return fits[0], [f"{words!r} is taken as {listed[0]}. Is it {others}? Then give that code"] if others else []
+
+
+def _travel(letter: str, given: Sequence[str], asks: bool) -> Interval:
+    """The travel of an axis, from ``X=-800..0``."""
+    stated = [
+        text.partition("=")[2] for part in given for text in part.split(",") if text.strip().upper().startswith(letter)
+    ]
+    if len(stated) > 1:
+        raise InputError(f"{letter} is given twice; give it once", field="--travel")
+    unknown = [part for part in given for text in part.split(",") if text.strip()[:1].upper() not in AXES]
+    if unknown:
+        raise InputError(f"{unknown[0]!r} is not of the form AXIS=LOW..HIGH, e.g. X=-800..0", field="--travel")
+    text = (
+        stated[0]
+        if stated
+        else _asked(f"Travel of {letter} in mm, lower and upper end (e.g. -800..0)", "--travel", asks)
+    )
+    try:
+        low, high = (float(end) for end in re.split(r"\.\.+|:|\bto\b|\bbis\b", text))
+    except ValueError:
+        raise InputError(
+            f"{letter}={text!r} is not of the form AXIS=LOW..HIGH, e.g. X=-800..0", field="--travel"
+        ) from None
+    try:
+        return toml_files.interval([low, high])
+    except ValueError as error:
+        raise InputError(f"{letter}={text!r}: {error}", field="--travel") from None
+
+
+def _nodes(given: Sequence[str], ranges: Mapping[str, Interval]) -> dict[str, int]:
+    """The number of nodes of each axis, from ``11`` or ``X=11``."""
+    found = {letter: usual_nodes(ends) for letter, ends in ranges.items()}
+    for part in given:
+        letters, equals, number = part.rpartition("=")
+        chosen = letters.strip().upper() if equals else AXES
+        if not number.strip().isdecimal() or not 2 <= int(number) <= 10001 or any(item not in AXES for item in chosen):
+            raise InputError(f"{part!r} is not of the form [AXIS=]N with N from 2 to 10001, e.g. X=11", field="--nodes")
+        found |= dict.fromkeys(chosen, int(number))
+    return found
+
+
+def _control_section(machine: Machine, name: str) -> str:
+    """The section of a control: every setting as a comment with its default and meaning.
+
+    Where something must be stated before the section can be read, its header is a comment too.
+    """
+    control = controller_named(name)
+    settings: dict[str, list[tuple[toml_files.DeclaredKey, str]]] = {}
+    for key, meaning in toml_files.declared_settings(getattr(control, "settings_class", object)):
+        settings.setdefault(key.key.partition(".")[0], []).append((key, meaning))
+    lines = []
+    for stem, items in settings.items():
+        values = ["..." if key.shown is None else json.dumps(key.shown, ensure_ascii=False) for key, _ in items]
+        parts = [f"{key.key.partition('.')[2]} = {value}" for (key, _), value in zip(items, values, strict=True)]
+        key, meaning = items[0]
+        words = key.allowed if key.allowed.startswith(("one of", "a whole number from", "true or")) else ""
+        remark = "; ".join(part for part in ("to be stated" if key.required else "", meaning, words) if part)
+        lines.append(
+            f"{f'# {stem} = ' + (values[0] if len(items) == 1 else '{ ' + ', '.join(parts) + ' }'):<41} # {remark}"
+        )
+    lines += [
+        f"# not settled by any public document: {' '.join(text.split())}" for text in load_format(name).unverified
+    ]
+    try:
+        control.read_settings(machine)
+        missing = control(machine).missing()
+    except InputError as error:
+        why = f"# open: {error.field or ''} {error.message}".replace("\n", " ")
+        return "\n".join([why, f"# [controllers.{name}]", *lines])
+    open_point = [f"# open: {missing.field} {missing.message}"] if missing is not None else []
+    return "\n".join([*open_point, f"[controllers.{name}]", *lines])

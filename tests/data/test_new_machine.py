@@ -1,0 +1,102 @@
+"""Chains from words: every usual arrangement of a machine, in English and German; and what a new machine file contains."""
+
+import pytest
+
+from compgen.data.machine import CHAINS, parse_machine
+from compgen.data.new_machine import chains_of, in_words, machine_text, usual_nodes
+from compgen.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("words", "chain"),
+    [
+        # the table carries both axes, on a saddle
+        ("table in X, saddle in Y, head in Z", "WXYFZT"),
+        ("table moves in X on a saddle that moves in Y; spindle head in Z", "WXYFZT"),
+        ("the saddle moves in X, the table moves in Y, the quill in Z", "WYXFZT"),
+        ("Tisch in Y, Schlitten in X, Pinole in Z", "WYXFZT"),
+        # a knee carries all three
+        ("knee in Z, saddle in Y, table in X", "WXYZFT"),
+        ("Konsole in Z, Sattel in Y, Tisch in X", "WXYZFT"),
+        # the table carries one axis
+        ("table in X, column in Y, head in Z", "WXFYZT"),
+        ("Tisch fährt in X, Ständer in Y, Kopf in Z", "WXFYZT"),
+        ("TISCH IN Y, QUERSCHLITTEN X, STÖßEL Z, BRÜCKE STEHT", "WYFXZT"),
+        ("table in Y, fixed gantry, cross beam in Z, head in X", "WYFZXT"),
+        ("column at rest, saddle in X, table in Y, head in Z", "WYXFZT"),
+        # the table is at rest
+        ("gantry in Y, cross slide in X, ram in Z", "WFYXZT"),
+        ("fixed table, moving column in X, beam in Z, ram in Y", "WFXZYT"),
+        ("Portal fährt in X, Querbalken in Z, Spindelkopf in Y", "WFXZYT"),
+        ("Tisch steht, Fahrständer in X, Schlitten in Y, Pinole in Z", "WFXYZT"),
+        # either may come first
+        ("X: table, Y: column, Z: head", "WXFYZT"),
+        ("Z by the head, Y by the column, X by the table", "WXFYZT"),
+        ("wfyxzt", "WFYXZT"),
+        ("W-X-Y-F-Z-T", "WXYFZT"),
+    ],
+)
+def test_clear_words_mean_one_chain(words, chain):
+    assert [item.name for item in chains_of(words)] == [chain]
+
+
+@pytest.mark.parametrize(
+    ("words", "likeliest", "others"),
+    [
+        ("table moves in X and Y, head in Z", "WXYFZT", ["WYXFZT"]),  # X on Y: as named, from the workpiece
+        ("Kreuztisch in Y und X, Kopf in Z", "WYXFZT", ["WXYFZT"]),
+        ("X and Y by the table, Z by the head", "WXYFZT", ["WYXFZT"]),
+        ("gantry in Y, head in X and Z", "WFYXZT", ["WFYZXT"]),  # X nearer to the foundation: as named, to the tool
+    ],
+)
+def test_axes_on_one_carriage_are_stacked_as_they_are_named(words, likeliest, others):
+    found = [item.name for item in chains_of(words)]
+    assert (found[0], found[1:]) == (likeliest, others)
+
+
+def test_what_words_leave_open_gives_every_chain_that_they_allow():
+    # an axis that is not named may be on either side, in any place
+    found = {item.name for item in chains_of("table in X")}
+    assert found == {name for name in CHAINS if name.index("X") < name.index("F")}
+    # a slide may be on the column or below the table where both move
+    assert {item.name for item in chains_of("slide in X, column in Y, table in Z")} == {"WZFYXT", "WZXFYT"}
+
+
+@pytest.mark.parametrize("words", ["", "foo", "a big mill", "X, Y, Z"])
+def test_words_without_axes_and_carriages_are_refused(words):
+    with pytest.raises(InputError, match="names no axes that move"):
+        chains_of(words)
+
+
+def test_an_axis_on_both_sides_is_refused():
+    with pytest.raises(InputError, match="X is carried by 'table' and by 'head'"):
+        chains_of("table in X and Y, head in X and Z")
+
+
+def test_words_of_a_chain_name_its_sides():
+    assert in_words(chains_of("WFYXZT")[0]).startswith("table does not move; head moves in Z, on a carriage in X, ")
+    assert in_words(chains_of("WXYZFT")[0]).endswith("on the bed; head does not move")
+
+
+@pytest.mark.parametrize("name", CHAINS)
+def test_the_file_of_every_chain_is_read_as_it_was_meant(name, tmp_path):
+    travel = {"X": (-800.0, -100.0), "Y": (50.0, 450.5), "Z": (-10.0, 0.0)}
+    text = machine_text("m", chains_of(name)[0], travel, {"X": 4, "Y": 5, "Z": 6})
+    machine = parse_machine(text, tmp_path / "m.toml")
+    assert (machine.name, machine.chain.name) == ("m", name)
+    assert [axis.range_mm for axis in machine.axes] == list(travel.values())
+    assert [len(axis.nodes_mm) for axis in machine.axes] == [4, 5, 6]
+    assert machine.reference_point_mm == (-100.0, 50.0, 0.0)  # machine zero, or the end of the travel next to it
+
+
+def test_every_default_that_the_file_shows_can_be_taken_as_it_is(tmp_path):
+    text = machine_text("m", chains_of("WFYXZT")[0], {axis: (0.0, 500.0) for axis in "XYZ"}, dict.fromkeys("XYZ", 6))
+    shown = "\n".join(line.removeprefix("# ") if " = " in line else line for line in text.splitlines())
+    assert parse_machine(shown, tmp_path / "m.toml").tool_range_mm == ((0.0, 0.0), (0.0, 0.0), (-250.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("travel", "nodes"), [((0.0, 100.0), 5), ((0.0, 600.0), 7), ((-1000.0, 0.0), 11), ((0.0, 5e4), 101)]
+)
+def test_usual_nodes_are_a_hundred_mm_apart(travel, nodes):
+    assert usual_nodes(travel) == nodes
