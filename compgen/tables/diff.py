@@ -48,19 +48,24 @@ class TableDifference:
         return self.first_mm - self.second_mm
 
     @property
+    def size_mm(self) -> FloatArray:
+        """Length of the difference, shape (n,)."""
+        return np.asarray(np.linalg.norm(self.difference_mm, axis=1))
+
+    @property
     def max_um(self) -> float:
         """Largest length of the difference."""
-        return float(np.max(np.linalg.norm(self.difference_mm, axis=1))) / MM_PER_UM
+        return float(self.size_mm.max()) / MM_PER_UM
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``diff.json``."""
-        worst = int(np.argmax(np.linalg.norm(self.difference_mm, axis=1)))
+        worst = int(np.argmax(self.size_mm))
         axes = {f"d{axis.lower()}": figures_of(self.difference_mm[:, k]) for k, axis in enumerate(AXES)}
         return {
             "controllers": list(self.controllers),
             "points": len(self.position_mm),
             "same": self.max_um == 0.0 and not self.geometry,
-            **figures_of(np.linalg.norm(self.difference_mm, axis=1)),
+            **figures_of(self.size_mm),
             "axes": axes,
             "largest_at_mm": self.position_mm[worst].tolist(),
             "largest_a_um": (self.first_mm[worst] / MM_PER_UM).tolist(),
