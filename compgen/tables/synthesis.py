@@ -87,7 +87,7 @@ class Projector:
         """Return what the closest tables leave of k wanted fields (k, n, 3) at the sample points, (k, n, 3)."""
         solution = self._solved(wanted_mm)
         solution[self.transform.shape[1] :] = 0.0  # a constant per axis is left to whoever asks
-        return wanted_mm - np.asarray(self.design @ solution).T.reshape(wanted_mm.shape)
+        return np.asarray(wanted_mm - (self.design @ solution).T.reshape(wanted_mm.shape))
 
     def _solved(self, wanted_mm: FloatArray) -> FloatArray:
         """Free values and offsets (free + offsets, k) for k wanted fields (k, n, 3)."""
